@@ -1,0 +1,35 @@
+"""The one exception tree.
+
+::
+
+    AqualvsError                what a user can mend; the command line prints it and exits with 2
+      RigError                  a rig file, or a rig that cannot exist
+      SourceError               a video or image folder that cannot be read
+      OutputError               a folder or file that cannot be written
+      OptionError               an option, or a combination of them, that makes no sense
+
+A refused posture is not an exception but a value, `aqualvs.scanning.posture.Refusal`.
+"""
+
+
+class AqualvsError(Exception):
+    """A fault that the user can mend.
+
+    The message is one line that names the file, the value and the remedy.
+    """
+
+
+class RigError(AqualvsError):
+    """A rig file that cannot be read, or a rig that cannot exist."""
+
+
+class SourceError(AqualvsError):
+    """A source of frames that cannot be opened or decoded."""
+
+
+class OutputError(AqualvsError):
+    """An output folder or file that cannot be written."""
+
+
+class OptionError(AqualvsError):
+    """An option, or a combination of options, that makes no sense."""

@@ -1,0 +1,25 @@
+"""Array types and the checks that public functions make at their border."""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+IntArray: TypeAlias = NDArray[np.int64]
+AnyArray: TypeAlias = NDArray[Any]
+
+
+def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:
+    """Return `values` as a contiguous float64 array of shape (..., size).
+
+    Raises
+    ------
+    ValueError
+        If the last axis does not have length `size`; the message names `name` and the shape.
+    """
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != size:
+        raise ValueError(f"{name} has shape {array.shape} but expected (..., {size})")
+    return array

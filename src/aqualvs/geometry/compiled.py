@@ -1,0 +1,53 @@
+"""A typed door to Numba: every compiled kernel of the project goes through `kernel`."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# Contraction to fused multiply-add and reassociation let LLVM vectorise the sums; NaN and
+# infinity keep their meaning, because validity masks rely on them.
+_FAST_BUT_NAN_SAFE = {"contract", "reassoc", "nsz", "arcp"}
+
+
+def kernel(function: F) -> F:
+    """Compile a batch kernel; the machine code is cached on disk for the next process."""
+    compiled = numba.njit(cache=True, error_model="numpy", fastmath=_FAST_BUT_NAN_SAFE, nogil=True)(
+        function
+    )
+    _depend_on_callees(compiled, function)
+    return cast(F, compiled)
+
+
+def inline_kernel(function: F) -> F:
+    """Compile a scalar function that batch kernels call; always inlined by LLVM."""
+    compiled = numba.njit(
+        cache=True,
+        error_model="numpy",
+        fastmath=_FAST_BUT_NAN_SAFE,
+        nogil=True,
+        forceinline=True,
+    )(function)
+    _depend_on_callees(compiled, function)
+    return cast(F, compiled)
+
+
+def _depend_on_callees(compiled: Any, function: Callable[..., Any]) -> None:
+    """Make the machine code on disk depend on the files of the kernels that it calls as well.
+
+    Numba compares only the stamp of the function's own file, so a change in an inlined kernel of
+    another module would leave stale machine code in use.
+    """
+    own = _cache_file(compiled)
+    if own is None:
+        return
+    called = (function.__globals__.get(name) for name in function.__code__.co_names)
+    files = (_cache_file(callee) for callee in called)
+    own._source_stamp = (own._source_stamp, *(f._source_stamp for f in files if f is not None))
+
+
+def _cache_file(compiled: Any) -> Any:
+    """Return Numba's record of the cache of a compiled function, None for anything else."""
+    return getattr(getattr(compiled, "_cache", None), "_cache_file", None)

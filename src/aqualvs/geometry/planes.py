@@ -1,0 +1,67 @@
+"""Planes n·X = d."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
+from aqualvs.geometry.rays import Rays
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """The plane normal·X = offset in one frame.
+
+    Attributes
+    ----------
+    normal : array, shape (3,)
+        Unit normal.
+    offset : float
+        Signed distance of the plane from the origin along the normal, in metres.
+    """
+
+    normal: FloatArray
+    offset: float
+
+    @classmethod
+    def from_normal(cls, normal: ArrayLike, offset: float) -> "Plane":
+        """Make a plane from a normal of any length; `offset` belongs to the normal as given.
+
+        Raises
+        ------
+        ValueError
+            If the normal is zero or not finite.
+        """
+        vector = as_vectors(normal, 3, "normal")
+        length = float(np.linalg.norm(vector))
+        if not np.isfinite(length) or length == 0.0:
+            raise ValueError(f"plane normal {vector.tolist()} has no direction")
+        return cls(vector / length, float(offset) / length)
+
+    def signed_distance(self, points: FloatArray) -> FloatArray:
+        """Return normal·X - offset for points of shape (..., 3)."""
+        distance: FloatArray = points @ self.normal - self.offset
+        return distance
+
+    def intersect(self, rays: Rays) -> tuple[FloatArray, BoolArray]:
+        """Intersect rays with the plane (paper, Eq. 16 and 20).
+
+        Returns
+        -------
+        points : array, shape (..., 3)
+            NaN where there is no intersection ahead of the ray's origin.
+        valid : bool array, shape (...)
+        """
+        approach = rays.directions @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (self.offset - rays.origins @ self.normal) / approach
+        valid = rays.valid & np.isfinite(distance) & (distance >= 0.0)
+        points = rays.points_at(np.where(valid, distance, np.nan))
+        return points, valid
+
+    def facing_origin(self) -> "Plane":
+        """Return the same plane with offset >= 0, as target planes have it."""
+        if self.offset < 0.0:
+            return Plane(-self.normal, -self.offset)
+        return self
