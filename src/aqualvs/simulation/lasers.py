@@ -1,0 +1,189 @@
+"""Line lasers as light sources, and the kernels that say how bright their sheets are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.errors import RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Laser, Rig
+from aqualvs.simulation.ray_kernels import inline_ray_kernel, ray_kernel
+from aqualvs.simulation.vectors import Vec, dot, minus, row3
+
+# Columns of the sheet table.
+SOURCE, NORMAL, CENTRE, SIDE, SIGMA, DIVERGENCE, POWER, REACH = 0, 3, 6, 9, 12, 13, 14, 15
+_COLUMNS = 16
+# `LaserSource.power` is stated at this distance.
+_REFERENCE = 0.5
+# Beyond so many sigma a sheet is dark.
+CUT = 4.0
+N_FAN = 3001
+# The fan's edge rolls off over this angle.
+_EDGE = np.deg2rad(0.8)
+_ON_PLANE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaserSource:
+    """Where a laser sheet comes from and how its light is spread.
+
+    Attributes
+    ----------
+    position : array, shape (3,)
+        The fan's origin in `dome`, on the laser's plane, in metres.
+    direction : array, shape (3,)
+        Unit vector of the fan's middle in `dome`, in the laser's plane.
+    half_angle : float
+        Half the fan's opening in radians.
+    sigma : float
+        Standard deviation of the sheet's thickness at the source, in metres.
+    divergence : float
+        Growth of that standard deviation with distance, in radians.
+    power : float
+        Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the
+        source, in clear water.
+    """
+
+    position: FloatArray
+    direction: FloatArray
+    half_angle: float = float(np.deg2rad(34.0))
+    sigma: float = 0.45e-3
+    divergence: float = 0.75e-3
+    power: float = 10.0
+
+
+class Sheets(NamedTuple):
+    """Laser sheets as tables.
+
+    Attributes
+    ----------
+    table : array, shape (n, 16)
+        See the column constants of this module.
+    fan : array, shape (n, N_FAN)
+        Relative power over the tangent of the fan angle, from -reach to reach.
+    first : array, shape (n, N_FAN)
+        Distance from the source at which the sheet's middle meets a surface; infinite where none.
+    """
+
+    table: FloatArray
+    fan: FloatArray
+    first: FloatArray
+
+
+def default_sources(rig: Rig) -> tuple[LaserSource, ...]:
+    """Return a source for every laser of a rig: beside the dome, aimed forward in its plane."""
+    return tuple(_source_on(laser) for laser in rig.lasers)
+
+
+def _source_on(laser: Laser) -> LaserSource:
+    """Lead from the plane's point nearest to the dome back to 10 mm before the dome's centre."""
+    normal = laser.plane.normal
+    forward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
+    length = float(np.linalg.norm(forward))
+    if length < 0.1:
+        raise RigError(
+            f"laser {laser.name}: its plane is square to the camera's view, so no stripe can "
+            "appear; check the plane's normal in the rig"
+        )
+    forward /= length
+    foot = normal * laser.plane.offset
+    back = (foot[1] - 0.01) / forward[1]
+    return LaserSource(position=foot - back * forward, direction=forward)
+
+
+def pack_sheets(lasers: Sequence[Laser], sources: Sequence[LaserSource]) -> Sheets:
+    """Return the tables of laser sheets that nothing shadows yet.
+
+    Raises
+    ------
+    RigError
+        If there is not one source for every laser, or a source is off its laser's plane.
+    """
+    if len(sources) != len(lasers):
+        raise RigError(f"{len(lasers)} lasers but {len(sources)} sources; give one for each laser")
+    table = np.zeros((len(lasers), _COLUMNS))
+    fan = np.zeros((len(lasers), N_FAN))
+    for i, (laser, source) in enumerate(zip(lasers, sources, strict=True)):
+        table[i] = _pack_sheet(laser, source)
+        tangents = np.linspace(-table[i, REACH], table[i, REACH], N_FAN)
+        past_edge = (np.abs(np.arctan(tangents)) - source.half_angle) / _EDGE
+        fan[i] = 1.0 / (1.0 + np.exp(np.clip(8.0 * past_edge, -60.0, 60.0)))
+    return Sheets(table, fan, np.full_like(fan, np.inf))
+
+
+def _pack_sheet(laser: Laser, source: LaserSource) -> FloatArray:
+    normal = laser.plane.normal
+    off = float(laser.plane.signed_distance(source.position))
+    tilt = float(normal @ source.direction)
+    if abs(off) > _ON_PLANE or abs(tilt) > _ON_PLANE:
+        raise RigError(
+            f"laser {laser.name}: its source is {1e3 * off:.3f} mm off its plane or aims "
+            f"{np.rad2deg(tilt):.3f} deg out of it; put both in the plane"
+        )
+    side = np.cross(normal, source.direction)
+    shape = [source.sigma, source.divergence, source.power]
+    reach = np.tan(min(source.half_angle + 2.0 * _EDGE, np.deg2rad(85.0)))
+    return np.concatenate([source.position, normal, source.direction, side, shape, [reach]])
+
+
+def fan_rays(sheets: Sheets, i: int) -> tuple[FloatArray, FloatArray]:
+    """Return origins and unit directions, shape (N_FAN, 3), of the rays in a sheet's middle."""
+    row = sheets.table[i]
+    tangents = np.linspace(-row[REACH], row[REACH], N_FAN)[:, None]
+    directions = row[CENTRE : CENTRE + 3] + tangents * row[SIDE : SIDE + 3]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.tile(row[SOURCE : SOURCE + 3], (N_FAN, 1)), directions
+
+
+@inline_ray_kernel
+def sheet_coordinates(p: Vec, table: FloatArray, i: int) -> tuple[float, float, float, float]:
+    """Return distance off the sheet, distance from the source, place in the fan, sigma.
+
+    The place in the fan is a fractional index of `Sheets.fan`, negative outside the fan.
+    """
+    rel = minus(p, row3(table, i, SOURCE))
+    off = dot(rel, row3(table, i, NORMAL))
+    forward, lateral = dot(rel, row3(table, i, CENTRE)), dot(rel, row3(table, i, SIDE))
+    reach = table[i, REACH]
+    if forward <= 0.0 or abs(lateral) >= reach * forward:
+        return off, 0.0, -1.0, 1.0
+    place = (lateral / (forward * reach) + 1.0) * 0.5 * (N_FAN - 1)
+    distance = np.sqrt(forward * forward + lateral * lateral)
+    return off, distance, place, table[i, SIGMA] + table[i, DIVERGENCE] * distance
+
+
+@inline_ray_kernel
+def peak_irradiance(
+    distance: float, sigma: float, place: float, attenuation: float, sheets: Sheets, i: int
+) -> float:
+    """Return the irradiance in a sheet's middle, spread by the fan and dimmed by the water."""
+    row = sheets.table[i]
+    reference = _REFERENCE * (row[SIGMA] + _REFERENCE * row[DIVERGENCE])
+    spread = reference / (distance * sigma)
+    k = int(place)
+    a = place - k
+    fan = sheets.fan[i, k] * (1.0 - a) + sheets.fan[i, min(k + 1, N_FAN - 1)] * a
+    return float(row[POWER] * spread * fan * np.exp(-attenuation * distance))
+
+
+def light_on_points(points: FloatArray, sheets: Sheets, attenuation: float) -> FloatArray:
+    """Return the laser light on free-floating points, shape (n, 3) in, (n,) out."""
+    light = np.zeros(len(points))
+    _light_on_points(np.ascontiguousarray(points), sheets, attenuation, light)
+    return light
+
+
+@ray_kernel
+def _light_on_points(
+    points: FloatArray, sheets: Sheets, attenuation: float, out: FloatArray
+) -> None:
+    for k in range(points.shape[0]):
+        p = row3(points, k, 0)
+        for i in range(sheets.table.shape[0]):
+            off, distance, place, sigma = sheet_coordinates(p, sheets.table, i)
+            if place < 0.0 or distance > sheets.first[i, int(place + 0.5)]:
+                continue
+            peak = peak_irradiance(distance, sigma, place, attenuation, sheets, i)
+            out[k] += peak * np.exp(-0.5 * (off / sigma) ** 2)

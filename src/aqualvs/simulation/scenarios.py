@@ -1,0 +1,133 @@
+"""Built-in scenarios by name, and how a name or a path becomes a scenario."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from aqualvs.errors import OptionError
+from aqualvs.simulation.scenario import Scenario
+from aqualvs.simulation.scenario_file import parse_scenario, read_scenario
+
+_NET_MOTION: dict[str, Any] = {
+    "range_mm": {"values": [350, 520, 430], "sway": 4, "period_s": 2.3},
+    "pitch_deg": {"values": [5, -3, 2], "sway": 1.5, "period_s": 3.1},
+    "yaw_deg": {"values": [-6, 8, 0], "sway": 1.5, "period_s": 2.7},
+    "slide_x_mm": [0, 90, 200],
+    "slide_z_mm": [0, -15, 20],
+}
+_TURBID: dict[str, Any] = {
+    "attenuation_per_m": [2.0, 1.25, 1.6],
+    "veil": [0.115, 0.235, 0.165],
+    "sheet_scatter_per_m": 1.5,
+    "forward_scatter": 0.16,
+    "halo_px": 12,
+    "snow": 1500,
+}
+_SUN: dict[str, Any] = {"caustics": 0.65, "glare": 0.5, "ambient": [0.50, 0.82, 0.78]}
+
+_BUILT_IN: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
+    {
+        "wall": (
+            "a wall square to the vehicle at 374, 438, 525 and 659 mm",
+            {
+                "duration_s": 1.6,
+                "motion": {"range_mm": {"values": [374, 438, 525, 659], "mode": "steps"}},
+                "walls": [{}],
+            },
+        ),
+        "wall_range": (
+            "a wall that recedes from 300 to 1250 mm",
+            {"motion": {"range_mm": [300, 1250]}, "walls": [{}]},
+        ),
+        "wall_yaw": (
+            "a wall at 600 mm, yaw swings through 20 degrees to either side",
+            {"motion": {"yaw_deg": {"values": [0], "sway": 20, "period_s": 4}}, "walls": [{}]},
+        ),
+        "wall_pitch": (
+            "a wall at 600 mm, pitch swings through 20 degrees to either side",
+            {"motion": {"pitch_deg": {"values": [0], "sway": 20, "period_s": 4}}, "walls": [{}]},
+        ),
+        "net_diamond": (
+            "a diamond net in open water",
+            {"motion": _NET_MOTION, "net": {"twine_mm": 2.2, "roll_deg": 3}},
+        ),
+        "net_square": (
+            "a square net with some growth on it",
+            {
+                "motion": _NET_MOTION,
+                "net": {"mesh": "square", "bar_mm": 22, "roll_deg": 8, "fouling": 0.15},
+            },
+        ),
+        "net_hexagon": (
+            "a hexagonal net, slightly bulging",
+            {
+                "motion": _NET_MOTION,
+                "net": {
+                    "mesh": "hexagon",
+                    "bar_mm": 18,
+                    "roll_deg": 12,
+                    "curvature_per_m": [0.25, 0.1],
+                },
+            },
+        ),
+        "net_clutter": (
+            "a net with a hole, a tiled wall behind it, fish, bubbles and a box",
+            {
+                "motion": {**_NET_MOTION, "range_mm": [420, 600, 500]},
+                "net": {"bar_mm": 30, "fouling": 0.1, "holes_mm": [[60, 40, 35]]},
+                "walls": [{"behind_mm": 450, "yaw_deg": 4, "tile_mm": 150}],
+                "boxes": [{"centre_mm": [330, 300, -60], "heading_deg": 12}],
+                "fish": 3,
+                "bubbles": 40,
+            },
+        ),
+        "lasers_off": (
+            "a wall with the lasers off: no posture may come of it",
+            {"duration_s": 1.0, "walls": [{}], "lasers_on": False},
+        ),
+        "empty": (
+            "open water with nothing in range: no posture may come of it",
+            {"duration_s": 1.0, "bubbles": 10, "water": {"snow": 200}},
+        ),
+        "turbid": (
+            "a net in turbid water: glowing sheets, halo and marine snow",
+            {"motion": _NET_MOTION, "net": {"fouling": 0.1}, "water": _TURBID},
+        ),
+        "sun": (
+            "a net and a wall behind it close below the surface: caustics and glare",
+            {
+                "motion": _NET_MOTION,
+                "net": {"twine_mm": 2.2},
+                "walls": [{"behind_mm": 350}],
+                "water": _SUN,
+            },
+        ),
+    }
+)
+
+
+def list_scenarios() -> dict[str, str]:
+    """Return the names of the built-in scenarios, each with one line about it."""
+    return {name: about for name, (about, _) in _BUILT_IN.items()}
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """Return a built-in scenario by its name, or the one that a YAML file describes.
+
+    Raises
+    ------
+    OptionError
+        If there is no such name or file, or the file makes no sense.
+    """
+    name = str(name_or_path)
+    if name in _BUILT_IN:
+        return parse_scenario(_BUILT_IN[name][1], name, name)
+    path = Path(name_or_path)
+    if path.suffix.lower() not in {".yaml", ".yml"}:
+        known = ", ".join(_BUILT_IN)
+        raise OptionError(
+            f"scenario {name}: no such name; choose one of {known}, or give the path of a .yaml "
+            "file"
+        )
+    return read_scenario(path)

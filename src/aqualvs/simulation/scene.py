@@ -1,0 +1,295 @@
+"""What the simulated vehicle looks at: surfaces, water, lasers and sensor, in SI units.
+
+Surfaces live in the frame `scene`: x right, y away from the vehicle, z up. The target (net or
+wall) is the plane y = 0, and `Scene.dome_from_scene` places all of it before the vehicle.
+
+Colours are (red, green, blue). Radiance 1 is the sensor's full scale at gain 1.
+"""
+
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+
+Vector: TypeAlias = tuple[float, float, float]
+Mesh: TypeAlias = Literal["diamond", "square", "hexagon"]
+Target: TypeAlias = Literal["net", "wall", "none"]
+
+
+class Label(IntEnum):
+    """What a lit point lies on; the lower-case names are `labels` in truth files."""
+
+    NONE = 0
+    NET = 1
+    WALL = 2
+    FISH = 3
+    BUBBLE = 4
+    SOLID = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wall:
+    """A plane with a procedural texture, parallel to the target plane unless it is turned.
+
+    Attributes
+    ----------
+    depth : float
+        Where the wall meets the scene's y axis, in metres; 0 is the target plane.
+    yaw, pitch : float
+        How the wall is turned against the target plane, in radians; signs as for postures.
+    albedo : (float, float, float)
+        Mean diffuse reflectance.
+    contrast : float
+        Relative swing of the stains, 0 to 1.
+    tile_pitch : float
+        Distance of the joints between tiles in metres; 0 leaves the wall without joints.
+    """
+
+    depth: float = 0.0
+    yaw: float = 0.0
+    pitch: float = 0.0
+    albedo: Vector = (0.50, 0.54, 0.52)
+    contrast: float = 0.35
+    tile_pitch: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Net:
+    """A fish net in (or gently bulging out of) the target plane y = 0.
+
+    The twine is a true cylinder around an axis in that plane: lit points lie within one twine
+    radius (plus growth) of the net plane, on the side that faces the vehicle.
+
+    Attributes
+    ----------
+    mesh : {"diamond", "square", "hexagon"}
+        Shape of the openings.
+    bar : float
+        Length of one side of an opening, in metres.
+    twine : float
+        Diameter of the clean twine, in metres.
+    roll : float
+        Turn of the mesh about the net's normal, in radians, counter-clockwise for the vehicle.
+    hanging_ratio : float
+        Width of a diamond over its stretched width; 0.707 makes it a square on its corner.
+    fouling : float
+        Fraction of the twine's length that carries growth, 0 to 1.
+    growth : float
+        Thickness of the growth at its thickest, in twine diameters.
+    missing : float
+        Fraction of the bars that are cut out, 0 to 1.
+    holes : tuple of (x, z, radius)
+        Round holes in scene coordinates, in metres.
+    curvature : (float, float)
+        Along x and z in 1/m; positive bulges away from the vehicle.
+    half_size : (float, float)
+        Half extent along x and z in metres; infinite by default.
+    offset : (float, float)
+        Slide of the mesh in its plane along x and z, in metres.
+    albedo : (float, float, float)
+        Diffuse reflectance of the clean twine.
+    seed : int
+        Chooses which bars are missing and where growth sits.
+    """
+
+    mesh: Mesh = "diamond"
+    bar: float = 0.025
+    twine: float = 0.002
+    roll: float = 0.0
+    hanging_ratio: float = 0.7071
+    fouling: float = 0.0
+    growth: float = 1.0
+    missing: float = 0.0
+    holes: tuple[Vector, ...] = ()
+    curvature: tuple[float, float] = (0.0, 0.0)
+    half_size: tuple[float, float] = (np.inf, np.inf)
+    offset: tuple[float, float] = (0.0, 0.0)
+    albedo: Vector = (0.60, 0.62, 0.62)
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fish:
+    """A fish: an ellipsoid with tail and eye that swims straight on and beats its tail.
+
+    Attributes
+    ----------
+    position, velocity : (float, float, float)
+        In `scene`, in metres and m/s, at time 0.
+    length : float
+        Length of the body in metres; height and thickness follow.
+    albedo : (float, float, float)
+        Diffuse reflectance of the flank.
+    beat : float
+        Beats of the tail a second.
+    """
+
+    position: Vector
+    velocity: Vector = (0.15, 0.0, 0.0)
+    length: float = 0.25
+    albedo: Vector = (0.40, 0.43, 0.42)
+    beat: float = 1.5
+
+    def at(self, t: float) -> "Fish":
+        """Return the fish where it is `t` seconds on."""
+        return replace(self, position=_moved(self.position, self.velocity, t))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bubble:
+    """A bubble: a bright rim, a clear middle and glints of sun and lasers.
+
+    Attributes
+    ----------
+    position, velocity : (float, float, float)
+        In `scene`, in metres and m/s, at time 0.
+    radius : float
+        In metres.
+    """
+
+    position: Vector
+    velocity: Vector = (0.0, 0.0, 0.2)
+    radius: float = 0.004
+
+    def at(self, t: float) -> "Bubble":
+        """Return the bubble where it is `t` seconds on."""
+        return replace(self, position=_moved(self.position, self.velocity, t))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Box:
+    """A box, turned about the vertical.
+
+    Attributes
+    ----------
+    centre : (float, float, float)
+        In `scene`, in metres.
+    size : (float, float, float)
+        Edge lengths along its x, y, z, in metres.
+    heading : float
+        Turn about z, in radians.
+    albedo : (float, float, float)
+        Diffuse reflectance.
+    """
+
+    centre: Vector
+    size: Vector = (0.3, 0.2, 0.3)
+    heading: float = 0.0
+    albedo: Vector = (0.46, 0.42, 0.26)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WaterOptics:
+    """How water dims, veils, glows and blurs.
+
+    Attributes
+    ----------
+    attenuation : (float, float, float)
+        Beam attenuation per metre for red, green and blue; the lasers use the green one.
+    veil : (float, float, float)
+        Radiance of endless water: what the veil tends to with distance.
+    ambient : (float, float, float)
+        Daylight that reaches a surface; a white one has this radiance.
+    sheet_scatter : float
+        Light that a laser sheet sends sideways to the camera, per metre and steradian.
+    forward_scatter : float
+        Fraction of the light that arrives in a halo instead of in focus.
+    halo_px : float
+        Standard deviation of that halo, in pixels.
+    caustics : float
+        Relative strength of the moving light network of the waves, 0 to 1.
+    glare : float
+        Radiance of the sun's glare at its brightest.
+    snow : int
+        Number of drifting particles before the camera.
+    """
+
+    attenuation: Vector = (0.75, 0.30, 0.42)
+    veil: Vector = (0.072, 0.205, 0.165)
+    ambient: Vector = (0.36, 0.62, 0.60)
+    sheet_scatter: float = 0.25
+    forward_scatter: float = 0.04
+    halo_px: float = 9.0
+    caustics: float = 0.0
+    glare: float = 0.0
+    snow: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensor:
+    """From radiance to grey levels.
+
+    Attributes
+    ----------
+    gain : float
+        Exposure: multiplies radiance before the full scale of 1 cuts it off.
+    gamma : float
+        Grey level = 255 * radiance**(1 / gamma).
+    read_noise : float
+        Standard deviation in the dark, of full scale.
+    shot_noise : float
+        Variance of the noise per unit of radiance, of full scale squared.
+    defocus_px : float
+        Standard deviation of the blur of lens and sensor, in pixels.
+    """
+
+    gain: float = 1.0
+    gamma: float = 1.25
+    read_noise: float = 0.004
+    shot_noise: float = 1.5e-4
+    defocus_px: float = 0.75
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """Everything in front of the camera at one instant (moving things carry their velocity).
+
+    Attributes
+    ----------
+    dome_from_scene : SE3
+        Places the scene; see `aqualvs.simulation.trajectory.dome_from_target`.
+    walls, nets, fish, bubbles, boxes
+        Surfaces.
+    target : {"net", "wall", "none"}
+        What the plane y = 0 is, for the truth files.
+    water : WaterOptics
+        Optical properties of the water.
+    sensor : Sensor
+        Optical and electronic properties of the camera.
+    lasers_on : bool
+        False switches all lasers off.
+    """
+
+    dome_from_scene: SE3
+    walls: tuple[Wall, ...] = ()
+    nets: tuple[Net, ...] = ()
+    fish: tuple[Fish, ...] = ()
+    bubbles: tuple[Bubble, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    target: Target = "none"
+    water: WaterOptics = field(default_factory=WaterOptics)
+    sensor: Sensor = field(default_factory=Sensor)
+    lasers_on: bool = True
+
+    def at(self, t: float) -> "Scene":
+        """Return the scene with fish and bubbles where they are `t` seconds on."""
+        return replace(
+            self,
+            fish=tuple(fish.at(t) for fish in self.fish),
+            bubbles=tuple(bubble.at(t) for bubble in self.bubbles),
+        )
+
+    def target_plane(self) -> Plane:
+        """Return the target plane in `dome`, its normal away from the vehicle."""
+        normal = self.dome_from_scene.rotation[:, 1]
+        offset = float(normal @ self.dome_from_scene.translation)
+        return Plane(normal, offset).facing_origin()
+
+
+def _moved(position: Vector, velocity: Vector, t: float) -> Vector:
+    x, y, z = (p + v * t for p, v in zip(position, velocity, strict=True))
+    return x, y, z

@@ -1,0 +1,246 @@
+"""What one ray brings home: daylight, lasers, veil, glow of the sheets, bubbles."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.simulation.lasers import (
+    CUT,
+    NORMAL,
+    SIGMA,
+    SOURCE,
+    Sheets,
+    peak_irradiance,
+    sheet_coordinates,
+)
+from aqualvs.simulation.ray_kernels import inline_ray_kernel
+from aqualvs.simulation.scene import Scene
+from aqualvs.simulation.surfaces import (
+    NONE,
+    Surfaces,
+    first_hit,
+    meet_bubbles,
+    normal_and_albedo,
+)
+from aqualvs.simulation.textures import Tiles, sample
+from aqualvs.simulation.vectors import Vec, along, dot, minus, row3, scaled, unit
+
+# How the colour filters of the sensor answer to 532 nm.
+LASER_RED, LASER_GREEN, LASER_BLUE = 0.40, 1.0, 0.27
+# Light comes down steeply, leaning towards the target.
+_UP = (0.10, -0.42, 0.90)
+_SHADOW_MARGIN = 3e-4
+_EVERYWHERE = 1e3
+
+
+class Light(NamedTuple):
+    """The numbers of `WaterOptics` that rays need.
+
+    Attributes
+    ----------
+    colours : array, shape (3, 3)
+        Rows: attenuation per metre, veil, ambient.
+    sheet_scatter, caustics, glare : float
+        As in `WaterOptics`.
+    time : float
+        Moves the caustics, in seconds.
+    """
+
+    colours: FloatArray
+    sheet_scatter: float
+    caustics: float
+    glare: float
+    time: float
+
+
+def pack_light(scene: Scene, t: float) -> Light:
+    """Return the water of a scene as kernels need it."""
+    water = scene.water
+    colours = np.array([water.attenuation, water.veil, water.ambient], dtype=np.float64)
+    return Light(
+        colours, float(water.sheet_scatter), float(water.caustics), float(water.glare), float(t)
+    )
+
+
+class Members(NamedTuple):
+    """Which ellipsoids and bubbles a ray may meet.
+
+    Attributes
+    ----------
+    ellipsoids, bubbles : int arrays
+        Rows of the tables, tile after tile.
+    first, last, first_bubble, last_bubble : int
+        The part of those arrays that belongs to the ray's tile.
+    """
+
+    ellipsoids: IntArray
+    bubbles: IntArray
+    first: int
+    last: int
+    first_bubble: int
+    last_bubble: int
+
+
+@inline_ray_kernel
+def radiance(
+    o: Vec, d: Vec, s: Surfaces, near: Members, everything: IntArray, sheets: Sheets, light: Light
+) -> Vec:
+    """Return the radiance (red, green, blue) that arrives along a ray."""
+    hit = first_hit(o, d, s, near.ellipsoids, near.first, near.last)
+    red, green, blue = 0.0, 0.0, 0.0
+    if hit.kind != NONE:
+        normal, albedo = normal_and_albedo(o, d, hit, s)
+        p = along(o, d, hit.t)
+        sun = _daylight(p, normal, light, s.tiles)
+        laser = _laser_light(p, normal, s, everything, sheets, light)
+        red = albedo[0] * (light.colours[2, 0] * sun + LASER_RED * laser)
+        green = albedo[1] * (light.colours[2, 1] * sun + LASER_GREEN * laser)
+        blue = albedo[2] * (light.colours[2, 2] * sun + LASER_BLUE * laser)
+    t, row = np.inf, -1
+    if near.last_bubble > near.first_bubble:
+        t, row = meet_bubbles(o, d, s, near.bubbles, near.first_bubble, near.last_bubble)
+    glow = _sheet_glow(o, d, hit.t, sheets, light)
+    veil = _veil(d, light)
+    path = min(hit.t, _EVERYWHERE)
+    seen = (
+        _through(red, 0, path, veil, light) + LASER_RED * glow,
+        _through(green, 1, path, veil, light) + LASER_GREEN * glow,
+        _through(blue, 2, path, veil, light) + LASER_BLUE * glow,
+    )
+    if t < hit.t:
+        seen = _over_bubble(seen, o, d, t, row, s, everything, sheets, light)
+    return seen
+
+
+@inline_ray_kernel
+def _through(source: float, channel: int, path: float, veil: float, light: Light) -> float:
+    """Dim by the water on the way and add the veil that it scatters in."""
+    left = np.exp(-light.colours[0, channel] * path)
+    return float(source * left + light.colours[1, channel] * veil * (1.0 - left))
+
+
+@inline_ray_kernel
+def _veil(d: Vec, light: Light) -> float:
+    """Brightness of the veil by direction: lighter above, and the sun's glare."""
+    veil = 1.0 + 0.55 * d[2] + 0.12 * d[0]
+    if light.glare > 0.0:
+        right, up = d[0] / d[1] - 0.22, d[2] / d[1] - 0.30
+        shaft = 1.0 + 0.35 * np.sin(9.0 * np.arctan2(right, 0.75 - up) + 1.3 * light.time)
+        veil += 6.0 * light.glare * shaft * np.exp(-(right * right + up * up) / 0.05)
+    return veil
+
+
+@inline_ray_kernel
+def _daylight(p: Vec, normal: Vec, light: Light, tiles: Tiles) -> float:
+    """Diffuse light from above, with the moving network that waves focus."""
+    sun = 0.55 + 0.45 * max(dot(normal, _UP), 0.0) * 1.6
+    if light.caustics > 0.0:
+        u, v = (p[0] + 0.35 * p[2]) / 0.0016, (0.5 * p[1] - 0.7 * p[2]) / 0.0016
+        drift = 38.0 * light.time
+        a = sample(tiles.ridges, u + drift, v + 0.4 * drift)
+        b = sample(tiles.ridges, 0.83 * v - 0.7 * drift, 0.83 * u + 0.5 * drift)
+        sun *= 1.0 + light.caustics * (1.9 * min(a, b) - 1.0)
+    return sun
+
+
+@inline_ray_kernel
+def _laser_light(
+    p: Vec, normal: Vec, s: Surfaces, everything: IntArray, sheets: Sheets, light: Light
+) -> float:
+    """Return the laser light that a surface receives, all sheets together."""
+    total = 0.0
+    for i in range(sheets.table.shape[0]):
+        off, distance, place, sigma = sheet_coordinates(p, sheets.table, i)
+        if place < 0.0 or abs(off) > CUT * sigma:
+            continue
+        from_source, slant = _from_source(p, off, sigma, sheets, i)
+        facing = -dot(from_source, normal)
+        if facing <= 0.0 or _shadowed(p, from_source, slant, s, everything):
+            continue
+        peak = peak_irradiance(distance, sigma, place, light.colours[0, 1], sheets, i)
+        total += peak * facing * np.exp(-0.5 * (off / sigma) ** 2)
+    return total
+
+
+@inline_ray_kernel
+def _from_source(p: Vec, off: float, sigma: float, sheets: Sheets, i: int) -> tuple[Vec, float]:
+    """Direction and length of the light's way; it leaves the source as far off in its thickness."""
+    start = along(
+        row3(sheets.table, i, SOURCE),
+        row3(sheets.table, i, NORMAL),
+        off * sheets.table[i, SIGMA] / sigma,
+    )
+    way = minus(p, start)
+    length = np.sqrt(dot(way, way))
+    return scaled(way, 1.0 / length), length
+
+
+@inline_ray_kernel
+def _shadowed(p: Vec, from_source: Vec, length: float, s: Surfaces, everything: IntArray) -> bool:
+    start = along(p, from_source, -length)
+    blocker = first_hit(start, from_source, s, everything, 0, everything.shape[0])
+    return blocker.t < length - _SHADOW_MARGIN
+
+
+@inline_ray_kernel
+def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> float:
+    """Light that the water in the sheets scatters into the ray, before it ends at `reach`."""
+    glow = 0.0
+    for i in range(sheets.table.shape[0]):
+        normal = row3(sheets.table, i, NORMAL)
+        slope = dot(d, normal)
+        t = dot(minus(row3(sheets.table, i, SOURCE), o), normal) / slope
+        if not 0.0 < t < reach:
+            continue
+        _, distance, place, sigma = sheet_coordinates(along(o, d, t), sheets.table, i)
+        if place < 0.0 or distance > sheets.first[i, int(place + 0.5)]:
+            continue
+        peak = peak_irradiance(distance, sigma, place, light.colours[0, 1], sheets, i)
+        thickness = np.sqrt(2.0 * np.pi) * sigma / max(abs(slope), 0.02)
+        glow += peak * thickness * light.sheet_scatter * np.exp(-light.colours[0, 1] * t)
+    return glow
+
+
+@inline_ray_kernel
+def _over_bubble(
+    behind: Vec,
+    o: Vec,
+    d: Vec,
+    t: float,
+    row: int,
+    s: Surfaces,
+    everything: IntArray,
+    sheets: Sheets,
+    light: Light,
+) -> Vec:
+    """Lay a bubble over what is behind it: totally reflecting rim, glints of sun and lasers."""
+    p = along(o, d, t)
+    normal = scaled(minus(p, row3(s.bubbles, row, 0)), 1.0 / s.bubbles[row, 3])
+    facing = max(-dot(d, normal), 0.0)
+    rim = (1.0 - facing) ** 2
+    cover = min(0.18 + 1.1 * rim, 0.95)
+    mirrored = unit(along(d, normal, 2.0 * facing))
+    sky = 0.35 + 0.55 * max(mirrored[2], 0.0) + 2.2 * max(dot(mirrored, _UP), 0.0) ** 60
+    laser = _laser_light(p, normal, s, everything, sheets, light) * (0.35 + 0.5 * rim)
+    veil = _veil(d, light)
+    return (
+        _layer(behind[0], 0, cover, sky, LASER_RED * laser, t, veil, light),
+        _layer(behind[1], 1, cover, sky, LASER_GREEN * laser, t, veil, light),
+        _layer(behind[2], 2, cover, sky, LASER_BLUE * laser, t, veil, light),
+    )
+
+
+@inline_ray_kernel
+def _layer(
+    behind: float,
+    channel: int,
+    cover: float,
+    sky: float,
+    laser: float,
+    path: float,
+    veil: float,
+    light: Light,
+) -> float:
+    own = _through(light.colours[2, channel] * sky + laser, channel, path, veil, light)
+    return (1.0 - cover) * behind + cover * own

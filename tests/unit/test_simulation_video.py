@@ -1,0 +1,98 @@
+"""Video files."""
+
+import av
+import numpy as np
+import pytest
+
+from aqualvs.errors import OptionError, OutputError
+from aqualvs.simulation.video import VideoWriter
+
+
+def _frames(n=5, size=(64, 48)):
+    """Smooth pictures that change from frame to frame."""
+    y, x = np.mgrid[: size[1], : size[0]]
+    return [
+        np.stack([3 * x + 5 * i, 4 * y, 2 * x + 2 * y], axis=-1).clip(0, 255).astype(np.uint8)
+        for i in range(n)
+    ]
+
+
+def _read(path):
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = list(container.decode(stream))
+        return stream.codec_context.pix_fmt, frames
+
+
+def test_lossless_gives_back_every_value(tmp_path):
+    path, frames = tmp_path / "a.mp4", _frames()
+    with VideoWriter(path, (64, 48), 25.0, quality="lossless") as writer:
+        for frame in frames:
+            writer.write(frame)
+    _, read = _read(path)
+    assert len(read) == len(frames)
+    for expected, frame in zip(frames, read, strict=True):
+        assert np.array_equal(frame.to_ndarray(format="rgb24"), expected)
+
+
+def test_h264_is_420_with_the_right_clock(tmp_path):
+    path, frames = tmp_path / "a.mp4", _frames()
+    with VideoWriter(path, (64, 48), 29.97) as writer:
+        for frame in frames:
+            writer.write(frame)
+    pixel_format, read = _read(path)
+    assert pixel_format == "yuv420p"
+    assert [frame.time for frame in read] == pytest.approx(np.arange(5) / 29.97, abs=2e-4)
+    for expected, frame in zip(frames, read, strict=True):
+        # H.264 at crf 20 on a smooth picture.
+        error = frame.to_ndarray(format="rgb24").astype(int) - expected
+        assert np.abs(error).mean() < 4.0
+
+
+def test_smaller_crf_or_more_bits_make_a_larger_file(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(4)]
+    sizes = {}
+    for name, options in {
+        "fine": {"crf": 10},
+        "coarse": {"crf": 40},
+        "bits": {"bit_rate": 8_000_000},
+        "few_bits": {"bit_rate": 100_000},
+    }.items():
+        path = tmp_path / f"{name}.mp4"
+        with VideoWriter(path, (128, 96), 25.0, **options) as writer:
+            for frame in frames:
+                writer.write(frame)
+        sizes[name] = path.stat().st_size
+    assert sizes["fine"] > 2 * sizes["coarse"]
+    assert sizes["bits"] > sizes["few_bits"]
+
+
+def test_an_interrupted_file_can_be_read(tmp_path):
+    path = tmp_path / "a.mp4"
+
+    def interrupted():
+        with VideoWriter(path, (64, 48), 25.0) as writer:
+            for frame in _frames(3):
+                writer.write(frame)
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        interrupted()
+    assert len(_read(path)[1]) == 3
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"quality": "best"}, {"crf": 60}, {"bit_rate": 0}, {"size_px": (63, 48)}, {"fps": 0.0}],
+)
+def test_senseless_options_are_refused(tmp_path, options):
+    given = {"size_px": (64, 48), "fps": 25.0, **options}
+    with pytest.raises(OptionError):
+        VideoWriter(tmp_path / "a.mp4", **given)
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path):
+    path = tmp_path / "none" / "a.mp4"
+    with pytest.raises(OutputError, match="none"):
+        VideoWriter(path, (64, 48), 25.0)
