@@ -1,0 +1,225 @@
+"""The command line: signatures and help only.
+
+Bodies live in their own modules and are imported when their command runs, so that `--help` needs
+neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from aqualvs import __version__
+from aqualvs.errors import AqualvsError
+
+app = typer.Typer(
+    name="aqualvs",
+    help="Underwater laser vision: range, pitch and yaw to a net or wall.",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+# Older versions of Typer keep this class in Click, newer ones in a private module of their own.
+_USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
+_EXIT_BAD_INPUT = 2
+_EXIT_INTERRUPTED = 130
+
+RigFile = Annotated[Path, typer.Option("--rig", help="Rig file (YAML).", show_default=False)]
+OutFolder = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+]
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"aqualvs {__version__}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command(
+    help="Measure a dive: range, pitch and yaw for every frame, all points, and a report. "
+    "SOURCE is a video, a folder of images, or an address (rtsp://, udp://, http://).",
+    epilog="Example: aqualvs run dive.mp4 --rig rig.yaml -o out/dive",
+)
+def run(
+    source: Annotated[str, typer.Argument(help="Video, folder of images, or address.")],
+    rig: RigFile,
+    out: OutFolder,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a run that is there.")
+    ] = False,
+    target: Annotated[
+        Literal["auto", "net", "solid"], typer.Option(help="What the lasers hit.")
+    ] = "auto",
+    detector: Annotated[
+        Literal["ridge", "threshold"],
+        typer.Option(help="Stripe detector; threshold is the paper's, for comparison."),
+    ] = "ridge",
+    mesh_filter: Annotated[
+        Literal["none", "paper"],
+        typer.Option(help="Filter for nets; paper is the paper's Algorithm 1."),
+    ] = "none",
+    fit: Annotated[
+        Literal["robust", "pseudo_inverse"],
+        typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
+    ] = "robust",
+    water_n: Annotated[
+        float | None, typer.Option(help="Refractive index of the water.", show_default=False)
+    ] = None,
+    temperature_c: Annotated[
+        float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
+    ] = None,
+    salinity: Annotated[
+        float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
+    ] = None,
+    dome: Annotated[
+        bool, typer.Option("--dome/--no-dome", help="Refract at the dome, or ignore it.")
+    ] = True,
+    frames: Annotated[
+        str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
+    ] = ":",
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of a folder of images.", show_default=False)
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Write overlay.mp4 too.")] = False,
+    report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the truth to compare with.", show_default=False)
+    ] = None,
+) -> None:
+    """Measure a dive."""
+    from aqualvs.app import run as body
+    from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
+
+    request = body.RunRequest(
+        source=source,
+        rig=rig,
+        out=out,
+        overwrite=overwrite,
+        water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
+        no_dome=not dome,
+        frames=FrameWindow.parse(frames),
+        fps=fps,
+        scanner=scanner_options(target, detector, mesh_filter, fit),
+        overlay=overlay,
+        report=report,
+        truth=truth,
+    )
+    raise typer.Exit(body.run_and_tell(request, typer.echo))
+
+
+@app.command(
+    help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
+    "SCENARIO is a name from --list or a YAML file.",
+    epilog="Example: aqualvs simulate net -o out/net",
+)
+def simulate(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Scenario name or YAML file.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig file; the example rig if left out.", show_default=False)
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a dive that is there.")
+    ] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
+) -> None:
+    """Render a dive."""
+    from aqualvs.app import simulate as body
+
+    if list_:
+        body.tell_scenarios(typer.echo)
+    else:
+        body.simulate(scenario, rig, out, typer.echo, overwrite=overwrite)
+
+
+@app.command(
+    help="Run the bundled dive and compare it with its truth.",
+    epilog="Example: aqualvs demo -o out/demo",
+)
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out/demo"),
+) -> None:
+    """Run the bundled dive."""
+    from aqualvs.app import demo as body
+
+    raise typer.Exit(body.demo(out, typer.echo))
+
+
+@app.command(
+    help="Say in words whether a rig is sane and what it can measure.",
+    epilog="Example: aqualvs check rig.yaml",
+)
+def check(rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")]) -> None:
+    """Check a rig."""
+    from aqualvs.app.check import run_check
+
+    raise typer.Exit(run_check(rig))
+
+
+@app.command(
+    help="Write the report of a run again. After a run that was killed, its points are completed "
+    "first.",
+    epilog="Example: aqualvs report out/dive --truth truth.csv",
+)
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the truth to show.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a report again."""
+    from aqualvs.app.outputs import recover
+    from aqualvs.app.report import write_report
+
+    if recover(folder):
+        typer.echo(f"{folder}: points completed from the journal of a run that was killed")
+    typer.echo(f"report: {write_report(folder, truth=truth)}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str or None
+        Without the program's name; None takes them from the process.
+
+    Returns
+    -------
+    exit_code : int
+        0, or 2 for bad input, or 128 + signal for a run that was stopped.
+    """
+    try:
+        listed = None if arguments is None else list(arguments)
+        code = app(args=listed, prog_name="aqualvs", standalone_mode=False)
+    except AqualvsError as fault:
+        return _complain(str(fault), _EXIT_BAD_INPUT)
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain("interrupted", _EXIT_INTERRUPTED)
+    except _USAGE_ERROR as fault:
+        return _complain(f"{_usage(fault)}; see aqualvs --help", _EXIT_BAD_INPUT)
+    return int(code or 0)
+
+
+def _usage(fault: Exception) -> str:
+    """Return what is wrong with the arguments, as the parser words it, in one line."""
+    message = getattr(fault, "format_message", fault.__str__)()
+    return " ".join(str(message).split()).rstrip(".")
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"aqualvs: error: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,45 @@
+"""What goes wrong with files and folders, in one line that names the remedy."""
+
+import contextlib
+import errno
+from collections.abc import Iterator
+from pathlib import Path
+
+from aqualvs.errors import OutputError
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_REMEDIES = {
+    errno.EACCES: "choose a folder that you may write to",
+    errno.EPERM: "choose a folder that you may write to",
+    errno.EROFS: "choose a folder that you may write to",
+    errno.ENOTDIR: "a part of this path is a file; choose another folder",
+    errno.EEXIST: "this path is a file; choose another folder",
+    errno.EISDIR: "this path is a folder; choose another name",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn a fault of the operating system while writing to `path` into one line.
+
+    Raises
+    ------
+    OutputError
+        In place of any `OSError`.
+    """
+    try:
+        yield
+    except OSError as fault:
+        raise OutputError(explain(path, fault)) from fault
+
+
+def explain(path: Path, fault: OSError) -> str:
+    """Return what is wrong with `path` and what to do about it."""
+    if fault.errno in _FULL:
+        return (
+            f"{path}: the disk is full ({fault.strerror}); what was written stays readable, "
+            "free some space and run again"
+        )
+    remedy = _REMEDIES.get(fault.errno or 0, "check the path and the disk")
+    return f"{path}: cannot be written ({fault.strerror or fault}); {remedy}"

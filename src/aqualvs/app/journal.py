@@ -1,0 +1,138 @@
+"""`points.arrows`: the points of a run that is under way, as an Arrow IPC stream.
+
+Parquet cannot be read before its footer is written; a stream can be read up to its last whole
+batch, whatever happened after it.
+"""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+
+from aqualvs.app.append_file import AppendFile, is_locked
+from aqualvs.errors import OutputError
+from aqualvs.scanning.scan import Label, Scan
+
+LABELS = tuple(label.name.lower() for label in Label)
+POINTS_SCHEMA = pa.schema(
+    [
+        ("frame", pa.int32()),
+        ("time_s", pa.float64()),
+        ("laser", pa.int8()),
+        *((name, pa.float32()) for name in ("u_px", "v_px", "x_m", "y_m", "z_m")),
+        *((name, pa.float32()) for name in ("sigma_m", "quality")),
+        ("label", pa.dictionary(pa.int8(), pa.string())),
+    ]
+)
+"""Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`."""
+
+_LABEL_NAMES = pa.array(LABELS, pa.string())
+
+
+class PointsJournal:
+    """Writer of `points.arrows`, frame by frame as `AppendFile` does it.
+
+    Parameters
+    ----------
+    path : Path
+        Written anew.
+
+    Raises
+    ------
+    OSError
+        From the constructor and from `write`, as the system says it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = AppendFile(path)
+        self._file.lock()
+        self._waiting = io.BytesIO()
+        self._writer = pa.ipc.new_stream(pa.PythonFile(self._waiting, "w"), POINTS_SCHEMA)
+        self._closed = False
+
+    def write(self, scan: Scan) -> None:
+        """Append the points of one frame; a frame without points leaves no trace."""
+        if len(scan.points):
+            self._writer.write_batch(points_batch(scan))
+            self._append()
+
+    def close(self) -> None:
+        """Finish the stream; further calls do nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._writer.close()
+            self._append()
+        finally:
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is after a failed write: with every whole frame."""
+        self._closed = True
+        self._file.close()
+
+    def _append(self) -> None:
+        """Hand over what Arrow has written as many small parts."""
+        self._file.append(self._waiting.getvalue())
+        self._waiting.seek(0)
+        self._waiting.truncate()
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the stream, or leave it as it is where writing failed."""
+        if isinstance(fault, OSError):
+            self.abandon()
+        else:
+            self.close()
+
+
+def points_batch(scan: Scan) -> Any:
+    """Return the points of a frame as a record batch of `POINTS_SCHEMA`."""
+    points = scan.points
+    n = len(points)
+    numbers = np.empty((7, n), np.float32)
+    numbers[0:2] = points.pixels.T
+    numbers[2:5] = points.points_in_dome.T
+    numbers[5] = points.sigma
+    numbers[6] = points.quality
+    head = (np.full(n, scan.index, np.int32), np.full(n, scan.time_s), points.laser)
+    label = pa.array(np.ascontiguousarray(points.label).view(np.int8))
+    names = pa.DictionaryArray.from_arrays(label, _LABEL_NAMES, safe=False)
+    arrays = [*(pa.array(column) for column in (*head, *numbers)), names]
+    return pa.RecordBatch.from_arrays(arrays, schema=POINTS_SCHEMA)
+
+
+def read_journal(path: Path) -> Iterator[Any]:
+    """Yield the whole record batches of a journal, up to where it was cut off."""
+    with pa.OSFile(str(path), "rb") as file:
+        try:
+            yield from pa.ipc.open_stream(file)
+        except (pa.ArrowInvalid, OSError):
+            return
+
+
+def check_idle(path: Path) -> None:
+    """Raise if another process is still writing this journal.
+
+    Raises
+    ------
+    OutputError
+        If it is.
+    """
+    if is_locked(path):
+        raise OutputError(
+            f"{path.parent}: a run is still writing here; wait for its end or stop it first"
+        )

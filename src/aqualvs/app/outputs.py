@@ -1,0 +1,220 @@
+"""The folder that a run writes, kept readable whenever and however the run ends.
+
+==================  ========================================================================
+`posture.csv`       one row for every frame, on disk when the frame is done
+`points.arrows`     the points while the run is under way; becomes the next two at its end
+`points.parquet`    every stripe point
+`points.ply`        the points on the target
+`run.yaml`          source, options, versions, rig, status and summary
+==================  ========================================================================
+
+The report and the overlay video are written beside them by their own modules.
+"""
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import yaml
+
+from aqualvs.app.disk import explain, writing
+from aqualvs.app.journal import PointsJournal, check_idle
+from aqualvs.app.points_export import export_points
+from aqualvs.app.posture_csv import PostureCsv
+from aqualvs.app.runfile import RunFile, Status, now, write_yaml
+from aqualvs.app.tally import Tally, tally_of
+from aqualvs.errors import OutputError
+from aqualvs.scanning.scan import Scan
+
+POSTURE_CSV = "posture.csv"
+JOURNAL = "points.arrows"
+POINTS_PARQUET = "points.parquet"
+POINTS_PLY = "points.ply"
+RUN_YAML = "run.yaml"
+OVERLAY_MP4 = "overlay.mp4"
+REPORT_HTML = "report.html"
+RUN_FILES = (
+    RUN_YAML,
+    POSTURE_CSV,
+    JOURNAL,
+    POINTS_PARQUET,
+    POINTS_PLY,
+    OVERLAY_MP4,
+    REPORT_HTML,
+)
+"""What belongs to a run; nothing else in its folder is ever removed or replaced."""
+
+_KILLED = "the run ended before it could close its files; the folder was completed afterwards"
+
+
+class RunOutputs:
+    """Writer of a run's folder; a context manager that completes it however the run ends.
+
+    Parameters
+    ----------
+    folder : Path
+        From `prepare_folder`.
+    source, rig, options : mapping
+        For `run.yaml`.
+
+    Attributes
+    ----------
+    status : Status
+        What `run.yaml` will say if the run ends without a fault; set it before the end.
+    tally : Tally
+        Summary so far.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the disk is full or the folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        source: Mapping[str, Any],
+        rig: Mapping[str, Any],
+        options: Mapping[str, Any],
+    ) -> None:
+        self.folder = folder
+        self.status = Status.FINISHED
+        self.tally = Tally()
+        self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
+        with contextlib.ExitStack() as stack, writing(folder):
+            self._run_file.write(Status.RUNNING)
+            self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
+            self._points = stack.enter_context(PointsJournal(folder / JOURNAL))
+            self._open_files = stack.pop_all()
+
+    def write(self, scan: Scan) -> None:
+        """Write one frame; when this returns, the frame outlives the process."""
+        with writing(self.folder):
+            # Points first: a frame that has its row in posture.csv has its points too.
+            self._points.write(scan)
+            self._posture.write(scan)
+        self.tally.add(scan)
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Complete the folder: the journal becomes `points.parquet` and `points.ply`."""
+        if isinstance(fault, OutputError):
+            self._leave_as_it_is(fault)
+            return
+        try:
+            self._open_files.close()
+            _finish_points(self.folder)
+            self._run_file.write(self._final(fault), error=_words(fault), summary=self._summary())
+        except OSError as full:
+            refusal = OutputError(explain(self.folder, full))
+            self._leave_as_it_is(refusal)
+            raise refusal from full
+
+    def _leave_as_it_is(self, fault: OutputError) -> None:
+        """Close what is open without writing more than a disk in need can take."""
+        self._points.abandon()
+        self._posture.close()
+        with contextlib.suppress(OSError):
+            self._run_file.write(Status.FAILED, error=str(fault), summary=self._summary())
+
+    def _final(self, fault: BaseException | None) -> Status:
+        if fault is None:
+            return self.status
+        return Status.INTERRUPTED if isinstance(fault, KeyboardInterrupt) else Status.FAILED
+
+    def _summary(self) -> dict[str, Any]:
+        return self.tally.facts()
+
+
+def prepare_folder(folder: Path, *, overwrite: bool) -> None:
+    """Make sure that a run can be written to `folder`.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it does not exist.
+    overwrite : bool
+        Whether to remove the files of a run that is already there (`RUN_FILES`, no others).
+
+    Raises
+    ------
+    OutputError
+        If the folder holds a run and `overwrite` is not set, if another process is writing to it,
+        or if it cannot be written.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        found = [folder / name for name in RUN_FILES if (folder / name).exists()]
+        check_idle(folder / JOURNAL)
+        if found and not overwrite:
+            raise OutputError(
+                f"{folder}: already holds a run ({found[0].name}); "
+                "choose another folder or add --overwrite"
+            )
+        for path in found:
+            path.unlink()
+
+
+def recover(folder: Path) -> bool:
+    """Complete the folder of a run that was killed.
+
+    Returns
+    -------
+    recovered : bool
+        False if there was nothing left to do.
+
+    Raises
+    ------
+    OutputError
+        If `folder` holds no run, the run is still under way, or the folder cannot be written.
+    """
+    if not (folder / POSTURE_CSV).is_file():
+        raise OutputError(f"{folder}: holds no run (no {POSTURE_CSV}); give the folder of a run")
+    journal = folder / JOURNAL
+    check_idle(journal)
+    if not journal.exists():
+        return False
+    with writing(folder):
+        _finish_points(folder)
+        _mend_run_file(folder)
+    return True
+
+
+def _finish_points(folder: Path) -> None:
+    export_points(folder / JOURNAL, folder / POINTS_PARQUET, folder / POINTS_PLY)
+    (folder / JOURNAL).unlink()
+
+
+def _mend_run_file(folder: Path) -> None:
+    """Replace the status of a run that could not say how it ended."""
+    path = folder / RUN_YAML
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError):
+        return
+    if not isinstance(content, dict) or content.get("status") != Status.RUNNING:
+        return
+    known = {"status", "started", "ended", "error", "summary"}
+    head = {
+        "status": Status.INTERRUPTED.value,
+        "started": content.get("started"),
+        "error": _KILLED,
+        "completed": now(),
+        "summary": tally_of(folder / POSTURE_CSV).facts(),
+    }
+    write_yaml(path, head | {key: value for key, value in content.items() if key not in known})
+
+
+def _words(fault: BaseException | None) -> str:
+    return "" if fault is None else f"{fault}" or type(fault).__name__

@@ -1,0 +1,125 @@
+"""From the journal of a run to `points.parquet` and `points.ply`, batch by batch."""
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from aqualvs.app.journal import LABELS, POINTS_SCHEMA, read_journal
+from aqualvs.app.report_words import bgr, laser_colour
+from aqualvs.scanning.scan import Label
+
+_ROWS_PER_GROUP = 1 << 17
+_TARGET = LABELS[Label.TARGET]
+_N_LASERS = 128
+_VERTEX = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+)
+
+
+def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
+    """Write the points of a journal as Parquet, and those on the target as PLY.
+
+    Both files appear whole or not at all; memory does not grow with the journal.
+
+    Parameters
+    ----------
+    journal : Path
+        May lack its end; what follows the last whole batch is left out.
+    points_parquet : Path
+        Columns as `POINTS_SCHEMA`.
+    points_ply : Path
+        Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser.
+
+    Returns
+    -------
+    n_points : int
+        Points in `points_parquet`.
+
+    Raises
+    ------
+    OSError
+        As the system says it, a full disk for example; the journal is left as it is.
+    """
+    drafts = [path.with_name(path.name + ".part") for path in (points_parquet, points_ply)]
+    try:
+        n_points = _write_drafts(journal, *drafts)
+        os.replace(drafts[0], points_parquet)
+        os.replace(drafts[1], points_ply)
+    finally:
+        for draft in drafts:
+            draft.unlink(missing_ok=True)
+    return n_points
+
+
+def _write_drafts(journal: Path, parquet_draft: Path, ply_draft: Path) -> int:
+    n_points, n_vertices = 0, 0
+    with (
+        parquet.ParquetWriter(parquet_draft, POINTS_SCHEMA, compression="zstd") as table_file,
+        ply_draft.open("wb") as ply,
+    ):
+        ply.write(_ply_header(0))
+        for table in _row_groups(read_journal(journal)):
+            table_file.write_table(table)
+            vertices = _vertices(table)
+            vertices.tofile(ply)
+            n_points += table.num_rows
+            n_vertices += len(vertices)
+        ply.seek(0)
+        ply.write(_ply_header(n_vertices))
+    return n_points
+
+
+def _row_groups(batches: Iterable[Any]) -> Iterator[Any]:
+    """Join the batches of many frames into tables of about `_ROWS_PER_GROUP` rows."""
+    waiting: list[Any] = []
+    n_rows = 0
+    for batch in batches:
+        waiting.append(batch)
+        n_rows += batch.num_rows
+        if n_rows >= _ROWS_PER_GROUP:
+            yield pa.Table.from_batches(waiting)
+            waiting, n_rows = [], 0
+    if waiting:
+        yield pa.Table.from_batches(waiting)
+
+
+def _vertices(table: Any) -> NDArray[np.void]:
+    """Return the target points of a table as PLY vertices."""
+    label = table["label"].combine_chunks()
+    names = label.dictionary.to_pylist()
+    target = label.indices.to_numpy() == names.index(_TARGET)
+    vertices = np.empty(np.count_nonzero(target), _VERTEX)
+    for axis in "xyz":
+        vertices[axis] = table[f"{axis}_m"].to_numpy()[target]
+    colours = _LASER_RGB[table["laser"].to_numpy()[target]]
+    vertices["red"], vertices["green"], vertices["blue"] = colours.T
+    return vertices
+
+
+def _ply_header(n_vertices: int) -> bytes:
+    """Return a header of the same length for any count: a comment takes up the slack."""
+    count = f"element vertex {n_vertices}"
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment target points in dome coordinates, metres {'.' * (40 - len(count))}",
+        count,
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _laser_rgb() -> NDArray[np.uint8]:
+    """Return red, green, blue of every laser that an int8 can number, shape (128, 3)."""
+    return np.array([bgr(laser_colour(i))[::-1] for i in range(_N_LASERS)], np.uint8)
+
+
+_LASER_RGB = _laser_rgb()

@@ -1,0 +1,96 @@
+"""`posture.csv`: one row for every frame, on disk as soon as the frame is done."""
+
+import math
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from aqualvs.app.append_file import AppendFile
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Scan
+
+POSTURE_COLUMNS = (
+    "frame",
+    "time_s",
+    "valid",
+    "reason",
+    "range_m",
+    "pitch_deg",
+    "yaw_deg",
+    "sigma_range_m",
+    "sigma_pitch_deg",
+    "sigma_yaw_deg",
+    "slant_range_m",
+    "nearest_m",
+    "n_points",
+    "n_water",
+)
+_N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
+
+
+class PostureCsv:
+    """Writer of `posture.csv`, row by row as `AppendFile` does it.
+
+    Parameters
+    ----------
+    path : Path
+        Written anew.
+
+    Raises
+    ------
+    OSError
+        From the constructor and from `write`, as the system says it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = AppendFile(path)
+        try:
+            self._append(",".join(POSTURE_COLUMNS) + "\n")
+        except OSError:
+            self.close()
+            raise
+
+    def write(self, scan: Scan) -> None:
+        """Append the row of one frame."""
+        self._append(posture_row(scan))
+
+    def close(self) -> None:
+        """Close the file; further calls do nothing."""
+        self._file.close()
+
+    def _append(self, row: str) -> None:
+        self._file.append(row.encode("ascii"))
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+
+def posture_row(scan: Scan) -> str:
+    """Return a frame's row with its line end; without a posture the numbers stay empty."""
+    head = f"{scan.index},{scan.time_s:.6f}"
+    posture = scan.posture
+    if not isinstance(posture, Posture):
+        return f"{head},0,{posture.reason.value},{',' * (_N_NUMBERS - 1)}\n"
+    return f"{head},1,,{_numbers(posture)},{scan.n_water:.6f}\n"
+
+
+def _numbers(posture: Posture) -> str:
+    variance = posture.covariance
+    return (
+        f"{posture.range:.6f},{math.degrees(posture.pitch):.5f},{math.degrees(posture.yaw):.5f},"
+        f"{np.sqrt(variance[0, 0]):.4g},{math.degrees(np.sqrt(variance[1, 1])):.4g},"
+        f"{math.degrees(np.sqrt(variance[2, 2])):.4g},"
+        f"{posture.slant_range:.6f},{posture.nearest:.6f},{posture.n_points}"
+    )

@@ -1,0 +1,58 @@
+"""How far a run is, on standard error."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+Tick: TypeAlias = Callable[[int], None]
+
+
+class _Rate(ProgressColumn):
+    """Frames per second."""
+
+    def render(self, task: Task) -> Text:
+        """Return the rate as text."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.0f} frames/s")
+
+
+@contextlib.contextmanager
+def progress(label: str, n_frames: int | None) -> Iterator[Tick]:
+    """Show a progress bar; nothing where standard error is not a terminal.
+
+    Parameters
+    ----------
+    label : str
+        What is going on.
+    n_frames : int or None
+        Frames to come, if known.
+
+    Yields
+    ------
+    tick : callable
+        To be called with the number of frames that have been done since the last call.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate())
+    bar = Progress(
+        *columns,
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task(label, total=n_frames)
+        yield lambda n_done: bar.advance(task, n_done)

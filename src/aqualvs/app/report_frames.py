@@ -1,0 +1,189 @@
+"""Which frames the report shows, and their pictures decoded again from the source."""
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+
+from aqualvs.app.overlay import draw_points
+from aqualvs.app.report_points import FramePoints
+from aqualvs.app.report_run import Track
+from aqualvs.app.report_series import stretches
+from aqualvs.geometry.arrays import IntArray
+from aqualvs.live.sources.images import IMAGE_SUFFIXES, images_in
+from aqualvs.scanning.posture import Reason
+from aqualvs.scanning.scan import ImagePlane, Label
+
+N_PICTURES = 6
+N_SAMPLES = 24
+_WIDTH_PX = 800
+_JPEG_QUALITY = 80
+_SATURATED = 250
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A sample frame ready for the page.
+
+    Attributes
+    ----------
+    jpeg_base64 : str
+    size_px : (int, int)
+        Width and height as embedded.
+    saturated : float
+        Share of the target points that lie on a saturated pixel; NaN without target points.
+    """
+
+    jpeg_base64: str
+    size_px: tuple[int, int]
+    saturated: float
+
+
+def choose_pictures(track: Track) -> list[int]:
+    """Return rows of the frames worth a picture: refusals, the worst posture, an even spread."""
+    chosen = _refused_rows(track)
+    valid = np.flatnonzero(track.valid)
+    if len(valid):
+        relative = track.sigma[valid, 0] / track.posture[valid, 0]
+        chosen.append(int(valid[np.nan_to_num(relative).argmax()]))
+    spread = valid if len(valid) else np.arange(len(track))
+    while len(set(chosen)) < min(N_PICTURES, len(set(chosen) | set(spread.tolist()))):
+        chosen.append(_farthest(spread, chosen))
+    return sorted(set(chosen))
+
+
+def choose_samples(track: Track, pictures: list[int]) -> list[int]:
+    """Return rows for the laser-plane view: the pictures' and an even spread over the dive."""
+    even = _evenly(np.arange(len(track)), N_SAMPLES)
+    room = N_SAMPLES - len(pictures)
+    others = [row for row in even if row not in pictures]
+    return sorted([*pictures, *(others[i] for i in _evenly(np.arange(len(others)), room))])
+
+
+def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    """Decode the frames of some rows again.
+
+    Returns
+    -------
+    pictures : dict
+        Row to BGR picture, shape (height, width, 3); rows that cannot be decoded are absent.
+    """
+    if source.is_dir():
+        return _from_images(images_in(source), track, rows)
+    if source.suffix.lower() in IMAGE_SUFFIXES:
+        return _from_images([source], track, rows)
+    pictures = {}
+    try:
+        with av.open(str(source)) as container:
+            for row, picture in _from_video(container, track, rows):
+                pictures[row] = picture
+    except (av.error.FFmpegError, OSError, IndexError):
+        # A broken file gives what came before the fault.
+        return pictures
+    return pictures
+
+
+def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
+    """Draw the points of a frame into its picture and compress it for the page."""
+    scale = min(1.0, _WIDTH_PX / image.shape[1])
+    small = image
+    if scale < 1.0:
+        small = np.asarray(
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    if points is not None:
+        pixels = (points.pixels + 0.5) * scale - 0.5
+        small = draw_points(small, points.laser, pixels, points.label)
+    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    text = base64.b64encode(jpeg.tobytes()).decode("ascii")
+    return Picture(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
+
+
+def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:
+    """Return the share of target points on a pixel with a channel at 250 or above."""
+    if points is None:
+        return float("nan")
+    pixels = points.pixels[(points.label == Label.TARGET) & np.isfinite(points.pixels).all(axis=1)]
+    columns, rows = np.round(pixels).astype(np.int64).T
+    inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+    if not inside.any():
+        return float("nan")
+    brightest = image[rows[inside], columns[inside]].max(axis=-1)
+    return float((brightest >= _SATURATED).mean())
+
+
+def _refused_rows(track: Track) -> list[int]:
+    """Return the middle of the longest refusal, for the two commonest reasons with a picture."""
+    longest: dict[str, tuple[int, int]] = {}
+    for stretch in stretches(track):
+        middle = (stretch.first + stretch.last) // 2
+        reason = track.reasons[track.reason[middle]]
+        length = stretch.last - stretch.first + 1
+        if reason != Reason.CORRUPT_FRAME and length > longest.get(reason, (0, 0))[0]:
+            longest[reason] = (length, middle)
+    return [middle for _, middle in sorted(longest.values(), reverse=True)[:2]]
+
+
+def _evenly(rows: IntArray, count: int) -> list[int]:
+    """Return `count` of `rows`, evenly spread, both ends included."""
+    if count <= 0 or not len(rows):
+        return []
+    return [
+        int(rows[i]) for i in np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))
+    ]
+
+
+def _farthest(rows: IntArray, chosen: list[int]) -> int:
+    """Return the row that lies farthest from all chosen ones."""
+    if not chosen:
+        return int(rows[0])
+    distance = np.abs(rows[:, None] - np.array(chosen)).min(axis=1)
+    return int(rows[distance.argmax()])
+
+
+def _from_images(files: list[Path], track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    pictures = {}
+    for row in rows:
+        frame = int(track.frame[row])
+        image = cv2.imread(str(files[frame]), cv2.IMREAD_COLOR) if frame < len(files) else None
+        if image is not None:
+            pictures[row] = np.asarray(image, dtype=np.uint8)
+    return pictures
+
+
+def _from_video(
+    container: InputContainer, track: Track, rows: list[int]
+) -> Iterator[tuple[int, ImagePlane]]:
+    """Yield row and picture; jumps to the key frame before each frame that is wanted."""
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    start = next(container.decode(stream)).time or 0.0
+    half, base = 0.5 * _step_s(track), stream.time_base or Fraction(1, 90_000)
+    for row in rows:
+        wanted = start + float(track.time_s[row])
+        container.seek(round(wanted / base), stream=stream, backward=True)
+        found = _frame_at(container, wanted - half)
+        if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
+            yield row, np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+
+
+def _frame_at(container: InputContainer, earliest: float) -> VideoFrame | None:
+    for frame in container.decode(video=0):
+        if frame.time is not None and frame.time >= earliest:
+            return frame
+    return None
+
+
+def _step_s(track: Track) -> float:
+    """Return the usual time between frames of the source, in seconds."""
+    frames = np.diff(track.frame)
+    if not len(frames):
+        return 0.04
+    return float(np.nanmedian(np.diff(track.time_s) / np.maximum(frames, 1)))

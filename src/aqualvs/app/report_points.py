@@ -1,0 +1,272 @@
+"""One pass over a run's points, batch by batch: counts, histograms, a sample of everything."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from aqualvs.app.journal import read_journal
+from aqualvs.app.report_run import Track
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.scanning.scan import Label
+
+_BATCH = 1 << 16
+_CLOUD = 15_000
+_LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
+_NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label")
+_OPTIONAL = ("quality",)
+MAX_LASERS = 16
+
+QUALITY_EDGES = np.linspace(0.0, 1.0, 41)
+RESIDUAL_EDGES_MM = np.linspace(-50.0, 50.0, 1001)
+
+
+@dataclass(frozen=True, slots=True)
+class FramePoints:
+    """Stripe points of one sample frame, M of them.
+
+    Attributes
+    ----------
+    laser, label : integer array, shape (M,)
+    pixels : array, shape (M, 2)
+    points_in_dome : array, shape (M, 3)
+        Metres.
+    """
+
+    laser: IntArray
+    label: IntArray
+    pixels: FloatArray
+    points_in_dome: FloatArray
+
+
+@dataclass(slots=True)
+class PointSummary:
+    """What the report needs of all points of a dive; its size does not grow with their number.
+
+    Attributes
+    ----------
+    on_target : int array, shape (n_frames, MAX_LASERS)
+        Target points per frame and laser.
+    labels : int array, shape (MAX_LASERS, len(Label))
+        Points per laser and label over the dive.
+    squares_mm2, n_squares : array, shape (n_frames,)
+        Sum of squared distances of target points from the frame's plane, and their number.
+    quality, residual : int array, shape (MAX_LASERS, bins)
+        Histograms of the target points over `QUALITY_EDGES` and `RESIDUAL_EDGES_MM`.
+    cloud_in_dome, cloud_laser : array, shape (K, 3) and (K,)
+        Random target points of the dive, at most 15,000, the same ones every time.
+    samples : dict
+        Frame number to the points of that frame.
+    """
+
+    on_target: IntArray
+    squares_mm2: FloatArray
+    n_squares: IntArray
+    labels: IntArray = field(default_factory=lambda: _counts(len(Label)))
+    quality: IntArray = field(default_factory=lambda: _counts(len(QUALITY_EDGES) - 1))
+    residual: IntArray = field(default_factory=lambda: _counts(len(RESIDUAL_EDGES_MM) - 1))
+    cloud_in_dome: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    cloud_laser: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    samples: dict[int, FramePoints] = field(default_factory=dict)
+
+    @property
+    def n_lasers(self) -> int:
+        """Return one more than the highest laser number that has a point."""
+        seen = np.flatnonzero(self.labels.sum(axis=1))
+        return int(seen[-1]) + 1 if len(seen) else 0
+
+    def rms_mm(self) -> FloatArray:
+        """Return the rms distance of target points from the plane per frame; NaN without any."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rms: FloatArray = np.sqrt(self.squares_mm2 / self.n_squares)
+        return rms
+
+
+def summarize_points(
+    run_dir: Path, track: Track, sample_frames: list[int]
+) -> tuple[PointSummary | None, str]:
+    """Read a run's points once, in batches: `points.parquet`, else the journal of a killed run.
+
+    Returns
+    -------
+    summary : PointSummary or None
+        None where there are no points that can be read.
+    trouble : str
+        What is wrong, in words; "" if nothing.
+    """
+    summary = _empty(track)
+    rng = np.random.default_rng(20210126)
+    keys = np.zeros(0)
+    try:
+        for batch in _batches(run_dir):
+            keys = _add(summary, batch, track, sample_frames, keys, rng)
+    except FileNotFoundError:
+        return None, "points.parquet is missing: no points are shown."
+    except KeyError as absent:
+        return None, f"points.parquet has no column {absent}: no points are shown."
+    except (pa.ArrowInvalid, OSError):
+        return None, "points.parquet cannot be read to its end: no points are shown."
+    return summary, ""
+
+
+def plane_of_posture(posture: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return unit normals (N, 3) and distances (N,) in metres of postures (N, 3) in m and degrees.
+
+    Inverse of the paper's Eq. 23-26: n is along (tan yaw, 1, tan pitch).
+    """
+    pitch, yaw = np.deg2rad(posture[:, 1]), np.deg2rad(posture[:, 2])
+    normal = np.stack([np.tan(yaw), np.ones_like(yaw), np.tan(pitch)], axis=-1)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True), posture[:, 0]
+
+
+def _counts(bins: int) -> IntArray:
+    return np.zeros((MAX_LASERS, bins), dtype=np.int64)
+
+
+def _empty(track: Track) -> PointSummary:
+    n = len(track)
+    return PointSummary(
+        on_target=np.zeros((n, MAX_LASERS), dtype=np.int64),
+        squares_mm2=np.zeros(n),
+        n_squares=np.zeros(n, dtype=np.int64),
+    )
+
+
+def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
+    """Yield batches as arrays by column, labels as numbers."""
+    path, journal = run_dir / "points.parquet", run_dir / "points.arrows"
+    if path.exists() or not journal.exists():
+        with parquet.ParquetFile(path, pre_buffer=False) as file:
+            names = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.schema_arrow.names]
+            # One batch at a time, on one thread, keeps memory flat however long the dive.
+            batches = file.iter_batches(batch_size=_BATCH, columns=names, use_threads=False)
+            yield from map(_columns, batches)
+    else:
+        yield from map(_columns, read_journal(journal))
+
+
+def _columns(batch: Any) -> dict[str, NDArray[Any]]:
+    """Return the columns that the report needs.
+
+    Raises
+    ------
+    KeyError
+        Naming a column that is absent.
+    """
+    present = [name for name in _OPTIONAL if name in batch.schema.names]
+    return {
+        name: _label_codes(batch.column(name)) if name == "label" else _plain(batch.column(name))
+        for name in (*_NEEDED, *present)
+    }
+
+
+def _plain(column: Any) -> NDArray[Any]:
+    array: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return array
+
+
+def _label_codes(column: Any) -> NDArray[Any]:
+    """Return `Label` values of a column of names; a name unknown here counts as clutter."""
+    if pa.types.is_integer(column.type):
+        return _plain(column)
+    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+    names = coded.dictionary.to_pylist()
+    table = np.array([_LABEL_OF_NAME.get(name, int(Label.CLUTTER)) for name in names] or [0])
+    codes: NDArray[Any] = table[coded.indices.to_numpy(zero_copy_only=False)]
+    return codes
+
+
+def _add(
+    summary: PointSummary,
+    batch: dict[str, NDArray[Any]],
+    track: Track,
+    sample_frames: list[int],
+    keys: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Add one batch; returns the sampling keys of the cloud as it now is."""
+    row = np.searchsorted(track.frame, batch["frame"]).clip(max=len(track) - 1)
+    laser = batch["laser"].astype(np.int64)
+    known = (track.frame[row] == batch["frame"]) & (laser >= 0) & (laser < MAX_LASERS)
+    batch = {name: column[known] for name, column in batch.items()}
+    row, laser = row[known], laser[known]
+    label = batch["label"].astype(np.int64).clip(0, len(Label) - 1)
+    points = np.stack([batch["x_m"], batch["y_m"], batch["z_m"]], axis=-1).astype(np.float64)
+    np.add.at(summary.labels, (laser, label), 1)
+    _keep_samples(summary, batch, laser, label, points, sample_frames)
+    target = (label == Label.TARGET) & np.isfinite(points).all(axis=1)
+    np.add.at(summary.on_target, (row[target], laser[target]), 1)
+    if "quality" in batch:
+        quality = batch["quality"][target].astype(np.float64)
+        _count(summary.quality, QUALITY_EDGES, laser[target], quality)
+    _add_residuals(summary, track, row[target], laser[target], points[target])
+    return _grow_cloud(summary, points[target], laser[target], keys, rng)
+
+
+def _keep_samples(
+    summary: PointSummary,
+    batch: dict[str, NDArray[Any]],
+    laser: IntArray,
+    label: IntArray,
+    points: FloatArray,
+    sample_frames: list[int],
+) -> None:
+    """Keep the points of sample frames; a frame may go on in the next batch."""
+    for frame in np.intersect1d(batch["frame"], sample_frames).tolist():
+        mine = batch["frame"] == frame
+        pixels = np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64)
+        new = FramePoints(laser[mine], label[mine], pixels, points[mine])
+        old = summary.samples.get(frame)
+        summary.samples[frame] = new if old is None else _joined(old, new)
+
+
+def _joined(first: FramePoints, second: FramePoints) -> FramePoints:
+    return FramePoints(
+        np.concatenate([first.laser, second.laser]),
+        np.concatenate([first.label, second.label]),
+        np.concatenate([first.pixels, second.pixels]),
+        np.concatenate([first.points_in_dome, second.points_in_dome]),
+    )
+
+
+def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: FloatArray) -> None:
+    """Add values to the histogram of their laser; those beyond the edges go to the last bins."""
+    finite = np.isfinite(values)
+    step = edges[1] - edges[0]
+    bins = ((values[finite] - edges[0]) / step).clip(0, len(edges) - 2).astype(np.int64)
+    np.add.at(histogram, (laser[finite], bins), 1)
+
+
+def _add_residuals(
+    summary: PointSummary, track: Track, row: IntArray, laser: IntArray, points: FloatArray
+) -> None:
+    valid = track.valid[row]
+    row, laser, points = row[valid], laser[valid], points[valid]
+    normal, distance = plane_of_posture(track.posture[row])
+    residual_mm = 1e3 * (np.einsum("ij,ij->i", normal, points) - distance)
+    np.add.at(summary.squares_mm2, row, residual_mm**2)
+    np.add.at(summary.n_squares, row, 1)
+    _count(summary.residual, RESIDUAL_EDGES_MM, laser, residual_mm)
+
+
+def _grow_cloud(
+    summary: PointSummary,
+    points: FloatArray,
+    laser: IntArray,
+    keys: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Keep the points with the smallest of all random keys: a uniform sample of any stream."""
+    keys = np.concatenate([keys, rng.random(len(points))])
+    points = np.concatenate([summary.cloud_in_dome, points])
+    laser = np.concatenate([summary.cloud_laser, laser])
+    if len(keys) > _CLOUD:
+        kept = np.argpartition(keys, _CLOUD)[:_CLOUD]
+        keys, points, laser = keys[kept], points[kept], laser[kept]
+    summary.cloud_in_dome, summary.cloud_laser = points, laser
+    return keys

@@ -1,0 +1,223 @@
+"""Read what a run left behind: `run.yaml`, `posture.csv`, truth and the bare-lens posture."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import yaml
+from pyarrow import csv
+
+from aqualvs.errors import SourceError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+
+_NUMBERS = (
+    "frame",
+    "time_s",
+    "range_m",
+    "pitch_deg",
+    "yaw_deg",
+    "sigma_range_m",
+    "sigma_pitch_deg",
+    "sigma_yaw_deg",
+    "n_points",
+    "n_water",
+)
+_TRUE = ("true", "1", "yes")
+POSTURE = ("range_m", "pitch_deg", "yaw_deg")
+"""The three columns of a posture, in the order of every (N, 3) array of the report."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """`posture.csv` as arrays, one entry per frame, ordered by frame.
+
+    Attributes
+    ----------
+    frame : int array, shape (N,)
+    time_s : array, shape (N,)
+    valid : bool array, shape (N,)
+    reason : int array, shape (N,)
+        Index into `reasons`; meaningful where not valid.
+    reasons : tuple of str
+        As the file spells them.
+    posture, sigma : array, shape (N, 3)
+        Range in metres, pitch and yaw in degrees; NaN where not valid.
+    n_points, n_water : array, shape (N,)
+        NaN where the file has none.
+    """
+
+    frame: IntArray
+    time_s: FloatArray
+    valid: BoolArray
+    reason: IntArray
+    reasons: tuple[str, ...]
+    posture: FloatArray
+    sigma: FloatArray
+    n_points: FloatArray
+    n_water: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.frame)
+
+
+def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
+    """Return the content of `run.yaml` and what is wrong with it, in words ("" if nothing).
+
+    An interrupted run may have left none or half of one; the report is still worth having.
+    """
+    path = run_dir / "run.yaml"
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}, "run.yaml is missing: rig, options and source are unknown."
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return {}, "run.yaml cannot be read: rig, options and source are unknown."
+    if not isinstance(content, dict):
+        return {}, "run.yaml is empty or not a mapping: rig, options and source are unknown."
+    return content, ""
+
+
+def read_track(path: Path) -> Track:
+    """Read a `posture.csv`; rows cut short by an interruption are left out.
+
+    Raises
+    ------
+    SourceError
+        If the file is missing, holds no frame, or holds something that is no number.
+    """
+    columns = _read_columns(path, _NUMBERS, ("valid", "reason"))
+    order = np.argsort(columns["frame"], kind="stable")
+    posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
+    sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
+    claimed = np.isin(np.char.lower(columns["valid"]), _TRUE)[order]
+    valid = claimed & np.isfinite(posture).all(axis=1)
+    reasons, reason = np.unique(columns["reason"][order], return_inverse=True)
+    return Track(
+        frame=columns["frame"][order].astype(np.int64),
+        time_s=columns["time_s"][order],
+        valid=valid,
+        reason=reason.astype(np.int64),
+        reasons=tuple(str(name) for name in reasons),
+        posture=np.where(valid[:, None], posture, np.nan),
+        sigma=np.where(valid[:, None], sigma, np.nan),
+        n_points=columns["n_points"][order],
+        n_water=columns["n_water"][order],
+    )
+
+
+def read_truth(path: Path, track: Track) -> FloatArray:
+    """Read truth onto the frames of a track.
+
+    Parameters
+    ----------
+    path : Path
+        CSV with columns `frame`, `range_mm` or `range_m`, `pitch_deg`, `yaw_deg`.
+    track : Track
+
+    Returns
+    -------
+    truth : array, shape (N, 3)
+        As `Track.posture`; NaN where the file has no such frame.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or shares no frame with the track.
+    """
+    columns = _read_columns(path, ("frame", "range_mm", *POSTURE), ())
+    range_m = columns["range_m"]
+    range_m = np.where(np.isfinite(range_m), range_m, columns["range_mm"] / 1e3)
+    values = np.stack([range_m, columns["pitch_deg"], columns["yaw_deg"]], axis=-1)
+    truth = _onto(track.frame, columns["frame"], values)
+    if not np.isfinite(truth).any():
+        raise SourceError(f"{path}: no frame in common with the run; give the truth of this dive")
+    return truth
+
+
+def read_bare(run_dir: Path, run: Mapping[str, Any], track: Track) -> FloatArray | None:
+    """Return the posture that a bare-lens camera gives on the same pixels, if the run has it.
+
+    Taken from `posture_bare.csv`, else from `comparison: bare_lens:` in `run.yaml`, a list of rows
+    with the same columns.
+
+    Returns
+    -------
+    posture : array, shape (N, 3), or None
+        As `Track.posture`, on the frames of `track`.
+    """
+    path = run_dir / "posture_bare.csv"
+    if path.is_file():
+        bare = read_track(path)
+        return _onto(track.frame, bare.frame.astype(np.float64), bare.posture)
+    comparison = run.get("comparison")
+    rows = comparison.get("bare_lens") if isinstance(comparison, dict) else None
+    if not isinstance(rows, list):
+        return None
+    numbers = [_row(row) for row in rows if isinstance(row, dict)]
+    if not numbers:
+        return None
+    table = np.array(numbers, dtype=np.float64)
+    return _onto(track.frame, table[:, 0], table[:, 1:])
+
+
+def number(value: object) -> float:
+    """Return a file's value as a finite float, NaN where it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return float("nan")
+    return float(value) if np.isfinite(value) else float("nan")
+
+
+def _row(row: Mapping[str, Any]) -> list[float]:
+    return [number(row.get("frame")), *(number(row.get(name)) for name in POSTURE)]
+
+
+def _onto(frames: IntArray, from_frames: FloatArray, values: FloatArray) -> FloatArray:
+    """Return rows of `values` for each of `frames`, NaN where there is none."""
+    known = np.isfinite(from_frames)
+    from_frames, values = from_frames[known], values[known]
+    found = np.full((len(frames), values.shape[1]), np.nan)
+    if not len(from_frames):
+        return found
+    order = np.argsort(from_frames, kind="stable")
+    place = np.searchsorted(from_frames[order], frames).clip(max=len(order) - 1)
+    rows = order[place]
+    match = from_frames[rows] == frames
+    found[match] = values[rows[match]]
+    return found
+
+
+def _read_columns(
+    path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]
+) -> dict[str, np.ndarray[Any, Any]]:
+    """Read the named columns of a CSV; a missing column becomes NaN or empty text."""
+    table = _read_table(path, numbers, texts)
+    frame = table["frame"].to_numpy(zero_copy_only=False).astype(np.float64)
+    table = table.filter(pa.array(np.isfinite(frame)))
+    if not table.num_rows:
+        raise SourceError(f"{path}: holds no frame; there is nothing to report, run the dive again")
+    columns = {name: _numbers(table[name]) for name in numbers}
+    return columns | {name: np.array(table[name].to_pylist(), dtype=np.str_) for name in texts}
+
+
+def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) -> Any:
+    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(texts, pa.string())
+    convert = csv.ConvertOptions(
+        column_types=types, include_columns=list(types), include_missing_columns=True
+    )
+    parse = csv.ParseOptions(invalid_row_handler=lambda _row: "skip")
+    try:
+        return csv.read_csv(path, parse_options=parse, convert_options=convert)
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; name the folder of a run, or run it") from None
+    except (pa.ArrowInvalid, OSError) as fault:
+        first_line = str(fault).splitlines()[0]
+        raise SourceError(f"{path}: cannot be read ({first_line}); mend or remove it") from fault
+
+
+def _numbers(column: Any) -> FloatArray:
+    values = column.to_numpy(zero_copy_only=False).astype(np.float64)
+    return np.where(np.isfinite(values), values, np.nan)

@@ -1,0 +1,70 @@
+"""How the report and the overlay call things, and the colours that they share.
+
+Colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), which remain distinct under
+the common forms of colour blindness.
+"""
+
+from aqualvs.scanning.posture import Reason
+from aqualvs.scanning.scan import Label
+
+REASON_WORDS: dict[str, str] = {
+    Reason.NO_STRIPES: "no stripes seen",
+    Reason.TOO_FEW_POINTS: "too few points on the target",
+    Reason.ONE_LASER: "only one laser on the target",
+    Reason.COLLINEAR: "points lie on one line",
+    Reason.NOT_A_PLANE: "stripes share no plane",
+    Reason.NO_TARGET: "no target of the kind asked for",
+    Reason.OUT_OF_RANGE: "target outside the working range",
+    Reason.CORRUPT_FRAME: "frame could not be decoded",
+}
+
+LABEL_WORDS: dict[Label, str] = {
+    Label.TARGET: "target",
+    Label.OTHER_SURFACE: "other surface",
+    Label.CLUTTER: "clutter",
+    Label.AMBIGUOUS: "ambiguous",
+    Label.OUT_OF_RANGE: "out of range",
+}
+
+LABEL_COLOURS: dict[Label, str] = {
+    Label.TARGET: "#009E73",
+    Label.OTHER_SURFACE: "#0072B2",
+    Label.CLUTTER: "#D55E00",
+    Label.AMBIGUOUS: "#CC79A7",
+    Label.OUT_OF_RANGE: "#999999",
+}
+
+# The first ones stay visible on a dark green picture as well as on white paper.
+LASER_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#D55E00", "#0072B2", "#009E73", "#F0E442")
+
+
+def reason_words(reason: str) -> str:
+    """Return a refusal in words; a reason unknown here comes back readable, not lost."""
+    key, _, detail = reason.partition(":")
+    words = REASON_WORDS.get(key.strip(), key.strip().replace("_", " ")) or "no reason given"
+    return f"{words} ({detail.strip()})" if detail.strip() else words
+
+
+def laser_colour(index: int) -> str:
+    """Return the colour, as #RRGGBB, of laser `index` in every chart and picture."""
+    return LASER_COLOURS[index % len(LASER_COLOURS)]
+
+
+def bgr(colour: str) -> tuple[int, int, int]:
+    """Return #RRGGBB as OpenCV's (blue, green, red)."""
+    value = int(colour.removeprefix("#"), 16)
+    return value & 255, (value >> 8) & 255, value >> 16
+
+
+def clock(seconds: float) -> str:
+    """Return a time since the start as m:ss, or h:mm:ss from one hour on; short ones as 7.3 s."""
+    if seconds < 60.0:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def signed(text: str) -> str:
+    """Return text with a true minus sign before its negative numbers."""
+    return text.replace("-", "−")

@@ -1,0 +1,167 @@
+"""What `aqualvs run` is asked to do, checked before anything is written."""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.sources import FrameSource
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.water import seawater_index_vacuum
+from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.scanning.pipeline import FitMethod, ScannerOptions
+from aqualvs.scanning.stripe import StripeOptions
+from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.threshold import ThresholdOptions
+
+_INDEX_LIMITS = (1.0, 1.5)
+"""Air is 1.0003, the densest brine about 1.39."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Water:
+    """What the user says about the medium; all None leaves the rig's own index.
+
+    Attributes
+    ----------
+    n_water : float or None
+        Refractive index relative to vacuum.
+    temperature_c, salinity : float or None
+        Degrees Celsius and per mille; only together.
+    """
+
+    n_water: float | None = None
+    temperature_c: float | None = None
+    salinity: float | None = None
+
+    def applied_to(self, rig: Rig) -> Rig:
+        """Return the rig in this water.
+
+        Raises
+        ------
+        OptionError
+            If the values contradict each other or lie outside of what water can be.
+        """
+        seawater = (self.temperature_c, self.salinity)
+        if self.n_water is not None:
+            if seawater != (None, None):
+                raise OptionError("--water-n: give the index or temperature and salinity, not both")
+            return rig.in_water(_checked_index(self.n_water))
+        if self.temperature_c is None and self.salinity is None:
+            return rig
+        if self.temperature_c is None or self.salinity is None:
+            missing = "--salinity" if self.salinity is None else "--temperature-c"
+            raise OptionError(f"{missing}: missing; the index of water needs both")
+        index = seawater_index_vacuum(self.temperature_c, self.salinity, n_air=rig.n_air)
+        return rig.in_water(float(index))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameWindow:
+    """Frames `first` to `stop` (not included) of a source; `stop` None means to its end."""
+
+    first: int = 0
+    stop: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> "FrameWindow":
+        """Return the window that "A:B", "A:" or ":B" means.
+
+        Raises
+        ------
+        OptionError
+            If the text is none of these, or the window is empty.
+        """
+        first, colon, stop = text.partition(":")
+        remedy = "give A:B with frame numbers from 0, such as 100:200, 100: or :200"
+        if not colon or not all(part.isdecimal() or not part for part in (first, stop)):
+            raise OptionError(f"--frames {text}: not understood; {remedy}")
+        window = cls(int(first or 0), int(stop) if stop else None)
+        if window.stop is not None and window.stop <= window.first:
+            raise OptionError(f"--frames {text}: holds no frame; {remedy}")
+        return window
+
+    def n_frames(self, n_source: int | None) -> int | None:
+        """Return how many frames of a source of `n_source` lie in the window, if known."""
+        ends = [end for end in (self.stop, n_source) if end is not None]
+        return max(0, min(ends) - self.first) if ends else None
+
+
+def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> ScannerOptions:
+    """Return the scanner's options from the words of the command line.
+
+    Parameters
+    ----------
+    target : {"auto", "net", "solid"}
+    detector : {"ridge", "threshold"}
+    mesh_filter : {"none", "paper"}
+    fit : {"robust", "pseudo_inverse"}
+    """
+    return ScannerOptions(
+        target=TargetKind(target),
+        detector=ThresholdOptions() if detector == "threshold" else StripeOptions(),
+        mesh_filter=MeshFilterOptions() if mesh_filter == "paper" else None,
+        fit=FitMethod(fit),
+    )
+
+
+def scanner_facts(options: ScannerOptions) -> dict[str, Any]:
+    """Return the scanner's options as `run.yaml` holds them."""
+    found: dict[str, Any] = asdict(options)
+    threshold = isinstance(options.detector, ThresholdOptions)
+    found["detector"] = {"kind": "threshold" if threshold else "ridge", **found["detector"]}
+    found["target"] = options.target.value
+    found["fit"] = options.fit.value
+    return found
+
+
+def prepared_rig(path: Path, water: Water, *, no_dome: bool) -> Rig:
+    """Load a rig and put it into the water it is used in.
+
+    Raises
+    ------
+    RigError
+        If the file cannot be used, or the rig has no lasers.
+    OptionError
+        If the water makes no sense.
+    """
+    rig = water.applied_to(load_rig(path))
+    return replace(rig, dome=None) if no_dome else rig
+
+
+def check_fits(source: FrameSource, rig: Rig) -> None:
+    """Raise if the pictures are not of the size that the rig was calibrated for.
+
+    Raises
+    ------
+    SourceError
+        If they are not.
+    """
+    if source.size_px != rig.size_px:
+        have, need = ("x".join(map(str, size)) for size in (source.size_px, rig.size_px))
+        raise SourceError(
+            f"{source.name}: pictures of {have} px, but the rig {rig.name!r} has {need} px; "
+            "use the rig of this camera in this video mode"
+        )
+
+
+def source_facts(source: FrameSource) -> dict[str, Any]:
+    """Return what identifies a source without reading all of it."""
+    found: dict[str, Any] = {"name": source.name}
+    path = Path(source.name)
+    if path.exists():
+        found["path"] = str(path.resolve())
+    if path.is_file():
+        found["size_bytes"] = path.stat().st_size
+    found["width_px"], found["height_px"] = source.size_px
+    found["fps"] = source.fps
+    found["n_frames"] = source.n_frames
+    return found
+
+
+def _checked_index(n_water: float) -> float:
+    low, high = _INDEX_LIMITS
+    if not low <= n_water <= high:
+        raise OptionError(f"--water-n {n_water:g}: no water; give a value from {low} to {high}")
+    return n_water

@@ -1,0 +1,99 @@
+"""`run.yaml`: what was run, on what, with what, and how it went."""
+
+import os
+import platform
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aqualvs import __version__
+
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "av")
+
+
+class Status(StrEnum):
+    """How a run stands; the value is what `run.yaml` says in `status`."""
+
+    RUNNING = "running"
+    """Under way, or killed before it could say otherwise."""
+    FINISHED = "finished"
+    INTERRUPTED = "interrupted"
+    """Stopped by the user or the system."""
+    FAILED = "failed"
+
+
+@dataclass(slots=True)
+class RunFile:
+    """Content of `run.yaml`.
+
+    Attributes
+    ----------
+    path : Path
+    source, rig, options : mapping
+        Facts that do not change during the run, ready for YAML.
+    started : str
+        ISO 8601 with the time zone.
+    """
+
+    path: Path
+    source: Mapping[str, Any]
+    rig: Mapping[str, Any]
+    options: Mapping[str, Any]
+    started: str = field(default_factory=lambda: now())
+
+    def write(
+        self, status: Status, *, error: str = "", summary: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write the file, whole or not at all.
+
+        Raises
+        ------
+        OSError
+            As the system says it.
+        """
+        content: dict[str, Any] = {"status": status.value, "started": self.started}
+        if status is not Status.RUNNING:
+            content["ended"] = now()
+        if error:
+            content["error"] = error
+        if summary is not None:
+            content["summary"] = dict(summary)
+        content["source"] = dict(self.source)
+        content["options"] = dict(self.options)
+        content["versions"] = versions()
+        content["rig"] = dict(self.rig)
+        write_yaml(self.path, content)
+
+
+def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a mapping as YAML in its own order; the old file stays until the new one is whole."""
+    draft = path.with_name(path.name + ".part")
+    text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
+    try:
+        draft.write_text(text, encoding="utf-8")
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, of Python and of what computes the numbers."""
+    found = {"aqualvs": __version__, "python": platform.python_version(), "system": sys.platform}
+    for name in _LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def now() -> str:
+    """Return the time, with its zone, to the second."""
+    return datetime.now(UTC).astimezone().isoformat(timespec="seconds")

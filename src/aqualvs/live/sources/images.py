@@ -1,0 +1,111 @@
+"""Frames from a folder or a list of images."""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self, cast
+
+import cv2
+
+from aqualvs.errors import SourceError
+from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import Frame, ImagePlane
+
+IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+
+
+class ImageSource:
+    """Images as frames, in natural order of their names (`img2` before `img10`).
+
+    Parameters
+    ----------
+    paths : Path or sequence of Path
+        A folder, or the images themselves (taken in the order given).
+    fps : float
+        Images have no clock: `Frame.time_s` is the index divided by this.
+
+    Raises
+    ------
+    SourceError
+        If there is no image, or the first one cannot be read.
+    """
+
+    def __init__(self, paths: Path | Sequence[Path], *, fps: float = 1.0) -> None:
+        self.name = str(paths) if isinstance(paths, Path) else f"{len(paths)} images"
+        self.fps = fps
+        self._paths = images_in(paths) if isinstance(paths, Path) else list(paths)
+        if not self._paths:
+            raise SourceError(f"{self.name}: no images; name at least one")
+        first = _read(self._paths[0])
+        if first is None:
+            raise SourceError(f"{self._paths[0]}: not a readable image; remove or replace it")
+        self.size_px = (first.shape[1], first.shape[0])
+        self.n_frames = len(self._paths)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the readable images; unreadable ones leave a gap in the index."""
+        last = -1
+        for index, path in enumerate(self._paths):
+            image = _read(path)
+            if image is None:
+                continue
+            self._check_size(path, image)
+            luma, chroma = planes_of_image(image)
+            yield Frame(index, index / self.fps, luma, chroma)
+            last = index
+        if last + 1 < self.n_frames:
+            raise SourceError(f"{self._paths[-1]}: not a readable image; remove or replace it")
+
+    def _check_size(self, path: Path, image: ImagePlane) -> None:
+        size = (image.shape[1], image.shape[0])
+        if size != self.size_px:
+            raise SourceError(
+                f"{path}: {size[0]}x{size[1]} px, but the first image has "
+                f"{self.size_px[0]}x{self.size_px[1]} px; keep one size a folder"
+            )
+
+    def __enter__(self) -> Self:
+        """Return itself; nothing stays open between two images."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Do nothing; no image file stays open."""
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the images in a folder, sorted naturally.
+
+    Raises
+    ------
+    SourceError
+        If the folder holds none, or cannot be listed.
+    """
+    try:
+        found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    except OSError as fault:
+        raise SourceError(f"{folder}: cannot be listed ({fault.strerror})") from fault
+    if not found:
+        kinds = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise SourceError(f"{folder}: no images in this folder; looked for {kinds}")
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key in which runs of digits count by value."""
+    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", path.name)]
+
+
+def _read(path: Path) -> ImagePlane | None:
+    """Return the image, grey if it is grey, or None if it cannot be decoded."""
+    level = cv2.utils.logging.setLogLevel(0)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    return cast("ImagePlane | None", image)

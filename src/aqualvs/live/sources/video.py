@@ -1,0 +1,254 @@
+"""Frames from a video file or stream, decoded by FFmpeg through PyAV."""
+
+import heapq
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import av
+from av.container import InputContainer
+from av.packet import Packet
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+
+from aqualvs.errors import SourceError
+from aqualvs.live.sources.planes import planes_of
+from aqualvs.scanning.scan import Frame
+
+_STALL_S = 10.0
+"""A stream that sends nothing for so long has ended."""
+
+_HIDDEN_PACKETS = frozenset({"vp8"})
+"""Codecs whose packets need not show a picture, so that packets cannot be counted as frames."""
+
+_LOSSY_CONTAINERS = frozenset({"mpegts", "rtsp"})
+"""Containers in which a packet marked as damaged still holds most of its picture, which helps to
+predict the next ones. Elsewhere it is the torn end of a file; its error would take the sound
+pictures with it that the decoder still holds."""
+
+
+class VideoSource:
+    """A video file, or a stream that FFmpeg can open.
+
+    Parameters
+    ----------
+    where : str or Path
+        Path or address.
+    threads : int
+        Decoder threads; they decode ahead while the caller works on a frame, which delays a live
+        stream by `threads - 1` frames.
+
+    Attributes
+    ----------
+    name, size_px, fps, n_frames
+        As in `FrameSource`.
+
+    Raises
+    ------
+    SourceError
+        If the file is missing, empty or cut off before its index, or is not a video.
+
+    Notes
+    -----
+    Pictures that the decoder had to patch up are dropped, not delivered: a stripe copied from the
+    picture before would give a posture that looks sound. Pictures predicted from a lost one are
+    delivered; they mend themselves at the next key frame. Damage that happens to be valid code goes
+    unseen.
+    """
+
+    def __init__(self, where: str | Path, *, threads: int = 2) -> None:
+        self.name = str(where)
+        self._container = _open(self.name)
+        self._stream = self._video_stream()
+        # With frame threads FFmpeg marks the pictures it had to patch up; with slices it does not.
+        self._stream.codec_context.thread_type = "FRAME"
+        self._stream.codec_context.thread_count = threads
+        self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
+        rate = self._stream.average_rate or self._stream.guessed_rate
+        self.fps = float(rate) if rate else None
+        self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
+        self._promised_s = _promised_duration(self._stream)
+        self.n_frames = self._stream.frames or self._estimated_frames()
+        self._ledger = _Ledger(
+            counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the sound frames; lost ones leave a gap in the index.
+
+        Raises
+        ------
+        SourceError
+            At the end, if frames that the container promised did not come; or when the picture
+            size changes, or a stream stalls.
+        """
+        n_delivered, last = 0, None
+        for picture in self._pictures():
+            index = self._ledger.number(picture.pts)
+            if picture.is_corrupt:
+                continue
+            last = self._frame(picture, index)
+            n_delivered += 1
+            yield last
+        self._check_complete(n_delivered, last)
+
+    def _pictures(self) -> Iterator[VideoFrame]:
+        """Decode what can be decoded, in order of presentation."""
+        for packet in self._packets():
+            self._ledger.expect(packet)
+            if packet.is_corrupt and not self._damage_is_partial:
+                continue
+            try:
+                pictures = packet.decode()
+            except av.error.InvalidDataError:
+                continue
+            for picture in pictures:
+                if isinstance(picture, VideoFrame):
+                    yield picture
+
+    def _packets(self) -> Iterator["Packet[VideoStream]"]:
+        """Read packets; a damaged container ends early, which the promise then reveals."""
+        try:
+            yield from self._container.demux(self._stream)
+        except av.error.InvalidDataError:
+            return
+        except av.error.FFmpegError as fault:
+            raise SourceError(f"{self.name}: the stream broke off ({fault.strerror})") from fault
+
+    def _frame(self, picture: VideoFrame, index: int) -> Frame:
+        if (picture.width, picture.height) != self.size_px:
+            raise SourceError(
+                f"{self.name}: the picture size changes from {self.size_px[0]}x{self.size_px[1]} "
+                f"to {picture.width}x{picture.height} px at frame {index}; cut the video there"
+            )
+        luma, chroma = planes_of(picture)
+        return Frame(index, self._time_of(picture, index), luma, chroma)
+
+    def _time_of(self, picture: VideoFrame, index: int) -> float:
+        """Return seconds since the start of the stream, by its own clock where it has one."""
+        if picture.pts is None or self._stream.time_base is None:
+            return index / (self.fps or 1.0)
+        return float((picture.pts - (self._ledger.first_pts or 0)) * self._stream.time_base)
+
+    def _check_complete(self, n_delivered: int, last: Frame | None) -> None:
+        """Raise if the file ended before its promise, or if its last frames are lost."""
+        index, time_s = (-1, 0.0) if last is None else (last.index, last.time_s)
+        exact = self._stream.frames
+        cut = self._ledger.n_packets < exact if exact else self._ends_early(time_s)
+        if not cut and index + 1 == self._ledger.n_known:
+            return
+        promised = f"{exact}" if exact else f"about {max(self.n_frames or 0, self._ledger.n_known)}"
+        raise SourceError(
+            f"{self.name}: only {n_delivered} of {promised} frames could be decoded, the last at "
+            f"{time_s:.2f} s; the file is cut short or damaged, copy it again from the recorder"
+        )
+
+    def _ends_early(self, time_s: float) -> bool:
+        """Return whether the last frame lies clearly before the promised end."""
+        if self._promised_s is None or self.fps is None:
+            return False
+        return time_s + max(3 / self.fps, 0.02 * self._promised_s) < self._promised_s
+
+    def _estimated_frames(self) -> int | None:
+        if self._promised_s is None or self.fps is None:
+            return None
+        return round(self._promised_s * self.fps)
+
+    def _video_stream(self) -> VideoStream:
+        if not self._container.streams.video:
+            self._container.close()
+            raise SourceError(f"{self.name}: holds no video; give a video file")
+        stream = self._container.streams.video[0]
+        if stream.codec_context is None or not stream.codec_context.width:
+            self._container.close()
+            raise SourceError(f"{self.name}: no picture in this video; record it again")
+        return stream
+
+    def close(self) -> None:
+        """Close the file; frames already delivered stay valid."""
+        self._container.close()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+
+class _Ledger:
+    """Numbers pictures by the packets that announced them, so that lost ones leave a gap."""
+
+    def __init__(self, *, counts_packets: bool) -> None:
+        self.first_pts: int | None = None
+        self.n_packets = 0
+        self._counts_packets = counts_packets
+        self._pending: list[int] = []
+        self._next = 0
+
+    @property
+    def n_known(self) -> int:
+        """Pictures numbered so far and announced ones that have not come."""
+        return self._next + len(self._pending)
+
+    def expect(self, packet: "Packet[VideoStream]") -> None:
+        """Note a packet; the empty one that flushes the decoder does not count."""
+        if packet.size == 0:
+            return
+        self.n_packets += 1
+        if packet.pts is None or packet.is_discard or not self._counts_packets:
+            return
+        heapq.heappush(self._pending, packet.pts)
+
+    def number(self, pts: int | None) -> int:
+        """Return the number of a picture, counting those lost before it."""
+        if self.first_pts is None and pts is not None:
+            self.first_pts = min(pts, *self._pending[:1])
+        while pts is not None and self._pending and self._pending[0] < pts:
+            heapq.heappop(self._pending)
+            self._next += 1
+        while pts is not None and self._pending and self._pending[0] == pts:
+            heapq.heappop(self._pending)
+        self._next += 1
+        return self._next - 1
+
+
+def _open(where: str) -> InputContainer:
+    """Open a container, or say in one line why not."""
+    try:
+        return av.open(where, timeout=_STALL_S)
+    except FileNotFoundError as fault:
+        raise SourceError(f"{where}: no such file; check the path") from fault
+    except (av.error.InvalidDataError, av.error.EOFError) as fault:
+        raise SourceError(_not_a_video(where)) from fault
+    except (av.error.FFmpegError, OSError) as fault:
+        raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
+
+
+def _not_a_video(where: str) -> str:
+    path = Path(where)
+    if path.is_file() and path.stat().st_size == 0:
+        return f"{where}: the file is empty (0 bytes); copy it again from the recorder"
+    return (
+        f"{where}: not a video, or cut short before its index was written; "
+        "check the file or copy it again from the recorder"
+    )
+
+
+def _promised_duration(stream: VideoStream) -> float | None:
+    """Return the duration in seconds that the container states for the video alone."""
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * Fraction(stream.time_base))
+    clock = stream.metadata.get("DURATION", "").split(":")
+    if len(clock) != 3:
+        return None
+    hours, minutes, seconds = (float(part) for part in clock)
+    return 3600 * hours + 60 * minutes + seconds

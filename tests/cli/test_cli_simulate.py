@@ -1,0 +1,51 @@
+"""`aqualvs simulate`, and what it writes through `aqualvs run`."""
+
+import pytest
+
+from aqualvs.app.cli import main
+from aqualvs.simulation.scenarios import list_scenarios
+from shell_cases import rig_file
+
+
+def test_the_list_names_every_scenario(capsys):
+    assert main(["simulate", "--list"]) == 0
+    said = capsys.readouterr().out
+    assert [line.split()[0] for line in said.splitlines()] == list(list_scenarios())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "SCENARIO"),
+        (["wall"], "--out"),
+        (["nowhere", "-o", "x"], "nowhere"),
+        (["missing.yaml", "-o", "x"], "missing.yaml"),
+        (["wall", "-o", "x", "--rig", "missing-rig.yaml"], "missing-rig.yaml"),
+    ],
+)
+def test_bad_input_gives_one_line(arguments, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert words in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_dive_is_kept(tmp_path, capsys):
+    (tmp_path / "dive.mp4").write_bytes(b"precious")
+    assert main(["simulate", "wall", "-o", str(tmp_path), "--rig", str(rig_file(tmp_path))]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (tmp_path / "dive.mp4").read_bytes() == b"precious"
+
+
+def test_a_simulated_dive_runs_against_its_truth(tmp_path, capsys):
+    scenario = tmp_path / "short.yaml"
+    scenario.write_text("duration_s: 0.12\nmotion: {range_mm: [500, 520]}\nwalls: [{}]\n")
+    dive = tmp_path / "dive"
+    assert main(["simulate", str(scenario), "-o", str(dive)]) == 0
+    assert sorted(p.name for p in dive.iterdir()) == ["dive.mp4", "rig.yaml", "truth.csv"]
+    said = capsys.readouterr().out
+    command = next(line for line in said.splitlines() if line.startswith("next: aqualvs "))
+    assert main([*command.removeprefix("next: aqualvs ").split(), "--no-report"]) == 0
+    assert "against the truth in 3 frames" in capsys.readouterr().out

@@ -1,0 +1,361 @@
+"""Sources: what arrives is what was encoded, and what is missing is said."""
+
+import gc
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.video.frame import VideoFrame
+
+from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.sources import ImageSource, VideoSource, open_source
+from aqualvs.live.sources.planes import planes_of, planes_of_image
+from shell_cases import (
+    all_key_frames,
+    cut_after,
+    damage_frame,
+    destroy_frame,
+    grain,
+    luma_level,
+    picture,
+    write_video,
+)
+
+SMALL = (96, 64)
+
+# Less than half of the step between two pictures; lossy encoders miss a flat level by up to 3.
+LEVEL_TOLERANCE = 4.0
+
+
+def luma_levels(source):
+    with source:
+        return {f.index: float(f.luma.mean()) for f in source}
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pix_fmt", "options"),
+    [
+        ("a.mp4", "libx264", "yuv420p", {"bf": "2"}),
+        ("a.mkv", "libx264", "yuv420p", {"bf": "2"}),
+        ("a.ts", "libx264", "yuv420p", {"bf": "2"}),
+        ("a.avi", "mpeg4", "yuv420p", {"bf": "2", "qscale": "2"}),
+        ("a.nut", "rawvideo", "nv12", {}),
+        ("a10.mkv", "ffv1", "yuv420p10le", {}),
+        ("a422.mkv", "ffv1", "yuv422p", {}),
+        ("rgb.mkv", "ffv1", "bgr0", {}),
+    ],
+)
+def test_every_frame_arrives_in_order_with_its_time(tmp_path, name, codec, pix_fmt, options):
+    path = tmp_path / name
+    write_video(path, 12, size=SMALL, codec=codec, pix_fmt=pix_fmt, options=options)
+    with open_source(path) as source:
+        assert source.size_px == SMALL
+        assert source.fps == pytest.approx(25.0)
+        frames = list(source)
+    assert [f.index for f in frames] == list(range(12))
+    # Matroska rounds times to a millisecond.
+    assert [f.time_s for f in frames] == pytest.approx([i / 25 for i in range(12)], abs=1e-3)
+    for i, frame in enumerate(frames):
+        assert frame.luma.shape == (64, 96)
+        assert frame.luma.mean() == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
+        assert [c.shape for c in frame.chroma] == [(32, 48), (32, 48)]
+        assert np.abs(np.stack(frame.chroma).astype(int) - 128).max() <= 2
+
+
+def test_grey_video_has_no_chroma(tmp_path):
+    path = write_video(tmp_path / "g.mkv", 3, size=SMALL, codec="ffv1", pix_fmt="gray", options={})
+    with open_source(path) as source:
+        frames = list(source)
+    assert len(frames) == 3
+    assert all(f.chroma is None and f.luma.shape == (64, 96) for f in frames)
+
+
+@pytest.mark.parametrize("kind", ["yuv420p", "yuvj420p", "nv12"])
+@pytest.mark.parametrize("size", [(96, 64), (97, 65)])
+def test_planes_are_views_on_the_decoder_s_memory(kind, size):
+    frame = VideoFrame(*size, kind)
+    rng = np.random.default_rng(3)
+    content = []
+    for plane in frame.planes:
+        content.append(rng.integers(0, 256, plane.buffer_size, dtype=np.uint8))
+        plane.update(content[-1].tobytes())
+    luma, chroma = planes_of(frame)
+    addresses = [plane.buffer_ptr for plane in frame.planes]
+    assert luma.ctypes.data == addresses[0]
+    assert chroma[0].ctypes.data == addresses[1]
+    # The semi-planar V starts one byte after U.
+    assert chroma[1].ctypes.data == (addresses[1] + 1 if kind == "nv12" else addresses[2])
+    width, height = size
+    rows = content[0].reshape(-1, frame.planes[0].line_size)
+    np.testing.assert_array_equal(luma, rows[:height, :width])
+    assert chroma[0].shape == chroma[1].shape == (-(-height // 2), -(-width // 2))
+    uv = content[1].reshape(-1, frame.planes[1].line_size)
+    step = 2 if kind == "nv12" else 1
+    last = chroma[0].shape[1] - 1
+    assert chroma[0][3, last] == uv[3, last * step]
+    assert not luma.flags.writeable
+
+
+@pytest.mark.parametrize("kind", ["yuvj422p", "yuv422p", "yuvj444p", "yuv444p", "nv21"])
+def test_conversion_of_other_formats_keeps_luma(kind):
+    frame = VideoFrame(96, 64, kind)
+    rng = np.random.default_rng(4)
+    for plane in frame.planes:
+        plane.update(rng.integers(0, 256, plane.buffer_size, dtype=np.uint8).tobytes())
+    luma, _ = planes_of(frame)
+    given = np.frombuffer(frame.planes[0], np.uint8).reshape(64, -1)[:, :96]
+    np.testing.assert_array_equal(luma, given)
+
+
+def test_frames_outlive_the_source_and_later_frames(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 12, size=SMALL)
+    with open_source(path) as source:
+        kept = list(source)
+    expected = [luma_level(i) for i in range(12)]
+    del source
+    gc.collect()
+    assert [f.luma.mean() for f in kept] == pytest.approx(expected, abs=LEVEL_TOLERANCE)
+
+
+def test_a_corrupt_frame_leaves_a_gap_and_the_rest_arrives(tmp_path):
+    path = all_key_frames(tmp_path / "a.mp4", 10, size=SMALL)
+    destroy_frame(path, 4)
+    found = luma_levels(open_source(path))
+    assert sorted(found) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    for i, mean in found.items():
+        assert mean == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
+
+
+def test_a_picture_that_the_decoder_patched_up_is_not_delivered(tmp_path):
+    path = write_video(
+        tmp_path / "a.mp4",
+        10,
+        size=(192, 128),
+        options={"preset": "ultrafast", "g": "100"},
+        content=grain,
+    )
+    damage_frame(path, 4)
+    with open_source(path) as source:
+        assert [f.index for f in source] == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+
+
+def test_time_counts_from_the_first_frame_even_if_that_is_lost(tmp_path):
+    path = all_key_frames(tmp_path / "a.mp4", 6, size=SMALL)
+    destroy_frame(path, 0)
+    with open_source(path) as source:
+        first = next(iter(source))
+    assert first.index == 1
+    assert first.time_s == pytest.approx(0.04)
+
+
+def test_a_lost_last_frame_is_said(tmp_path):
+    path = all_key_frames(tmp_path / "a.mp4", 6, size=SMALL)
+    destroy_frame(path, 5)
+    delivered = []
+    with open_source(path) as source, pytest.raises(SourceError, match="only 5 of 6 frames"):
+        delivered.extend(source)
+    assert [f.index for f in delivered] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("name", "mux", "promise"),
+    [
+        ("a.mp4", {"movflags": "faststart"}, "of 40"),
+        ("a.mp4", {"movflags": "frag_keyframe+empty_moov"}, "of about 2"),
+        ("a.mkv", {}, "of about 40"),
+    ],
+)
+def test_a_truncated_file_gives_what_it_has_then_says_what_is_missing(tmp_path, name, mux, promise):
+    # Key frames at 0, 5, ... and no frame that refers to a later one: packet 23 is picture 23.
+    options = {"preset": "veryfast", "g": "5", "bf": "0"}
+    path = write_video(
+        tmp_path / name, 40, size=(192, 128), options=options, mux=mux, content=grain
+    )
+    cut_after(path, 23)
+    delivered = []
+    with open_source(path) as source, pytest.raises(SourceError) as fault:
+        delivered.extend(source)
+    assert [f.index for f in delivered] == list(range(23))
+    assert f"only 23 {promise}" in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_the_torn_end_of_a_file_costs_no_sound_picture(tmp_path):
+    """The decoder still holds pictures when it meets the torn packet."""
+    options = {"preset": "veryfast", "bf": "2"}
+    mux = {"movflags": "faststart"}
+    path = write_video(
+        tmp_path / "a.mp4", 20, size=(192, 128), options=options, mux=mux, content=grain
+    )
+    cut_after(path, 9)
+    delivered = []
+    with open_source(path) as source, pytest.raises(SourceError, match="only 9 of 20 frames"):
+        delivered.extend(source)
+    assert len(delivered) == 9
+
+
+def test_a_whole_file_raises_nothing_even_if_its_rate_varies(tmp_path):
+    path = tmp_path / "vfr.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height = SMALL
+        stream.pix_fmt = "yuv420p"
+        ticks = [0, 1, 2, 10, 11, 30, 31, 32]
+        for i, tick in enumerate(ticks):
+            frame = VideoFrame.from_ndarray(picture(i, SMALL), format="bgr24")
+            frame.pts = tick
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    with open_source(path) as source:
+        frames = list(source)
+    assert [f.index for f in frames] == list(range(8))
+    assert [f.time_s for f in frames] == pytest.approx([t / 25 for t in ticks], abs=1e-3)
+
+
+def test_a_change_of_picture_size_is_refused(tmp_path):
+    whole = tmp_path / "two.ts"
+    parts = [
+        write_video(tmp_path / "a.ts", 4, size=SMALL),
+        write_video(tmp_path / "b.ts", 4, size=(128, 64)),
+    ]
+    whole.write_bytes(b"".join(part.read_bytes() for part in parts))
+    with (
+        open_source(whole) as source,
+        pytest.raises(SourceError, match="picture size changes from"),
+    ):
+        list(source)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "no such file"), (b"", "empty"), (b"hello\n" * 50, "not a video")],
+)
+def test_what_is_no_video_is_refused_in_one_line(tmp_path, content, words):
+    path = tmp_path / "a.mp4"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SourceError, match=words) as fault:
+        open_source(path)
+    assert str(path) in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_a_file_cut_before_its_index_is_refused(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 8, size=SMALL)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(SourceError, match="cut short"):
+        open_source(path)
+
+
+def test_sound_alone_is_refused(tmp_path):
+    path = tmp_path / "a.wav"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    with pytest.raises(SourceError, match="holds no video"):
+        open_source(path)
+
+
+def write_images(folder, names, size=SMALL):
+    for i, name in enumerate(names):
+        cv2.imwrite(str(folder / name), picture(i, size))
+
+
+def test_images_come_in_natural_order(tmp_path):
+    names = ["img1.png", "img2.png", "img10.png", "img21.png"]
+    write_images(tmp_path, names)
+    (tmp_path / "notes.txt").write_text("not an image")
+    with open_source(tmp_path, fps=10.0) as source:
+        assert (source.n_frames, source.size_px, source.fps) == (4, SMALL, 10.0)
+        frames = list(source)
+    assert [f.index for f in frames] == [0, 1, 2, 3]
+    assert [f.time_s for f in frames] == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    for i, frame in enumerate(frames):
+        assert frame.luma.mean() == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
+
+
+def test_one_image_is_a_source(tmp_path):
+    write_images(tmp_path, ["a.png"])
+    with open_source(tmp_path / "a.png") as source:
+        assert [f.index for f in source] == [0]
+
+
+@pytest.mark.parametrize("size", [(6, 4), (7, 5), (7, 4), (6, 5)])
+def test_colour_images_become_420_with_rounded_up_chroma(size):
+    image = np.random.default_rng(5).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    luma, chroma = planes_of_image(image)
+    assert luma.shape == (size[1], size[0])
+    assert chroma[0].shape == chroma[1].shape == (-(-size[1] // 2), -(-size[0] // 2))
+    weights = np.array([24.966, 128.553, 65.481]) / 255  # BT.601 of B, G, R
+    # Integer arithmetic inside OpenCV rounds to a grey level.
+    np.testing.assert_allclose(luma, 16 + image @ weights, atol=1.0)
+
+
+def test_an_unreadable_image_leaves_a_gap_and_is_named_at_the_end(tmp_path, capfd):
+    write_images(tmp_path, ["a1.png", "a2.png", "a3.png"])
+    (tmp_path / "a2.png").write_bytes(b"broken")
+    with open_source(tmp_path) as source:
+        assert [f.index for f in source] == [0, 2]
+    (tmp_path / "a3.png").write_bytes(b"broken")
+    with open_source(tmp_path) as source, pytest.raises(SourceError, match=r"a3\.png"):
+        list(source)
+    assert capfd.readouterr().err == ""
+
+
+def test_images_of_two_sizes_are_refused(tmp_path):
+    write_images(tmp_path, ["a1.png"])
+    write_images(tmp_path, ["a2.png"], size=(32, 32))
+    with open_source(tmp_path) as source, pytest.raises(SourceError, match="32x32 px"):
+        list(source)
+
+
+def test_a_folder_without_images_is_refused(tmp_path):
+    with pytest.raises(SourceError, match="no images"):
+        open_source(tmp_path)
+
+
+def test_a_list_of_images_keeps_its_order(tmp_path):
+    write_images(tmp_path, ["b.png", "a.png"])
+    with ImageSource([tmp_path / "b.png", tmp_path / "a.png"]) as source:
+        means = [f.luma.mean() for f in source]
+    assert means == pytest.approx([luma_level(0), luma_level(1)], abs=LEVEL_TOLERANCE)
+
+
+def test_a_frame_rate_for_a_video_is_refused(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 2, size=SMALL)
+    with pytest.raises(OptionError, match="own clock"):
+        open_source(path, fps=10.0)
+    with pytest.raises(OptionError, match="positive"):
+        open_source(tmp_path, fps=0.0)
+
+
+def test_an_address_is_read_like_a_file(tmp_path):
+    """An MPEG-TS over HTTP, served here."""
+    import functools
+    import http.server
+    import threading
+
+    write_video(tmp_path / "a.ts", 10, size=SMALL)
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *arguments):
+            pass
+
+    handler = functools.partial(Quiet, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with open_source(f"http://127.0.0.1:{server.server_port}/a.ts") as source:
+            assert isinstance(source, VideoSource)
+            assert [f.index for f in source] == list(range(10))
+        with pytest.raises(SourceError, match="cannot be opened"):
+            open_source(f"http://127.0.0.1:{server.server_port}/missing.ts")
+        server.shutdown()
+
+
+def test_decoding_takes_one_pass(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 5, size=SMALL)
+    with VideoSource(path, threads=1) as source:
+        assert sum(1 for _ in source) == 5
