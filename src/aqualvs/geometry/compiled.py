@@ -35,17 +35,18 @@ def inline_kernel(function: F) -> F:
 
 
 def _depend_on_callees(compiled: Any, function: Callable[..., Any]) -> None:
-    """Make the machine code on disk depend on the files of the kernels that it calls as well.
+    """Make the machine code on disk depend on the files of the kernels that it may call as well.
 
     Numba compares only the stamp of the function's own file, so a change in an inlined kernel of
-    another module would leave stale machine code in use.
+    another module would leave stale machine code in use. Counted are all kernels that the module
+    has imported, whether this function calls them or not.
     """
     own = _cache_file(compiled)
     if own is None:
         return
-    called = (function.__globals__.get(name) for name in function.__code__.co_names)
-    files = (_cache_file(callee) for callee in called)
-    own._source_stamp = (own._source_stamp, *(f._source_stamp for f in files if f is not None))
+    files = (_cache_file(value) for value in function.__globals__.values())
+    stamps = {stamp for file in files if file is not None for stamp in file._source_stamp}
+    own._source_stamp = tuple(sorted(stamps | {own._source_stamp}))
 
 
 def _cache_file(compiled: Any) -> Any:

@@ -1,0 +1,239 @@
+"""Rays and projections a second on one core, next to the same mathematics in plain NumPy.
+
+Run `python benchmarks/bench_optics.py` for a table. The reference is timed in the same run, and the
+two must agree before anything is reported.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.optics.camera import BareCamera, DomeCamera
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.lens import Lens
+from aqualvs.optics.rays_batch import trace_all
+
+SIZE_PX = (720, 576)
+LENS = Lens(
+    fx=817.5, fy=878.0, cx=368.9, cy=281.7, distortion=(-0.126, 0.0827, 6.2e-4, -4.5e-4, 0.01)
+)
+NOMINAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+POSE = SE3(rotation_from_rotvec([0.04, 0.029, 0.016]) @ NOMINAL, np.array([3.1, 41.8, 3.0]) * 1e-3)
+CAMERA = DomeCamera(
+    size_px=SIZE_PX,
+    lens=LENS,
+    dome_from_cam=POSE,
+    dome=Dome(0.04425, 0.00575, 1.49),
+    n_air=1.0003,
+    n_water=1.3333,
+)
+BARE = BareCamera(size_px=SIZE_PX, lens=LENS, dome_from_cam=POSE)
+DISTANCE = 0.6
+N_JACOBIANS = 40_000
+
+
+def numpy_distort(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    k1, k2, p1, p2, k3 = LENS.distortion
+    q = x * x + y * y
+    f = 1.0 + q * (k1 + q * (k2 + q * k3))
+    return (
+        x * f + 2.0 * p1 * x * y + p2 * (q + 2.0 * x * x),
+        y * f + p1 * (q + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+def numpy_undistort(xd: FloatArray, yd: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Newton's method, four steps."""
+    k1, k2, p1, p2, k3 = LENS.distortion
+    x, y = xd, yd
+    for _ in range(4):
+        q = x * x + y * y
+        f = 1.0 + q * (k1 + q * (k2 + q * k3))
+        slope = 2.0 * (k1 + q * (2.0 * k2 + q * 3.0 * k3))
+        ax, ay = numpy_distort(x, y)
+        ex, ey = xd - ax, yd - ay
+        j_xx = f + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        j_yy = f + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        j_xy = x * y * slope + 2.0 * (p1 * x + p2 * y)
+        det = j_xx * j_yy - j_xy * j_xy
+        x, y = x + (j_yy * ex - j_xy * ey) / det, y + (j_xx * ey - j_xy * ex) / det
+    return x, y
+
+
+def numpy_trace(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Snell's law in vector form at both spheres."""
+    dome = CAMERA.dome
+    p, d = POSE.translation, directions
+    for radius, ratio in (
+        (dome.inner_radius, CAMERA.n_air / dome.n_acrylic),
+        (dome.outer_radius, dome.n_acrylic / CAMERA.n_water),
+    ):
+        along = np.sum(p * d, axis=-1, keepdims=True)
+        reach = np.sqrt(along**2 + radius**2 - np.sum(p * p, axis=-1, keepdims=True))
+        p = p + (reach - along) * d
+        cos_in = reach / radius
+        cos_out = np.sqrt(1.0 - ratio**2 * (1.0 - cos_in**2))
+        d = ratio * d - (ratio * cos_in - cos_out) / radius * p
+    return p, d
+
+
+def numpy_rays(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    x, y = numpy_undistort((pixels[:, 0] - LENS.cx) / LENS.fx, (pixels[:, 1] - LENS.cy) / LENS.fy)
+    d = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(1.0 + x * x + y * y)[:, None]
+    return numpy_trace(d @ POSE.rotation.T)
+
+
+def numpy_project(points: FloatArray) -> FloatArray:
+    """Bouguer's invariant with arc sines, five Newton steps from the straight line."""
+    dome, n_air, n_water = CAMERA.dome, CAMERA.n_air, CAMERA.n_water
+    length = np.linalg.norm(POSE.translation)
+    axis = POSE.translation / length
+    rho = np.linalg.norm(points, axis=-1)
+    cosine = points @ axis / rho
+    across = points / rho[:, None] - cosine[:, None] * axis
+    sine = np.linalg.norm(across, axis=-1)
+    target = np.arctan2(sine, cosine)
+    alpha = np.arctan2(rho * sine, rho * cosine - length)
+    surfaces = (
+        (-1.0, n_air * dome.inner_radius),
+        (1.0, dome.n_acrylic * dome.inner_radius),
+        (-1.0, dome.n_acrylic * dome.outer_radius),
+        (1.0, n_water * dome.outer_radius),
+        (-1.0, n_water * rho),
+    )
+    for _ in range(5):
+        b = n_air * length * np.sin(alpha)
+        theta, slope = alpha, 1.0
+        for sign, n_rho in surfaces:
+            s = b / n_rho
+            theta = theta + sign * np.arcsin(s)
+            slope = slope + sign * n_air * length * np.cos(alpha) / (n_rho * np.sqrt(1.0 - s * s))
+        alpha = alpha + (target - theta) / slope
+    d = np.cos(alpha)[:, None] * axis + (np.sin(alpha) / sine)[:, None] * across
+    d = d @ POSE.rotation
+    x, y = numpy_distort(d[:, 0] / d[:, 2], d[:, 1] / d[:, 2])
+    return np.stack([LENS.fx * x + LENS.cx, LENS.fy * y + LENS.cy], axis=-1)
+
+
+def numeric_jacobian(points: FloatArray) -> FloatArray:
+    """Central differences of the compiled projection: what a solver without derivatives pays."""
+    columns = []
+    for axis in np.eye(3) * 1e-6:
+        columns.append((CAMERA.project(points + axis)[0] - CAMERA.project(points - axis)[0]) / 2e-6)
+    return np.stack(columns, axis=-1)
+
+
+def best_rate(count: int, call: Callable[[], object], rounds: int = 9) -> float:
+    """Items a second in the fastest of `rounds`, after one round that compiles."""
+    call()
+    best = np.inf
+    for _ in range(rounds):
+        start = time.perf_counter()
+        call()
+        best = min(best, time.perf_counter() - start)
+    return count / best
+
+
+def row(
+    name: str, count: int, call: Callable[[], object], reference: Callable[[], object] | None
+) -> dict[str, Any]:
+    value = best_rate(count, call) / 1e6
+    slow = best_rate(count, reference, rounds=3) / 1e6 if reference else None
+    return {
+        "name": name,
+        "value": value,
+        "unit": "M/s",
+        "reference": slow,
+        "ratio": value / slow if slow else None,
+    }
+
+
+def run() -> list[dict[str, Any]]:
+    """Time every direction through the camera on one full picture (720 x 576).
+
+    Returns
+    -------
+    list of dict
+        name, value and reference in millions a second, unit, and their ratio; reference and ratio
+        are None where there is no plain counterpart.
+    """
+    x, y = np.meshgrid(np.arange(float(SIZE_PX[0])), np.arange(float(SIZE_PX[1])))
+    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+    n = len(pixels)
+    origins, directions = np.empty((n, 3)), np.empty((n, 3))
+    valid = np.empty(n, dtype=np.bool_)
+    back = np.empty((n, 2))
+    at_lens = POSE.rotate(LENS.directions(pixels)[0])
+    CAMERA.rays_into(pixels, origins, directions, valid)
+    points = origins + DISTANCE * directions
+    few = points[:: n // N_JACOBIANS]
+    bare_valid = np.empty(n, dtype=np.bool_)
+
+    assert valid.all()
+    expected_origins, expected_directions = numpy_rays(pixels)
+    assert np.abs(expected_origins - origins).max() < 1e-15
+    assert np.abs(expected_directions - directions).max() < 1e-13
+    assert np.abs(numpy_project(points) - pixels).max() < 1e-9
+    assert np.abs(CAMERA.project(points)[0] - pixels).max() < 1e-9
+    ray_out = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, dtype=np.bool_)
+
+    return [
+        row(
+            "pixel to ray, 5 coefficients",
+            n,
+            lambda: CAMERA.rays_into(pixels, *ray_out),
+            lambda: numpy_rays(pixels),
+        ),
+        row(
+            "direction to ray",
+            n,
+            lambda: trace_all(CAMERA.params, at_lens, *ray_out),
+            lambda: numpy_trace(at_lens),
+        ),
+        row(
+            "pixel to direction, 5 coefficients",
+            n,
+            lambda: LENS.directions(pixels),
+            lambda: numpy_undistort(pixels[:, 0] / 800.0 - 0.45, pixels[:, 1] / 800.0 - 0.36),
+        ),
+        row(
+            "point to pixel, 5 coefficients",
+            n,
+            lambda: CAMERA.project_into(points, back, valid),
+            lambda: numpy_project(points),
+        ),
+        row(
+            "point to pixel, bare lens",
+            n,
+            lambda: BARE.project_into(points, back, bare_valid),
+            None,
+        ),
+        row(
+            "point to pixel with Jacobian",
+            len(few),
+            lambda: CAMERA.project_with_jacobian(few),
+            lambda: numeric_jacobian(few),
+        ),
+        row(
+            "point to pixel with all 20 parameters",
+            len(few),
+            lambda: CAMERA.project_with_parameter_jacobian(few),
+            None,
+        ),
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    print(f"{'what':40s} {'M/s':>8s} {'plain M/s':>10s} {'ratio':>7s}")
+    for r in run():
+        plain = f"{r['reference']:10.3f} {r['ratio']:7.1f}" if r["reference"] else ""
+        print(f"{r['name']:40s} {r['value']:8.2f} {plain}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,20 @@
+"""Refraction, the camera behind a dome, water, and the rig file."""
+
+from aqualvs.optics.camera import BareCamera, Camera, DomeCamera, parameter_names
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.refraction import refract
+from aqualvs.optics.water import seawater_index, seawater_index_vacuum
+
+__all__ = [
+    "BareCamera",
+    "Camera",
+    "Dome",
+    "DomeCamera",
+    "Lens",
+    "LensModel",
+    "parameter_names",
+    "refract",
+    "seawater_index",
+    "seawater_index_vacuum",
+]

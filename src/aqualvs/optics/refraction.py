@@ -1,0 +1,169 @@
+"""Snell's law in vector form: two square roots a surface, no trigonometry, no singularity."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
+from aqualvs.geometry.compiled import inline_kernel, kernel
+
+
+@inline_kernel
+def snell_weight(cos_in: float, ratio: float) -> tuple[float, float]:
+    """Return (k, radicand) with refracted = ratio * direction + k * normal.
+
+    `ratio` is n_in / n_out and the normal points into the incoming medium. A negative radicand
+    means total reflection; k is then finite and meaningless.
+    """
+    radicand = 1.0 - ratio * ratio * (1.0 - cos_in * cos_in)
+    return ratio * cos_in - math.sqrt(max(radicand, 0.0)), radicand
+
+
+@inline_kernel
+def leave_sphere(
+    px: float,
+    py: float,
+    pz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    radius: float,
+    ratio: float,
+) -> tuple[float, float, float, float, float, float, float]:
+    """Carry a ray from inside a sphere round the origin to its surface and refract it there.
+
+    Parameters
+    ----------
+    px, py, pz : float
+        Start, inside the sphere or on it.
+    dx, dy, dz : float
+        Unit direction.
+    radius : float
+        Of the sphere.
+    ratio : float
+        n inside / n outside.
+
+    Returns
+    -------
+    radicand, qx, qy, qz, ex, ey, ez : float
+        Point on the sphere and unit direction outside it. A radicand that is not >= 0 means total
+        reflection; point and direction are then meaningless.
+    """
+    along = px * dx + py * dy + pz * dz
+    # The cosine of incidence times the radius, because the normal is the point itself.
+    reach = math.sqrt(along * along + radius * radius - (px * px + py * py + pz * pz))
+    step = reach - along
+    qx, qy, qz = px + step * dx, py + step * dy, pz + step * dz
+    k, radicand = snell_weight(reach / radius, ratio)
+    k = k / radius
+    ex, ey, ez = ratio * dx - k * qx, ratio * dy - k * qy, ratio * dz - k * qz
+    return radicand, qx, qy, qz, ex, ey, ez
+
+
+@inline_kernel
+def leave_sphere_tangent(
+    p: tuple[float, float, float],
+    d: tuple[float, float, float],
+    p_dot: tuple[float, float, float],
+    d_dot: tuple[float, float, float],
+    radius: float,
+    ratio: float,
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return the derivative of `leave_sphere`'s point and direction along (p_dot, d_dot)."""
+    along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
+    p_p_dot = p[0] * p_dot[0] + p[1] * p_dot[1] + p[2] * p_dot[2]
+    along_dot = (
+        p_dot[0] * d[0]
+        + p_dot[1] * d[1]
+        + p_dot[2] * d[2]
+        + p[0] * d_dot[0]
+        + p[1] * d_dot[1]
+        + p[2] * d_dot[2]
+    )
+    reach = math.sqrt(along * along + radius * radius - (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]))
+    reach_dot = (along * along_dot - p_p_dot) / reach
+    step, step_dot = reach - along, reach_dot - along_dot
+    qx, qy, qz = p[0] + step * d[0], p[1] + step * d[1], p[2] + step * d[2]
+    qx_dot = p_dot[0] + step_dot * d[0] + step * d_dot[0]
+    qy_dot = p_dot[1] + step_dot * d[1] + step * d_dot[1]
+    qz_dot = p_dot[2] + step_dot * d[2] + step * d_dot[2]
+    cos_in, cos_in_dot = reach / radius, reach_dot / radius
+    cos_out = math.sqrt(1.0 - ratio * ratio * (1.0 - cos_in * cos_in))
+    k = (ratio * cos_in - cos_out) / radius
+    k_dot = ratio * cos_in_dot * (1.0 - ratio * cos_in / cos_out) / radius
+    return (
+        (qx_dot, qy_dot, qz_dot),
+        (
+            ratio * d_dot[0] - k_dot * qx - k * qx_dot,
+            ratio * d_dot[1] - k_dot * qy - k * qy_dot,
+            ratio * d_dot[2] - k_dot * qz - k * qz_dot,
+        ),
+    )
+
+
+@kernel
+def _refract_all(
+    directions: FloatArray,
+    normals: FloatArray,
+    ratio: float,
+    refracted: FloatArray,
+    valid: BoolArray,
+) -> None:
+    for i in range(directions.shape[0]):
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        cos_in = -(dx * nx + dy * ny + dz * nz)
+        k, radicand = snell_weight(cos_in, ratio)
+        ok = radicand >= 0.0 and cos_in >= 0.0
+        valid[i] = ok
+        refracted[i, 0] = ratio * dx + k * nx if ok else np.nan
+        refracted[i, 1] = ratio * dy + k * ny if ok else np.nan
+        refracted[i, 2] = ratio * dz + k * nz if ok else np.nan
+
+
+def refract(
+    directions: ArrayLike, normals: ArrayLike, *, n_in: float, n_out: float
+) -> tuple[FloatArray, BoolArray]:
+    """Refract unit directions at a smooth interface.
+
+    Parameters
+    ----------
+    directions : array, shape (..., 3)
+        Unit directions of travel, same frame as `normals`.
+    normals : array, shape (..., 3)
+        Unit normals pointing into the incoming medium; broadcast against `directions`.
+    n_in, n_out : float
+        Refractive indices before and behind the interface.
+
+    Returns
+    -------
+    refracted : array, shape (..., 3)
+        Unit directions behind the interface; NaN where not valid.
+    valid : bool array, shape (...)
+        False under total reflection, and where the direction runs away from the interface.
+
+    Raises
+    ------
+    ValueError
+        If an array does not end in an axis of length 3, or an index is not positive.
+
+    Notes
+    -----
+    Snell's law in vector form; see Glassner, An Introduction to Ray Tracing (1989), 5.2.
+    """
+    if not (n_in > 0.0 and n_out > 0.0):
+        raise ValueError(f"refractive indices must be positive, not {n_in} and {n_out}")
+    d, n = np.broadcast_arrays(
+        as_vectors(directions, 3, "directions"), as_vectors(normals, 3, "normals")
+    )
+    refracted = np.empty(d.shape)
+    valid = np.empty(d.shape[:-1], dtype=np.bool_)
+    _refract_all(
+        np.ascontiguousarray(d).reshape(-1, 3),
+        np.ascontiguousarray(n).reshape(-1, 3),
+        n_in / n_out,
+        refracted.reshape(-1, 3),
+        valid.reshape(-1),
+    )
+    return refracted, valid

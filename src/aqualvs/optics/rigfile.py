@@ -1,0 +1,290 @@
+"""The rig file: `rig.yaml` to `Rig` and back.
+
+Files speak millimetres and degrees, `Rig` metres and radians. Whatever was loaded from a file is
+written back bit for bit; a rotation is written to 1e-12 degrees. docs/rig.md explains every key.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aqualvs.errors import AqualvsError, OptionError, OutputError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
+from aqualvs.optics.camera import Dome
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
+from aqualvs.optics.rigschema import VERSION, RigFile, WaterPart, parse_rig
+from aqualvs.optics.rigtext import read_yaml, rig_text
+from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
+
+__all__ = ["load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
+
+_MM = 1e3
+_ROTATION_DECIMALS = 12
+# Normals this close to unit length are kept as they are, so that loading and saving settle.
+_UNIT = 1e-14
+
+
+def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
+    """Load a rig file.
+
+    Parameters
+    ----------
+    path : path
+        A `rig.yaml`, see docs/rig.md.
+    need_lasers : bool
+        Refuse a rig without lasers; calibrations that come before the lasers' set it to False.
+
+    Raises
+    ------
+    RigError
+        One line that names the file, the place in it, the value and the remedy.
+    """
+    return rig_from_mapping(read_yaml(Path(path)), source_name=str(path), need_lasers=need_lasers)
+
+
+def save_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig file that `load_rig` turns into the same rig; an old file is replaced at once.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    RigError
+        If `solved_from` holds what YAML cannot.
+    """
+    target = Path(path)
+    text = rig_text(rig_to_mapping(rig))
+    draft = target.with_name(target.name + ".part")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        os.replace(draft, target)
+    except OSError as error:
+        raise OutputError(
+            f"{target}: cannot write the rig ({error.strerror}); choose another place"
+        ) from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def rig_to_mapping(rig: Rig) -> dict[str, Any]:
+    """Return a rig as plain numbers, lists and mappings, in the order and units of the file."""
+    content: dict[str, Any] = {
+        "aqualvs_rig": VERSION,
+        "name": rig.name,
+        "image": {"width_px": int(rig.size_px[0]), "height_px": int(rig.size_px[1])},
+        "camera": _camera_mapping(rig),
+    }
+    if rig.dome is not None:
+        content["dome"] = {
+            "inner_radius_mm": _to_mm(rig.dome.inner_radius),
+            "thickness_mm": _to_mm(rig.dome.thickness),
+            "n_acrylic": float(rig.dome.n_acrylic),
+        }
+    content["n_air"] = float(rig.n_air)
+    content["water"] = {"n": float(rig.n_water)}
+    content["lasers"] = [_laser_mapping(laser) for laser in rig.lasers]
+    content["working_range_mm"] = _all_to_mm(rig.working_range)
+    if rig.solved_from:
+        content["solved_from"] = _plain(rig.solved_from, "solved_from")
+    return content
+
+
+def rig_from_mapping(
+    mapping: Mapping[str, Any], *, source_name: str, need_lasers: bool = True
+) -> Rig:
+    """Make a rig from the content of a rig file.
+
+    Parameters
+    ----------
+    mapping : mapping
+        As `rig_to_mapping` gives it, or as YAML reads it.
+    source_name : str
+        How messages call the file.
+    need_lasers : bool
+        As in `load_rig`.
+
+    Raises
+    ------
+    RigError
+        One line that names the file, the place in it, the value and the remedy.
+    """
+    file = parse_rig(mapping, source_name)
+    try:
+        rig = _rig(file)
+        _check_whole(file, need_lasers)
+    except AqualvsError as error:
+        raise RigError(f"{source_name}: {error}") from None
+    return rig
+
+
+def _rig(file: RigFile) -> Rig:
+    camera = file.camera
+    turn = rotation_from_rotvec(np.deg2rad(camera.rotation_deg))
+    dome = file.dome
+    return Rig(
+        name=file.name,
+        size_px=(file.image.width_px, file.image.height_px),
+        lens=Lens(
+            model=LensModel(camera.model),
+            fx=camera.fx_px,
+            fy=camera.fy_px,
+            cx=camera.cx_px,
+            cy=camera.cy_px,
+            distortion=_distortion(file),
+        ),
+        dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(camera.position_mm) / _MM),
+        dome=None
+        if dome is None
+        else Dome(dome.inner_radius_mm / _MM, dome.thickness_mm / _MM, dome.n_acrylic),
+        n_air=file.n_air,
+        n_water=_water_index(file.water, file.n_air),
+        lasers=tuple(
+            Laser(part.name, _plane(i, part.normal, part.offset_mm))
+            for i, part in enumerate(file.lasers)
+        ),
+        working_range=(file.working_range_mm[0] / _MM, file.working_range_mm[1] / _MM),
+        solved_from=dict(file.solved_from),
+    )
+
+
+def _distortion(file: RigFile) -> tuple[float, ...]:
+    values, model = file.camera.distortion, file.camera.model
+    allowed = {"opencv": (0, 4, 5, 8), "fisheye": (0, 4)}[model]
+    if len(values) not in allowed:
+        raise RigError(
+            f"camera.distortion has {len(values)} values; the {model} model takes "
+            f"{', '.join(map(str, allowed[:-1]))} or {allowed[-1]}"
+        )
+    return tuple(float(value) for value in values)
+
+
+def _water_index(water: WaterPart, n_air: float) -> float:
+    """Index of the water relative to vacuum, as given or from Quan & Fry (1995)."""
+    measured = (water.temperature_c, water.salinity_permille, water.wavelength_nm)
+    if water.n is not None:
+        if any(value is not None for value in measured):
+            raise RigError(
+                "water gives n and what it would follow from; keep either n, or temperature_c "
+                "and salinity_permille"
+            )
+        return water.n
+    if water.temperature_c is None or water.salinity_permille is None:
+        raise RigError(
+            "water has no index; write 'water: {n: 1.3333}', or both temperature_c and "
+            "salinity_permille"
+        )
+    wavelength = GREEN_NM if water.wavelength_nm is None else water.wavelength_nm
+    try:
+        n = seawater_index_vacuum(
+            water.temperature_c, water.salinity_permille, wavelength, n_air=n_air
+        )
+    except OptionError as error:
+        raise RigError(f"water: {error}") from None
+    return float(n)
+
+
+def _plane(i_laser: int, normal: Sequence[float], offset_mm: float) -> Plane:
+    """Plane with the direction of `normal`; the offset belongs to the unit normal."""
+    vector: FloatArray = np.array(normal, dtype=np.float64)
+    length = math.hypot(*normal)
+    if length == 0.0:
+        raise RigError(
+            f"lasers[{i_laser}].normal is {list(normal)}, which has no direction; give the "
+            "normal of the laser's plane"
+        )
+    if abs(length - 1.0) > _UNIT:
+        vector = vector / length
+    return Plane(vector, offset_mm / _MM)
+
+
+def _check_whole(file: RigFile, need_lasers: bool) -> None:
+    near, far = file.working_range_mm
+    if not near < far:
+        raise RigError(
+            f"working_range_mm is [{near:g}, {far:g}]; write the nearest range first, then a "
+            "larger one"
+        )
+    distance = math.hypot(*file.camera.position_mm)
+    if file.dome is not None and distance >= file.dome.inner_radius_mm:
+        raise RigError(
+            f"camera.position_mm is {file.camera.position_mm}, {distance:.1f} mm from the dome's "
+            f"centre and outside its inner radius of {file.dome.inner_radius_mm:g} mm; give the "
+            "lens's place relative to the centre of the sphere"
+        )
+    names = [laser.name for laser in file.lasers]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise RigError(
+                f"lasers[{i}].name is {name!r}, as of lasers[{names.index(name)}]; give every "
+                "laser a name of its own"
+            )
+    if need_lasers and not names:
+        raise RigError(
+            "lasers is empty: a rig without lasers measures nothing; run 'aqualvs calibrate "
+            "lasers', or write one laser at least (two for pitch and yaw)"
+        )
+
+
+def _camera_mapping(rig: Rig) -> dict[str, Any]:
+    lens, pose = rig.lens, rig.dome_from_cam
+    turn = np.rad2deg(rotvec_from_rotation(pose.rotation @ DOME_FROM_CAM_NOMINAL.T))
+    return {
+        "model": LensModel(lens.model).value,
+        "fx_px": float(lens.fx),
+        "fy_px": float(lens.fy),
+        "cx_px": float(lens.cx),
+        "cy_px": float(lens.cy),
+        "distortion": [float(value) for value in lens.distortion],
+        "position_mm": _all_to_mm(pose.translation),
+        # Adding zero turns -0.0 into 0.0.
+        "rotation_deg": [round(float(value), _ROTATION_DECIMALS) + 0.0 for value in turn],
+    }
+
+
+def _laser_mapping(laser: Laser) -> dict[str, Any]:
+    return {
+        "name": laser.name,
+        "normal": [float(value) for value in laser.plane.normal],
+        "offset_mm": _to_mm(laser.plane.offset),
+    }
+
+
+def _all_to_mm(values: FloatArray | Sequence[float]) -> list[float]:
+    return [_to_mm(float(value)) for value in values]
+
+
+def _to_mm(metres: float) -> float:
+    """Millimetres, as few digits as lead back to the same number of metres when loaded.
+
+    A few numbers of metres are the thousandth of no float; they come back one unit in the last
+    place away.
+    """
+    value = float(metres) * _MM
+    for digits in (15, 16, 17):
+        short = float(f"{value:.{digits}g}")
+        if short / _MM == metres:
+            return short
+    neighbours = (math.nextafter(value, -math.inf), math.nextafter(value, math.inf))
+    return next((near for near in neighbours if near / _MM == metres), value)
+
+
+def _plain(value: object, place: str) -> Any:
+    """Turn NumPy values, tuples and paths into what YAML knows."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, f"{place}.{key}") for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, f"{place}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise RigError(f"{place} is of type {type(value).__name__}; keep numbers, words and lists")

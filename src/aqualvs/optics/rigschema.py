@@ -1,0 +1,245 @@
+"""What a rig file may contain, and one line about what is wrong with it.
+
+`parse_rig` checks the shape of the file alone: keys, types, limits of single values. What a rig
+must fulfil as a whole (the lens inside the dome, say) is checked in `rigfile`.
+"""
+
+import difflib
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from aqualvs.errors import RigError
+
+VERSION = 1
+"""Version of the format that this package reads and writes."""
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
+Pixels = Annotated[int, Field(gt=0)]
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+Name = Annotated[str, Field(min_length=1)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class ImagePart(_Part):
+    """`image`: size of the pictures."""
+
+    width_px: Pixels
+    height_px: Pixels
+
+
+class CameraPart(_Part):
+    """`camera`: intrinsics, calibrated in air without the dome, and place in the dome."""
+
+    model: Literal["opencv", "fisheye"] = "opencv"
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Number
+    cy_px: Number
+    distortion: list[Number] = []
+    position_mm: Triple
+    rotation_deg: Triple = [0.0, 0.0, 0.0]
+
+
+class DomePart(_Part):
+    """`dome`: two concentric spheres and what is between them."""
+
+    inner_radius_mm: Positive
+    thickness_mm: NotNegative
+    n_acrylic: Index
+
+
+class WaterPart(_Part):
+    """`water`: its index, or what the index follows from."""
+
+    n: Index | None = None
+    temperature_c: Number | None = None
+    salinity_permille: Number | None = None
+    wavelength_nm: Number | None = None
+
+
+class LaserPart(_Part):
+    """One of `lasers`: a plane in `dome`; `offset_mm` belongs to the unit normal."""
+
+    name: Name
+    normal: Triple
+    offset_mm: Number
+
+
+class RigFile(_Part):
+    """A whole rig file."""
+
+    aqualvs_rig: int
+    name: Name = "rig"
+    image: ImagePart
+    camera: CameraPart
+    dome: DomePart | None = None
+    n_air: Index = 1.0003
+    water: WaterPart
+    lasers: list[LaserPart] = []
+    working_range_mm: Pair = [250.0, 1300.0]
+    solved_from: dict[str, Any] = {}
+
+
+def parse_rig(content: object, source_name: str) -> RigFile:
+    """Check the content of a rig file, key by key.
+
+    Parameters
+    ----------
+    content : object
+        What YAML made of the file.
+    source_name : str
+        How the message calls the file.
+
+    Raises
+    ------
+    RigError
+        One line on the first fault: file, place, value, remedy.
+    """
+    if not isinstance(content, Mapping):
+        raise RigError(
+            f"{source_name}: is {_shown(content)}, not a rig; a rig file is a list of keys that "
+            f"begins with 'aqualvs_rig: {VERSION}' (docs/rig.md)"
+        )
+    _check_version(content, source_name)
+    try:
+        return RigFile.model_validate(dict(content))
+    except ValidationError as error:
+        raise RigError(f"{source_name}: {_first_fault(error)}") from None
+
+
+def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
+    if "aqualvs_rig" not in content:
+        raise RigError(
+            f"{source_name}: aqualvs_rig is missing, so this may not be a rig file; a rig file "
+            f"begins with 'aqualvs_rig: {VERSION}' (docs/rig.md)"
+        )
+    version = content["aqualvs_rig"]
+    if type(version) is not int or version != VERSION:
+        raise RigError(
+            f"{source_name}: aqualvs_rig is {_shown(version)}, but this aqualvs reads version "
+            f"{VERSION}; write the file again with this aqualvs, or install one that reads it"
+        )
+
+
+def _first_fault(error: ValidationError) -> str:
+    """One line on the fault to mend first; a misspelt key explains the one that is missing."""
+    faults = error.errors(include_url=False)
+    unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
+    return _sentence((unknown or faults)[0])
+
+
+def _sentence(fault: ErrorDetails) -> str:
+    place, kind = _place(fault["loc"]), fault["type"]
+    if kind == "extra_forbidden":
+        return f"{place} is not a key of a rig file; {_closest(fault['loc'])}"
+    if kind == "missing":
+        return f"{place} is missing; add it, for example '{_example(fault['loc'])}'"
+    if kind == "literal_error":
+        return f"{place} is {_shown(fault['input'])}; write {fault['ctx']['expected']}"
+    return f"{place} is {_shown(fault['input'])}; {_remedy(fault)}"
+
+
+def _remedy(fault: ErrorDetails) -> str:
+    limits = fault.get("ctx", {})
+    if fault["type"] in _LIMITS:
+        return _LIMITS[fault["type"]].format(**limits)
+    if fault["type"] in _TYPES:
+        return f"write {_TYPES[fault['type']]}, for example '{_example(fault['loc'])}'"
+    return fault["msg"]
+
+
+_TYPES = {
+    "float_type": "a plain number",
+    "int_type": "a whole number",
+    "string_type": "a word",
+    "list_type": "a list in square brackets",
+    "model_type": "keys and values",
+    "model_attributes_type": "keys and values",
+    "dict_type": "keys and values",
+}
+_LIMITS = {
+    "finite_number": "write a finite number",
+    "greater_than": "it must be greater than {gt:g}",
+    "greater_than_equal": "it must be at least {ge:g}",
+    "less_than_equal": "it must be at most {le:g}",
+    "too_short": "write {min_length} values",
+    "too_long": "write {max_length} values",
+    "string_too_short": "give it a name",
+}
+
+_EXAMPLES: dict[str, str] = {
+    "image": "image: {width_px: 720, height_px: 576}",
+    "width_px": "width_px: 720",
+    "height_px": "height_px: 576",
+    "camera": "camera: {fx_px: 817.5, ...}",
+    "fx_px": "fx_px: 817.5",
+    "fy_px": "fy_px: 878.0",
+    "cx_px": "cx_px: 359.5",
+    "cy_px": "cy_px: 287.5",
+    "distortion": "distortion: [-0.126, 0.083, 0.0006, -0.0004]",
+    "position_mm": "position_mm: [0.0, 0.0, 0.0]",
+    "rotation_deg": "rotation_deg: [0.0, 0.0, 0.0]",
+    "dome": "dome: {inner_radius_mm: 44.25, thickness_mm: 5.75, n_acrylic: 1.49}",
+    "inner_radius_mm": "inner_radius_mm: 44.25",
+    "thickness_mm": "thickness_mm: 5.75",
+    "n_acrylic": "n_acrylic: 1.49",
+    "n_air": "n_air: 1.0003",
+    "water": "water: {n: 1.3333}",
+    "n": "n: 1.3333",
+    "temperature_c": "temperature_c: 15",
+    "salinity_permille": "salinity_permille: 38",
+    "wavelength_nm": "wavelength_nm: 532",
+    "lasers": "lasers: [{name: left, normal: [1, 0, 0], offset_mm: -140}]",
+    "name": "name: left",
+    "normal": "normal: [1.0, 0.0, 0.0]",
+    "offset_mm": "offset_mm: -140.0",
+    "working_range_mm": "working_range_mm: [250, 1300]",
+    "solved_from": "solved_from: {views: 14}",
+}
+
+
+def _example(loc: tuple[int | str, ...]) -> str:
+    words = [part for part in loc if isinstance(part, str) and part in _EXAMPLES]
+    return _EXAMPLES[words[-1]] if words else "aqualvs_rig: 1"
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    text = ""
+    for part in loc:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def _closest(loc: tuple[int | str, ...]) -> str:
+    part: type[BaseModel] = RigFile
+    for word in loc[:-1]:
+        part = _PARTS.get(str(word), part)
+    known = list(part.model_fields)
+    close = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return f"allowed here: {', '.join(known)}"
+
+
+_PARTS: dict[str, type[BaseModel]] = {
+    "image": ImagePart,
+    "camera": CameraPart,
+    "dome": DomePart,
+    "water": WaterPart,
+    "lasers": LaserPart,
+}
+
+
+def _shown(value: object) -> str:
+    text = "empty" if value is None else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,118 @@
+"""The refractive index of water from temperature, salinity and wavelength.
+
+Quan and Fry, Empirical equation for the index of refraction of seawater, Applied Optics 34 (1995)
+3477, doi:10.1364/AO.34.003477, fitted to the data of Austin and Halikas (1976): standard deviation
+about 1.5e-5. The index it gives is relative to air.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+
+N_AIR = 1.0003
+"""Index of air relative to vacuum, as rig files have it by default."""
+GREEN_NM = 532.0
+"""Wavelength of a frequency-doubled Nd:YAG laser in vacuum, nanometres."""
+
+_N0, _N1, _N2, _N3, _N4 = 1.31405, 1.779e-4, -1.05e-6, 1.6e-8, -2.02e-6
+_N5, _N6, _N7, _N8, _N9 = 15.868, 0.01155, -0.00423, -4382.0, 1.1455e6
+
+
+class IndexSlopes(NamedTuple):
+    """Derivatives of the index of seawater relative to air.
+
+    Attributes
+    ----------
+    by_temperature : array
+        Per degree Celsius.
+    by_salinity : array
+        Per per mille.
+    """
+
+    by_temperature: FloatArray
+    by_salinity: FloatArray
+
+
+def seawater_index(
+    temperature_c: ArrayLike, salinity_permille: ArrayLike, wavelength_nm: ArrayLike = GREEN_NM
+) -> FloatArray:
+    """Return the refractive index of seawater relative to air at atmospheric pressure.
+
+    Parameters
+    ----------
+    temperature_c : array
+        0 to 30 degrees Celsius.
+    salinity_permille : array
+        0 to 40 per mille. The equation was fitted from 0 to 35; above that it is extrapolated,
+        linearly, as the formula is in salinity.
+    wavelength_nm : array
+        400 to 700 nanometres.
+
+    Returns
+    -------
+    array
+        The three broadcast together.
+
+    Raises
+    ------
+    OptionError
+        If a value lies outside its range or is not a number.
+    """
+    t, s, w = _checked(temperature_c, salinity_permille, wavelength_nm)
+    index: FloatArray = np.asarray(
+        _N0
+        + (_N1 + (_N2 + _N3 * t) * t) * s
+        + _N4 * t * t
+        + (_N5 + _N6 * s + _N7 * t + (_N8 + _N9 / w) / w) / w
+    )
+    return index
+
+
+def seawater_index_vacuum(
+    temperature_c: ArrayLike,
+    salinity_permille: ArrayLike,
+    wavelength_nm: ArrayLike = GREEN_NM,
+    *,
+    n_air: float = N_AIR,
+) -> FloatArray:
+    """Return the refractive index of seawater relative to vacuum, as rigs and cameras take it.
+
+    `seawater_index` times `n_air`; parameters and errors as there.
+    """
+    return seawater_index(temperature_c, salinity_permille, wavelength_nm) * n_air
+
+
+def seawater_index_slopes(
+    temperature_c: ArrayLike, salinity_permille: ArrayLike, wavelength_nm: ArrayLike = GREEN_NM
+) -> IndexSlopes:
+    """Return how `seawater_index` changes with temperature and salinity; parameters as there."""
+    t, s, w = _checked(temperature_c, salinity_permille, wavelength_nm)
+    return IndexSlopes(
+        np.asarray((_N2 + 2.0 * _N3 * t) * s + 2.0 * _N4 * t + _N7 / w),
+        np.asarray(_N1 + (_N2 + _N3 * t) * t + _N6 / w),
+    )
+
+
+def _checked(*values: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ranges = (
+        ("water temperature", "°C", 0.0, 30.0),
+        ("salinity", "per mille", 0.0, 40.0),
+        ("wavelength", "nm", 400.0, 700.0),
+    )
+    arrays = []
+    for value, (name, unit, low, high) in zip(values, ranges, strict=True):
+        array = np.asarray(value, dtype=np.float64)
+        outside = ~((array >= low) & (array <= high))
+        if np.any(outside):
+            first = float(array[outside].flat[0])
+            raise OptionError(
+                f"{name} {first:g} {unit} is outside {low:g} to {high:g} {unit}, where the "
+                "equation of Quan and Fry holds; give the measured value or the index itself"
+            )
+        arrays.append(array)
+    t, s, w = np.broadcast_arrays(*arrays)
+    return t, s, w
