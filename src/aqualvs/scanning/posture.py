@@ -1,0 +1,172 @@
+"""Posture relative to a plane target: range, pitch, yaw and how far to trust them."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.plane_fit import PlaneFit
+
+# Beyond these a posture tells nothing that a pilot could use.
+_MAX_SIGMA_RANGE_SHARE = 0.05
+_MAX_SIGMA_ANGLE = np.deg2rad(5.0)
+# A plane fits a net or a wall within this share of the range, or it is not a plane.
+_MAX_RMS_SHARE = 0.02
+# What detection noise may add to the edge of the working range.
+_RANGE_TOLERANCE = 0.01
+
+
+class Reason(StrEnum):
+    """Why there is no posture; the value is what `posture.csv` says in `reason`."""
+
+    NO_STRIPES = "no_stripes"
+    """Nothing in the lasers' bands stands out."""
+    TOO_FEW_POINTS = "too_few_points"
+    """Less stripe than a posture needs."""
+    ONE_LASER = "one_laser"
+    """Stripes of one laser only: a line does not fix a plane."""
+    COLLINEAR = "collinear"
+    """The points are almost on a line; the plane could turn about it."""
+    NOT_A_PLANE = "not_a_plane"
+    """Stripes that share no plane."""
+    NO_TARGET = "no_target"
+    """Surfaces, but none of the kind that was asked for."""
+    OUT_OF_RANGE = "out_of_range"
+    """A plane, but outside the working range."""
+    CORRUPT_FRAME = "corrupt_frame"
+    """The picture could not be decoded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """No posture, and why; falsy."""
+
+    reason: Reason
+    detail: str = ""
+
+    def __bool__(self) -> Literal[False]:
+        """Return False, so that `if posture:` reads well."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Posture:
+    """Posture of the vehicle relative to a plane (paper, Eq. 23-26); truthy.
+
+    Attributes
+    ----------
+    range, pitch, yaw : float
+        Distance of the dome's centre from the plane in metres, angles in radians.
+    covariance : array, shape (3, 3)
+        Of (range, pitch, yaw), in m and rad.
+    normal_in_dome : array, shape (3,)
+        Unit normal of the target plane, pointing away from the vehicle.
+    slant_range : float
+        Distance from the dome's centre to the plane along the camera's axis, in metres.
+    nearest : float
+        Distance from the dome's centre to the nearest measured point of the target, in metres.
+    n_points : int
+        Stripe points that the fit rests on.
+    rms : float
+        Root mean square distance of their chunks from the plane, in metres.
+    """
+
+    range: float
+    pitch: float
+    yaw: float
+    covariance: FloatArray
+    normal_in_dome: FloatArray
+    slant_range: float
+    nearest: float
+    n_points: int
+    rms: float
+
+    def __bool__(self) -> Literal[True]:
+        """Return True: a posture is an answer."""
+        return True
+
+
+def posture_from_fit(
+    fit: PlaneFit,
+    points: FloatArray,
+    *,
+    camera_axis_in_dome: FloatArray,
+    working_range: tuple[float, float],
+) -> Posture | Refusal:
+    """Turn a plane fit into a posture (paper, Eq. 23-26), or say why it is none.
+
+    Parameters
+    ----------
+    fit : PlaneFit
+        Of the target.
+    points : array, shape (N, 3)
+        The stripe points that the fit rests on, in `dome`, metres.
+    camera_axis_in_dome : array, shape (3,)
+        Unit vector along which the camera looks.
+    working_range : (float, float)
+        Nearest and farthest range that is believed, in metres.
+    """
+    distance, pitch, yaw = range_pitch_yaw(fit.m)
+    jacobian = _range_pitch_yaw_jacobian(fit.m)
+    covariance = jacobian @ fit.covariance @ jacobian.T
+    refusal = _refuse(distance, covariance, fit.rms, working_range)
+    if refusal is not None:
+        return refusal
+    approach = float(fit.m @ camera_axis_in_dome)
+    return Posture(
+        range=distance,
+        pitch=pitch,
+        yaw=yaw,
+        covariance=covariance,
+        normal_in_dome=fit.m * distance,
+        slant_range=1.0 / approach if approach > 0.0 else float("inf"),
+        nearest=float(np.sqrt(np.min(np.sum(points**2, axis=1)))),
+        n_points=len(points),
+        rms=fit.rms,
+    )
+
+
+def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
+    """Range (m), pitch and yaw (rad) of the plane m·X = 1 (paper, Eq. 25-26 as arctangents)."""
+    return (
+        float(1.0 / np.linalg.norm(m)),
+        float(np.arctan2(m[2], m[1])),
+        float(np.arctan2(m[0], m[1])),
+    )
+
+
+def _range_pitch_yaw_jacobian(m: FloatArray) -> FloatArray:
+    """Return the derivative (3, 3) of (range, pitch, yaw) by m."""
+    x, y, z = m
+    yz, xy = y * y + z * z, x * x + y * y
+    return np.array(
+        [
+            -m / float(np.linalg.norm(m)) ** 3,
+            [0.0, -z / yz, y / yz],
+            [y / xy, -x / xy, 0.0],
+        ]
+    )
+
+
+def _refuse(
+    distance: float, covariance: FloatArray, rms: float, working_range: tuple[float, float]
+) -> Refusal | None:
+    near, far = working_range
+    sigma_range, sigma_pitch, sigma_yaw = np.sqrt(np.diag(covariance))
+    if not (1.0 - _RANGE_TOLERANCE) * near <= distance <= (1.0 + _RANGE_TOLERANCE) * far:
+        return Refusal(
+            Reason.OUT_OF_RANGE,
+            f"range {distance:.3f} m is outside the working range {near:.2f} to {far:.2f} m",
+        )
+    if rms > _MAX_RMS_SHARE * distance:
+        return Refusal(Reason.NOT_A_PLANE, f"points are {1e3 * rms:.1f} mm rms off the best plane")
+    worst = max(sigma_pitch, sigma_yaw)
+    if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
+        return Refusal(
+            Reason.COLLINEAR,
+            f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
+            f"{np.rad2deg(worst):.1f} deg",
+        )
+    return None

@@ -1,0 +1,108 @@
+"""What goes in and out of the scanner: frames, stripe points, scans."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.posture import Posture, Refusal
+
+ImagePlane: TypeAlias = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture as decoders deliver it: full-size luma, half-size chroma.
+
+    Attributes
+    ----------
+    index : int
+        Number of the frame in its source, from 0.
+    time_s : float
+        Time since the start of the source, from the stream's own clock.
+    luma : uint8 array, shape (height, width)
+        Rows may be padded in memory (any strides with unit step along x).
+    chroma : (uint8 array, uint8 array) or None
+        U and V planes, shape (ceil(height/2), ceil(width/2)); None for a grey source.
+    """
+
+    index: int
+    time_s: float
+    luma: ImagePlane
+    chroma: tuple[ImagePlane, ImagePlane] | None = None
+
+
+class Label(IntEnum):
+    """What a stripe point was found to be; `points.parquet` holds the lower-case name."""
+
+    TARGET = 0
+    """Lies on the target plane and entered the posture."""
+    OTHER_SURFACE = 1
+    """Lies on another plane: a wall behind the net, a face of a box."""
+    CLUTTER = 2
+    """Lies on no plane: fish, bubble, marine snow, glare."""
+    AMBIGUOUS = 3
+    """In a crossing zone; could belong to more than one laser."""
+    OUT_OF_RANGE = 4
+    """Triangulates outside the working range."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPoints:
+    """Triangulated stripe points of one frame, N of them, ordered by laser.
+
+    Attributes
+    ----------
+    laser : int8 array, shape (N,)
+        Index into `Rig.lasers`.
+    pixels : array, shape (N, 2)
+        Sub-pixel position on the stripe in `image`.
+    points_in_dome : array, shape (N, 3)
+        Metres.
+    sigma : array, shape (N,)
+        Standard deviation along the ray, in metres.
+    intensity, width, quality : array, shape (N,)
+        Peak height above background (grey levels), full width at half height across the search
+        line (px), and quality between 0 and 1.
+    label : uint8 array, shape (N,)
+        `Label` values.
+    """
+
+    laser: NDArray[np.int8]
+    pixels: FloatArray
+    points_in_dome: FloatArray
+    sigma: FloatArray
+    intensity: FloatArray
+    width: FloatArray
+    quality: FloatArray
+    label: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.laser)
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """The scanner's answer to one frame.
+
+    Attributes
+    ----------
+    index, time_s
+        As in the `Frame`.
+    posture : Posture or Refusal
+        Falsy with its reason when there is none.
+    points : ScanPoints
+        Every stripe point, labelled.
+    n_water : float
+        Refractive index used.
+    """
+
+    index: int
+    time_s: float
+    posture: Posture | Refusal
+    points: ScanPoints
+    n_water: float

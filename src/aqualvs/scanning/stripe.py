@@ -1,0 +1,314 @@
+"""Stripe detection: sub-pixel returns along search lines."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.scanning.contrast import ContrastWorkspace, U8Array, local_contrast
+from aqualvs.scanning.runs import cells_in_band, cells_near_green, find_runs, sort_by_line
+
+# A valley below this many tenths of the lower of two peaks separates two returns.
+_VALLEY_TENTHS = 6
+_NO_CHROMA = np.empty((0, 0), np.uint8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StripeOptions:
+    """Options of the sub-pixel detector.
+
+    Attributes
+    ----------
+    min_contrast : int
+        Smallest height of a return above its background, in grey levels.
+    reach_share : float
+        How far the background is looked for on each side, as a share of the image width; must
+        exceed the width of the widest stripe.
+    min_green_fall : float
+        Smallest fall of the U chroma against the flanks, in grey levels: a laser line is greener
+        than what surrounds it; twine and sun glare are not. Only used where the source has colour.
+    max_returns : int
+        Returns kept per frame and search direction; what exceeds it is dropped.
+    """
+
+    min_contrast: int = 12
+    reach_share: float = 0.045
+    min_green_fall: float = 3.0
+    max_returns: int = 16384
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if not 1 <= self.min_contrast <= 254:
+            raise OptionError(f"min_contrast is {self.min_contrast}; use 1 to 254 grey levels")
+        if not 0.0 < self.reach_share < 0.5:
+            raise OptionError(f"reach_share is {self.reach_share}; use 0 to 0.5 of the width")
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """Returns of one search direction, ordered by search line, then by position.
+
+    Attributes
+    ----------
+    line : int array, shape (N,)
+        Search line: x for searches along y, y for searches along x.
+    position : array, shape (N,)
+        Sub-pixel centre along the line.
+    height : array, shape (N,)
+        Peak above background, in grey levels.
+    width : array, shape (N,)
+        Full width at half height along the line, in pixels.
+    green_fall : array, shape (N,)
+        Fall of the U chroma against the flanks, in grey levels; NaN for a grey source.
+    """
+
+    line: IntArray
+    position: FloatArray
+    height: FloatArray
+    width: FloatArray
+    green_fall: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of returns."""
+        return len(self.line)
+
+
+@dataclass(frozen=True, slots=True)
+class SearchView:
+    """A frame as one search direction sees it, both ways round.
+
+    What looks at many lines at once runs along the rows of `luma`, what follows one line along
+    the rows of `lines`: each along memory.
+
+    Attributes
+    ----------
+    luma : uint8 array, shape (length, n_lines)
+        Search lines are columns.
+    lines : uint8 array, shape (n_lines, length)
+        Its transpose: search lines are rows.
+    u, u_lines : uint8 array or None
+        U chroma of half the size, likewise; None for a grey source.
+    """
+
+    luma: U8Array
+    lines: U8Array
+    u: U8Array | None
+    u_lines: U8Array | None
+
+
+class StripeDetector:
+    """Finds returns along every search line of one direction; several per line.
+
+    Parameters
+    ----------
+    length, n_lines : int
+        Shape of the search image: the luma plane, or its transpose for searches along x.
+    lowest, highest : int array, shape (n_lines,)
+        First and last position of interest on each line (an empty interval skips the line).
+    reach_px : int
+        See `StripeOptions.reach_share`.
+    options : StripeOptions
+        Options.
+
+    Notes
+    -----
+    A return is a run of pixels above the local background with one peak. Its centre is the
+    centroid of what stands above half height, which keeps its place when the top saturates.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        n_lines: int,
+        lowest: IntArray,
+        highest: IntArray,
+        reach_px: int,
+        options: StripeOptions,
+    ) -> None:
+        self._options = options
+        self._lowest, self._highest = lowest, highest
+        self._reach_px = reach_px
+        self._workspace = ContrastWorkspace(length, n_lines, reach_px)
+        half_length, half_lines = -(-length // 2), -(-n_lines // 2)
+        self._chroma_workspace = ContrastWorkspace(half_length, half_lines, -(-reach_px // 2))
+        self._inverted_u: U8Array = np.empty((half_length, half_lines), np.uint8)
+        self._in_band = cells_in_band(length, lowest, highest)
+        self._cells = np.empty_like(self._in_band)
+        self._any_green = np.empty(self._in_band.shape, np.uint32)
+        self._open_start = np.empty(n_lines, np.int64)
+        self._open_last = np.empty(n_lines, np.int64)
+        self._runs = np.empty((options.max_returns, 3), np.int64)
+        self._sorted = np.empty_like(self._runs)
+        self._line_start = np.empty(n_lines + 1, np.int64)
+        self._line = np.empty(options.max_returns, np.int64)
+        self._measures = np.empty((4, options.max_returns))
+
+    def detect(self, view: SearchView) -> Returns:
+        """Find the returns of one frame.
+
+        Returns
+        -------
+        found : Returns
+            Copies: they stay valid after the next call.
+        """
+        contrast = local_contrast(view.luma, self._workspace, self._options.min_contrast)
+        n_runs = find_runs(
+            self._cells_of_interest(view.u),
+            contrast.view(np.uint64),
+            contrast,
+            self._lowest,
+            self._highest,
+            self._open_start,
+            self._open_last,
+            self._runs,
+        )
+        sort_by_line(self._runs[:n_runs], self._line_start, self._sorted)
+        n = _measure_runs(
+            view.lines,
+            contrast,
+            view.u_lines if view.u_lines is not None else _NO_CHROMA,
+            self._sorted[:n_runs],
+            self._reach_px,
+            self._options.min_green_fall,
+            self._line,
+            self._measures,
+        )
+        position, height, width, green_fall = self._measures[:, :n].copy()
+        return Returns(self._line[:n].copy(), position, height, width, green_fall)
+
+    def _cells_of_interest(self, u_plane: U8Array | None) -> BoolArray:
+        """Mark the cells that a band reaches and where something is green."""
+        if u_plane is None:
+            return self._in_band
+        np.subtract(255, u_plane, out=self._inverted_u)
+        threshold = max(1, int(self._options.min_green_fall))
+        green = local_contrast(self._inverted_u, self._chroma_workspace, threshold)
+        cells_near_green(self._in_band, green.view(np.uint32), self._any_green, self._cells)
+        return self._cells
+
+
+@inline_kernel
+def _next_peak(lines: U8Array, x: int, start: int, last: int, base: int) -> tuple[int, int]:
+    """Return (peak, end) of the first return in [start, last]; the next one begins at `end`.
+
+    `base` is the background: a valley between two returns is shallow or deep against it.
+    """
+    peak = start
+    top = np.int64(lines[x, start])
+    valley_at = start
+    valley = top
+    for v in range(start + 1, last + 1):
+        value = np.int64(lines[x, v])
+        if value > top:
+            if _separates(valley, top, base) and valley_at > start:
+                return peak, valley_at
+            top, peak = value, v
+            valley, valley_at = value, v
+        elif value < valley:
+            valley, valley_at = value, v
+        elif _separates(valley, value, base) and valley_at > start:
+            return peak, valley_at
+    return peak, last + 1
+
+
+@inline_kernel
+def _separates(valley: int, lower_peak: int, base: int) -> bool:
+    return 10 * (valley - base) < _VALLEY_TENTHS * (lower_peak - base)
+
+
+@inline_kernel
+def _half_height_centroid(
+    lines: U8Array, x: int, peak: int, low: int, high: int, height: int
+) -> tuple[float, float, bool]:
+    """Centroid and width of what stands above half `height` at `peak`, searched in [low, high].
+
+    False when the profile does not fall to that level inside the interval.
+    """
+    # Twice the grey levels keep half a level a whole number.
+    level = 2 * np.int64(lines[x, peak]) - height
+    total = np.int64(0)
+    moment = np.int64(0)
+    a = peak
+    while a >= low:
+        excess = 2 * np.int64(lines[x, a]) - level
+        if excess <= 0:
+            break
+        total += excess
+        moment += excess * (a - peak)
+        a -= 1
+    b = peak + 1
+    while b <= high:
+        excess = 2 * np.int64(lines[x, b]) - level
+        if excess <= 0:
+            break
+        total += excess
+        moment += excess * (b - peak)
+        b += 1
+    if a < low or b > high:
+        return 0.0, 0.0, False
+    below, above = 2 * np.int64(lines[x, a]) - level, 2 * np.int64(lines[x, a + 1]) - level
+    rise = -below / (above - below)
+    below, above = 2 * np.int64(lines[x, b]) - level, 2 * np.int64(lines[x, b - 1]) - level
+    fall = -below / (above - below)
+    return peak + moment / total, (b - fall) - (a + rise), True
+
+
+@inline_kernel
+def _green_fall(u_lines: U8Array, x: int, peak: int, width: float) -> float:
+    """Fall of U against both flanks, where it is deepest: a saturated core is white, not green."""
+    row = x // 2
+    last = u_lines.shape[1] - 1
+    edge = int(0.5 * width) + 1
+    flank = int(width) + 4
+    here = min(
+        u_lines[row, peak // 2],
+        u_lines[row, max(peak - edge, 0) // 2],
+        u_lines[row, min((peak + edge) // 2, last)],
+    )
+    before = float(u_lines[row, max(peak - flank, 0) // 2])
+    after = float(u_lines[row, min((peak + flank) // 2, last)])
+    return 0.5 * (before + after) - float(here)
+
+
+@kernel
+def _measure_runs(
+    lines: U8Array,
+    contrast: U8Array,
+    u_lines: U8Array,
+    runs: IntArray,
+    reach_px: int,
+    min_green_fall: float,
+    line: IntArray,
+    measures: FloatArray,
+) -> int:
+    """Write the line and (position, height, width, green fall) of every return in the runs."""
+    length = lines.shape[1]
+    n = 0
+    for i in range(runs.shape[0]):
+        x, start, last = runs[i, 0], runs[i, 1], runs[i, 2]
+        first = max(start - reach_px, 0)
+        base = np.int64(lines[x, start]) - np.int64(contrast[start, x])
+        while start <= last and n < line.shape[0]:
+            peak, end = _next_peak(lines, x, start, last, base)
+            # Beyond the run the profile may still be falling towards half height.
+            bound = min(last + reach_px, length - 1) if end > last else end
+            height = np.int64(contrast[peak, x])
+            centre, width, found = _half_height_centroid(lines, x, peak, first, bound, height)
+            first = end
+            start = end
+            if not found or width > reach_px:
+                continue
+            green = np.nan
+            if u_lines.shape[0] > 0:
+                green = _green_fall(u_lines, x, peak, width)
+                if green < min_green_fall:
+                    continue
+            line[n] = x
+            measures[0, n] = centre
+            measures[1, n] = height
+            measures[2, n] = width
+            measures[3, n] = green
+            n += 1
+    return n
