@@ -265,7 +265,7 @@ def _plane_axes(frames: list[Json], index: int) -> Json:
     limits = {}
     for axis in "xy":
         values = [v for frame in frames for v in frame["lasers"][index][axis] if v is not None]
-        low, high = np.percentile(values, [0.5, 99.5]) if values else (0.0, 1000.0)
+        low, high = np.percentile(values, [2, 98]) if values else (0.0, 1000.0)
         pad = 0.06 * (high - low) + 5.0
         limits[axis] = rounded([low - pad, high + pad], 1)
     return limits

@@ -24,7 +24,13 @@ from aqualvs.scanning.scan import ImagePlane, Label
 N_PICTURES = 6
 N_SAMPLES = 24
 _WIDTH_PX = 800
-_JPEG_QUALITY = 80
+# Colour at full resolution, else the lasers' colours bleed into the green stripes below.
+_JPEG = (
+    cv2.IMWRITE_JPEG_QUALITY,
+    80,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+)
 _SATURATED = 250
 
 
@@ -101,7 +107,7 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
     if points is not None:
         pixels = (points.pixels + 0.5) * scale - 0.5
         small = draw_points(small, points.laser, pixels, points.label)
-    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    _, jpeg = cv2.imencode(".jpg", small, _JPEG)
     text = base64.b64encode(jpeg.tobytes()).decode("ascii")
     return Picture(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
 

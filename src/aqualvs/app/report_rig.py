@@ -62,15 +62,11 @@ def lasers_of(rig: Mapping[str, Any]) -> list[LaserFacts]:
 
 def working_range_m(rig: Mapping[str, Any]) -> tuple[float, float] | None:
     """Return the nearest and farthest range at which the rig is believed, in metres."""
-    for key, unit in (("working_range_mm", 1e-3), ("working_range_m", 1.0)):
-        pair = rig.get(key)
-        if (
-            isinstance(pair, list)
-            and len(pair) == 2
-            and np.isfinite([number(v) for v in pair]).all()
-        ):
-            return number(pair[0]) * unit, number(pair[1]) * unit
-    return None
+    pair = rig.get("working_range_mm")
+    if not isinstance(pair, list) or len(pair) != 2:
+        return None
+    near, far = (1e-3 * number(value) for value in pair)
+    return (near, far) if np.isfinite(near) and np.isfinite(far) else None
 
 
 def dome_radius_mm(rig: Mapping[str, Any]) -> float:
@@ -104,23 +100,13 @@ def _shown(value: object) -> str:
 
 
 def _laser(entry: Mapping[str, Any], index: int) -> LaserFacts:
-    plane = entry.get("plane")
-    merged = {**entry, **plane} if isinstance(plane, dict) else dict(entry)
-    normal = np.array([number(v) for v in _triple(merged.get("normal"))])
+    values = entry.get("normal")
+    triple = values if isinstance(values, list) and len(values) == 3 else [None] * 3
+    normal = np.array([number(value) for value in triple])
     length = float(np.linalg.norm(normal))
-    offset = _offset(merged)
-    name = str(entry.get("name") or f"laser {index + 1}")
+    unknown = LaserFacts.unknown(index)
+    name = str(entry.get("name") or unknown.name)
     if not length > 0.0:
-        return LaserFacts(name, np.full(3, np.nan), float("nan"))
-    return LaserFacts(name, normal / length, offset / length)
-
-
-def _triple(value: object) -> list[object]:
-    return value if isinstance(value, list) and len(value) == 3 else [None] * 3
-
-
-def _offset(entry: Mapping[str, Any]) -> float:
-    for key, unit in (("offset_mm", 1e-3), ("d_mm", 1e-3), ("offset_m", 1.0), ("d_m", 1.0)):
-        if key in entry:
-            return number(entry[key]) * unit
-    return float("nan")
+        return LaserFacts(name, unknown.normal, unknown.offset)
+    # As in rig files, the offset belongs to the unit normal.
+    return LaserFacts(name, normal / length, 1e-3 * number(entry.get("offset_mm")))

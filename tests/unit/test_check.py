@@ -1,0 +1,257 @@
+"""`aqualvs check`: numbers against closed forms and Monte Carlo, verdicts on spoilt rigs."""
+
+import io
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from aqualvs.app.check import Finding, Severity, check_rig, run_check
+from aqualvs.app.check_accuracy import N_POINTS, SIGMA_PX, expect, index_sigma
+from aqualvs.app.check_stripes import field_of_view, point_per_pixel, see_stripe
+from aqualvs.errors import RigError
+from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
+from aqualvs.optics.lens import Lens
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
+from aqualvs.optics.rigfile import save_rig
+from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+
+
+def pinhole(*lasers: Laser) -> Rig:
+    """Return a rig with a bare pinhole camera at the dome's centre."""
+    return Rig(
+        name="pinhole",
+        size_px=(641, 481),
+        lens=Lens(fx=800.0, fy=800.0, cx=320.0, cy=240.0),
+        dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
+        dome=None,
+        n_air=1.0,
+        n_water=1.3333,
+        lasers=lasers,
+        working_range=(0.3, 1.2),
+    )
+
+
+def upright(offset: float = 0.1) -> Laser:
+    return Laser("upright", Plane.from_normal([1.0, 0.0, 0.0], offset))
+
+
+def level(offset: float = -0.1) -> Laser:
+    return Laser("level", Plane.from_normal([0.0, 0.0, 1.0], offset))
+
+
+def sentences(findings: list[Finding], severity: Severity) -> str:
+    return " ".join(f.sentence for f in findings if f.severity is severity)
+
+
+@pytest.mark.parametrize("rig", [example_rig(), bluerov2_rig()], ids=lambda rig: rig.name)
+def test_example_rigs_are_sane(rig: Rig) -> None:
+    findings = check_rig(rig)
+    assert sentences(findings, Severity.BAD) == ""
+    assert "The lens lies" in sentences(findings, Severity.OK)
+
+
+def test_field_of_view_of_a_pinhole() -> None:
+    across, down = field_of_view(pinhole().camera())
+    # 641 pixels from edge to edge; 1e-7: arccos near its end, and the arithmetic of the lens.
+    assert across == pytest.approx(2.0 * np.arctan(320.5 / 800.0), abs=1e-7)
+    assert down == pytest.approx(2.0 * np.arctan(240.5 / 800.0), abs=1e-7)
+
+
+def test_stripe_of_a_pinhole() -> None:
+    stripe = see_stripe(pinhole().camera(), upright().plane, 0.5)
+    # x = 320 + 800 · 0.1 / 0.5, the whole height of the picture but for one angular step.
+    np.testing.assert_allclose(stripe.pixels[:, 0], 480.0, atol=1e-9)
+    assert stripe.length_px == pytest.approx(481.0, abs=4.0)
+    np.testing.assert_allclose(stripe.points_in_dome[:, :2], [[0.1, 0.5]] * len(stripe.pixels))
+
+
+def test_stripe_lies_on_wall_and_laser_behind_a_dome() -> None:
+    rig = example_rig()
+    for laser in rig.lasers:
+        stripe = see_stripe(rig.camera(), laser.plane, 0.6)
+        assert len(stripe.pixels) > 100
+        np.testing.assert_allclose(stripe.points_in_dome[:, 1], 0.6, rtol=1e-12)
+        np.testing.assert_allclose(
+            laser.plane.signed_distance(stripe.points_in_dome), 0.0, atol=1e-14
+        )
+
+
+def test_laser_parallel_to_the_wall_is_not_seen() -> None:
+    across = Plane.from_normal([0.0, 1.0, 0.0], 0.5)
+    assert not see_stripe(pinhole().camera(), across, 0.5).visible
+
+
+@pytest.mark.parametrize("wall", [0.3, 0.6, 1.0])
+def test_range_per_pixel_of_a_pinhole(wall: float) -> None:
+    """Laser plane at distance b beside the axis: r = f b / (u - cx), so dr/du = r²/(f b)."""
+    rig = pinhole(upright(0.1), level(-0.08))
+    expected = wall**2 / (800.0 * np.array([0.1, 0.08]))
+    per_pixel = expect(rig, wall).per_pixel
+    # Second order of the central difference over one pixel: (h/u)² with u = f b / r >= 64 px.
+    np.testing.assert_allclose(per_pixel, expected, rtol=1e-4)
+    stripe = see_stripe(rig.camera(), upright().plane, wall)
+    slope = point_per_pixel(rig.camera(), stripe)
+    np.testing.assert_allclose(slope[:, 0], 0.0, atol=1e-12)
+
+
+def test_sigmas_are_those_of_a_monte_carlo() -> None:
+    rig, wall = example_rig(), 0.6
+    camera = rig.camera()
+    rng = np.random.default_rng(11)
+    points, slopes = [], []
+    for laser in rig.lasers:
+        stripe = see_stripe(camera, laser.plane, wall).thinned(N_POINTS)
+        points.append(stripe.points_in_dome)
+        slopes.append(point_per_pixel(camera, stripe))
+    true, slope = np.concatenate(points), np.concatenate(slopes)
+    weight = 1.0 / np.abs(slope[:, 1])
+    n_trials = 600
+    posture = np.empty((n_trials, 3))
+    for i in range(n_trials):
+        noisy = true + slope * rng.normal(0.0, SIGMA_PX, size=(len(true), 1))
+        m = np.linalg.lstsq(noisy * weight[:, None], weight)[0]
+        posture[i] = (
+            1.0 / np.linalg.norm(m),
+            np.arctan2(m[2], m[1]),
+            np.arctan2(m[0], m[1]),
+        )
+    told = expect(rig, wall)
+    predicted = [told.sigma_range, told.sigma_pitch, told.sigma_yaw]
+    # A standard deviation from 600 trials is known to 1/sqrt(1200) = 3 %; four times that.
+    np.testing.assert_allclose(posture.std(axis=0), predicted, rtol=0.12)
+
+
+def test_one_line_gives_no_posture() -> None:
+    assert not expect(pinhole(upright()), 0.5).valid
+    assert not expect(pinhole(upright(), replace(upright(), name="twin")), 0.5).valid
+    assert not expect(pinhole(), 0.5).valid
+    assert expect(pinhole(upright(0.1), upright(-0.1)), 0.5).valid
+
+
+def test_index_is_seen_by_a_decentred_lens_only() -> None:
+    rig = example_rig()
+    at = [
+        index_sigma(replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, [0.0, y, 0.0])))
+        for y in (0.001, 0.005, 0.015, 0.040)
+    ]
+    assert all(a > b for a, b in itertools.pairwise(at))
+    centred = replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
+    assert index_sigma(centred) > 0.1
+    assert index_sigma(replace(rig, dome=None)) == np.inf
+
+
+def test_index_sigma_is_that_of_a_monte_carlo() -> None:
+    rig, rng = example_rig(), np.random.default_rng(3)
+    told = index_sigma(rig)
+    x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
+    corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
+    tried = rig.n_water + told * np.linspace(-6.0, 6.0, 241)
+    seen = [rig.in_water(float(n)).camera().project(corners) for n in tried]
+    at, inside = np.array([pixels for pixels, _ in seen]), seen[120][1]
+    found = []
+    for _ in range(400):
+        noisy = at[120] + rng.normal(0.0, SIGMA_PX, size=at[120].shape)
+        cost = ((at - noisy) ** 2)[:, inside].sum(axis=(1, 2))
+        found.append(tried[np.argmin(cost)])
+    # A standard deviation from 400 trials is known to 3.5 %; four times that.
+    assert np.std(found) == pytest.approx(told, rel=0.14)
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (pinhole(), "There are no lasers"),
+        (pinhole(upright(), level(0.9)), "'level' never crosses the picture between 300 and 1200"),
+        (
+            pinhole(upright(), Laser("twin", Plane.from_normal([-1, 0, 0], -0.1))),
+            "lie in one plane",
+        ),
+        (replace(example_rig(), n_water=1.5), "index 1.5000 is not that of water"),
+        (
+            replace(
+                example_rig(),
+                dome_from_cam=SE3(
+                    rotation_from_rotvec([0.0, 0.0, np.pi]) @ DOME_FROM_CAM_NOMINAL, np.zeros(3)
+                ),
+            ),
+            "looks 180 degrees away",
+        ),
+    ],
+    ids=["no lasers", "laser unseen", "coplanar", "no water", "backwards"],
+)
+def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
+    assert words in sentences(check_rig(rig), Severity.BAD)
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (pinhole(upright()), "One laser draws one line"),
+        (pinhole(upright(), level(-0.25)), "'level' is in the picture only from"),
+        (replace(example_rig(), n_water=1.0003), "that of air"),
+        (
+            pinhole(upright(0.05), Laser("b", Plane.from_normal([1, 0, 0.1], -0.05))),
+            "6 degrees only",
+        ),
+        (
+            replace(
+                example_rig(),
+                dome_from_cam=SE3(
+                    rotation_from_rotvec([0.6, 0.0, 0.0]) @ DOME_FROM_CAM_NOMINAL, np.zeros(3)
+                ),
+            ),
+            "looks 34 degrees away",
+        ),
+        (
+            replace(pinhole(upright()), lens=Lens(fx=800, fy=800, cx=640, cy=240)),
+            "(640, 240) px is far",
+        ),
+        (replace(pinhole(upright()), lens=Lens(fx=800, fy=500, cx=320, cy=240)), "800 and 500 px"),
+        (
+            replace(
+                pinhole(upright()),
+                lens=Lens(fx=300, fy=300, cx=320, cy=240, distortion=(-0.5, 0.0, 0.0, 0.0)),
+            ),
+            "of the picture sees no water",
+        ),
+        (pinhole(upright(0.002), level(-0.002)), "put the lasers farther"),
+    ],
+    ids=["one", "near lost", "air", "narrow", "aside", "centre", "aspect", "lens ends", "baseline"],
+)
+def test_what_is_worth_a_warning(rig: Rig, words: str) -> None:
+    findings = check_rig(rig)
+    assert words in sentences(findings, Severity.WARN)
+
+
+def checked(path: Path) -> tuple[int, str]:
+    page = io.StringIO()
+    code = run_check(path, Console(file=page, width=120))
+    return code, page.getvalue()
+
+
+def test_command_on_a_sane_rig(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    save_rig(example_rig(), path)
+    code, page = checked(path)
+    assert code == 0
+    assert "rig 'example'" in page
+    assert "lower mm/px" in page
+    assert "This rig is sane" in page
+
+
+def test_command_on_a_bad_rig(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    save_rig(replace(pinhole(), name="[bold]odd"), path)
+    code, page = checked(path)
+    assert code == 2
+    assert "rig '[bold]odd'" in page
+    assert "cannot measure as it is: mend 1 fault." in page
+
+
+def test_command_on_no_rig(tmp_path: Path) -> None:
+    with pytest.raises(RigError, match="no such file"):
+        run_check(tmp_path / "none.yaml")
