@@ -12,7 +12,7 @@ from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.pipeline import FitMethod, ScannerOptions
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions
 
 _INDEX_LIMITS = (1.0, 1.5)

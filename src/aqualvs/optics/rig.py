@@ -90,6 +90,11 @@ class Rig:
         """Return the same camera without the dome: what ignoring refraction means."""
         return BareCamera(size_px=self.size_px, lens=self.lens, dome_from_cam=self.dome_from_cam)
 
+    @property
+    def focal_px(self) -> float:
+        """Pixels per radian near the image centre, in air: a scale for lengths in the image."""
+        return max(self.lens.fx, self.lens.fy)
+
     def in_water(self, n_water: float) -> "Rig":
         """Return the same rig in a medium of another index."""
         return replace(self, n_water=n_water)

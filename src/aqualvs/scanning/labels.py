@@ -9,68 +9,10 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.readings import Readings
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.scanning.surfaces import Surface
+from aqualvs.scanning.surfaces import Surface, in_lit_cell, lit_cells
 
-# Two stripes disturb each other within this many full widths, and this many pixels more.
-_CROSSING_WIDTHS = 1.2
-_CROSSING_PX = 2.0
-# Readings this near to an explained return are the same light, seen by the other search.
-_SAME_LIGHT_CELL_PX = 6
-
-
-def crossing_zone(
-    readings: Readings, planes: FloatArray, focal_px: float, candidates: BoolArray
-) -> BoolArray:
-    """Return which candidates lie where another laser's stripe crosses (paper, section 3.1).
-
-    Parameters
-    ----------
-    readings : Readings
-        N of them.
-    planes : array, shape (n_lasers, 4)
-        Laser planes as (normal, offset).
-    focal_px : float
-        Pixels per radian, roughly: turns distances on the target into pixels.
-    candidates : bool array, shape (N,)
-        Points on the target; others are not looked at.
-    """
-    zone = np.zeros(len(readings), np.bool_)
-    _mark_crossings(
-        readings.points, readings.laser, readings.width, planes, focal_px, candidates, zone
-    )
-    return zone
-
-
-@kernel
-def _mark_crossings(
-    points: FloatArray,
-    laser: IntArray,
-    width: FloatArray,
-    planes: FloatArray,
-    focal_px: float,
-    candidates: BoolArray,
-    zone: BoolArray,
-) -> None:
-    n_lasers = planes.shape[0]
-    # The mean width of each laser's stripe: a single width is inflated by the crossing itself.
-    total = np.zeros(n_lasers)
-    count = np.zeros(n_lasers)
-    for i in range(points.shape[0]):
-        if candidates[i]:
-            total[laser[i]] += width[i]
-            count[laser[i]] += 1.0
-    for i in range(points.shape[0]):
-        if not candidates[i]:
-            continue
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        px_per_m = focal_px / np.sqrt(x * x + y * y + z * z)
-        for b in range(n_lasers):
-            if b == laser[i] or count[b] == 0.0:
-                continue
-            gap = abs(planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3])
-            mean_width = max(total[b] / count[b], total[laser[i]] / count[laser[i]])
-            if gap * px_per_m < _CROSSING_WIDTHS * mean_width + _CROSSING_PX:
-                zone[i] = True
+# Position error of the best returns there are: quality 1.
+_BEST_SIGMA_PX = 0.1
 
 
 def label_readings(
@@ -112,7 +54,7 @@ def label_readings(
     if len(readings):
         _drop_explained(readings.source, readings.pixels, explained, kept, shared)
     label[shared & ~explained] = Label.AMBIGUOUS
-    return _scan_points(readings.where(kept), label[kept])
+    return _scan_points(readings, label, np.flatnonzero(kept))
 
 
 @kernel
@@ -125,34 +67,26 @@ def _drop_explained(
 ) -> None:
     """Drop unexplained readings of explained light; mark returns with several readings left."""
     n = source.shape[0]
-    rows = int(pixels[:, 1].max()) // _SAME_LIGHT_CELL_PX + 3
-    columns = int(pixels[:, 0].max()) // _SAME_LIGHT_CELL_PX + 3
-    lit = np.zeros((rows, columns), np.bool_)
-    for i in range(n):
-        if explained[i]:
-            row = max(int(pixels[i, 1]) // _SAME_LIGHT_CELL_PX, 0)
-            column = max(int(pixels[i, 0]) // _SAME_LIGHT_CELL_PX, 0)
-            lit[row : row + 3, column : column + 3] = True
+    lit = lit_cells(pixels, explained)
     readings_of = np.zeros(source.max() + 1, np.int64)
     for i in range(n):
         if not explained[i]:
-            row = max(int(pixels[i, 1]) // _SAME_LIGHT_CELL_PX, 0) + 1
-            column = max(int(pixels[i, 0]) // _SAME_LIGHT_CELL_PX, 0) + 1
-            kept[i] = not lit[row, column]
+            kept[i] = not in_lit_cell(pixels, i, lit)
         if kept[i]:
             readings_of[source[i]] += 1
     for i in range(n):
         shared[i] = kept[i] and readings_of[source[i]] > 1
 
 
-def _scan_points(readings: Readings, label: NDArray[np.uint8]) -> ScanPoints:
+def _scan_points(readings: Readings, label: NDArray[np.uint8], rows: IntArray) -> ScanPoints:
+    sigma_px, sensitivity = readings.sigma_px[rows], readings.sensitivity[rows]
     return ScanPoints(
-        laser=readings.laser.astype(np.int8),
-        pixels=readings.pixels,
-        points_in_dome=readings.points,
-        sigma=readings.sigma_px * np.sqrt(np.einsum("ij,ij->i", *[readings.sensitivity] * 2)),
-        intensity=readings.height,
-        width=readings.width,
-        quality=np.minimum(0.1 / readings.sigma_px, 1.0),
-        label=label,
+        laser=readings.laser[rows].astype(np.int8),
+        pixels=readings.pixels[rows],
+        points_in_dome=readings.points[rows],
+        sigma=sigma_px * np.sqrt(np.einsum("ij,ij->i", sensitivity, sensitivity)),
+        intensity=readings.height[rows],
+        width=readings.width[rows],
+        quality=np.minimum(_BEST_SIGMA_PX / sigma_px, 1.0),
+        label=label[rows],
     )

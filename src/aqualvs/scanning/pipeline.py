@@ -1,35 +1,23 @@
 """The main path: a frame in, posture and points out."""
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
-from aqualvs.scanning.labels import crossing_zone, label_readings
+from aqualvs.scanning.labels import label_readings
+from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
 from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
-from aqualvs.scanning.plane_fit import PlaneFit, fit_pseudo_inverse, fit_robust
-from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
+from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.search import plan_searches
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import Surface, TargetKind, choose_target, find_surfaces
+from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
-
-_MIN_LINES = 30
-
-
-class FitMethod(StrEnum):
-    """How the plane is fitted to the target's points."""
-
-    ROBUST = "robust"
-    """Weighted by each point's uncertainty, outliers rejected."""
-    PSEUDO_INVERSE = "pseudo_inverse"
-    """The paper's Eq. 24, for comparison: all points alike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,10 +64,7 @@ class Scanner:
         self._searches = plan_searches(rig, camera)
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
-        self._planes = np.array([[*one.plane.normal, one.plane.offset] for one in rig.lasers])
-        self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
-        # Angles shrink by the water's index behind a centred dome hardly at all; a rough scale.
-        self._focal_px = max(rig.lens.fx, rig.lens.fy)
+        self._meter = PostureMeter(rig, self.options.fit)
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -111,13 +96,16 @@ class Scanner:
             readings.pixels,
             len(self.rig.lasers),
             self._search_range(),
-            self._focal_px,
+            self.rig.focal_px,
         )
         target = choose_target(surfaces, self.options.target)
         # The posture from the target's points outside crossing zones.
-        posture, in_posture = self._measure(readings, chunk_index, target, surfaces)
-        points = label_readings(readings, chunk_index, surfaces, target, in_posture)
-        return Scan(frame.index, frame.time_s, posture, points, self.rig.n_water)
+        if target is None:
+            found = _no_target(readings, surfaces, self.options.target)
+        else:
+            found = self._meter.measure(readings, chunk_index, target)
+        points = label_readings(readings, chunk_index, surfaces, target, found.rests_on)
+        return Scan(frame.index, frame.time_s, found.posture, points, self.rig.n_water)
 
     def _search_range(self) -> tuple[float, float]:
         """Wider than the working range, so that a target beyond it is named as such."""
@@ -138,56 +126,10 @@ class Scanner:
             )
         return readings.where(kept)
 
-    def _measure(
-        self,
-        readings: Readings,
-        chunk_index: IntArray,
-        target: Surface | None,
-        surfaces: list[Surface],
-    ) -> tuple[Posture | Refusal, BoolArray]:
-        nothing = np.zeros(len(readings), np.bool_)
-        if target is None:
-            return _why_no_target(readings, surfaces, self.options.target), nothing
-        on_target = target.members[chunk_index]
-        if target.is_mesh:
-            # All the light on a strand: a part of it would have its centre off the sheet.
-            on_target = np.isin(readings.stretch, readings.stretch[on_target])
-        on_target &= ~crossing_zone(readings, self._planes, self._focal_px, on_target)
-        selected = readings.where(on_target)
-        if len(selected) < _MIN_LINES:
-            return Refusal(Reason.TOO_FEW_POINTS, "too few points outside crossings"), nothing
-        fit, unit = self._fit(selected, target)
-        if fit is None:
-            return Refusal(Reason.COLLINEAR, "the points do not fix a plane"), nothing
-        used = fit.weights[unit] > 0.0
-        posture = posture_from_fit(
-            fit,
-            selected.points[used],
-            camera_axis_in_dome=self._axis_in_dome,
-            working_range=self.rig.working_range,
-        )
-        in_posture = nothing
-        in_posture[np.flatnonzero(on_target)[used]] = bool(posture)
-        return posture, in_posture
 
-    def _fit(self, selected: Readings, target: Surface) -> tuple[PlaneFit | None, IntArray]:
-        """Fit the plane; also tell which observation of the fit each reading belongs to."""
-        # On a net a stretch is one strand, whose light has one centre; on a wall a chunk is enough
-        # for errors to be independent.
-        pieces = selected.stretch if target.is_mesh else selected.chunk
-        groups, index = np.unique(pieces, return_inverse=True)
-        seen = selected.observations(index, len(groups), target.plane.normal)
-        robust = fit_robust(
-            seen.points,
-            seen.sensitivity,
-            seen.sigma_px,
-            seen.laser,
-            target.plane.normal / target.plane.offset,
-        )
-        if robust is None or self.options.fit is FitMethod.ROBUST:
-            return robust, index
-        paper = fit_pseudo_inverse(selected.points, robust.covariance)
-        return paper, np.arange(len(selected))
+def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Measurement:
+    refusal = _why_no_target(readings, surfaces, wanted)
+    return Measurement(refusal, np.zeros(len(readings), np.bool_))
 
 
 def _why_no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Refusal:
@@ -195,7 +137,7 @@ def _why_no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKi
         return Refusal(Reason.NO_STRIPES, "no laser stripe in the picture")
     if surfaces:
         return Refusal(Reason.NO_TARGET, f"surfaces in view, but none of kind {wanted.value}")
-    if len(readings) < _MIN_LINES:
+    if len(readings) < MIN_LINES:
         return Refusal(Reason.TOO_FEW_POINTS, f"only {len(readings)} stripe points")
     if len(np.unique(readings.laser)) < 2:
         return Refusal(Reason.ONE_LASER, "stripes of one laser only")

@@ -39,20 +39,22 @@ class PlaneFit:
     rms: float
 
 
-def fit_pseudo_inverse(points: FloatArray, covariance: FloatArray) -> PlaneFit:
+def fit_pseudo_inverse(points: FloatArray, n_groups: int, covariance: FloatArray) -> PlaneFit:
     """Fit m·X = 1 by the left pseudo-inverse (paper, Eq. 24): all points alike, outliers too.
 
     Parameters
     ----------
     points : array, shape (N, 3)
         In `dome`, metres; N >= 3 and not collinear.
+    n_groups : int
+        How many weights to answer with, all 1.
     covariance : array, shape (3, 3)
         Passed on: the pseudo-inverse itself says nothing about its uncertainty.
     """
     m = np.asarray(np.linalg.lstsq(points, np.ones(len(points)))[0], dtype=np.float64)
     residual = (points @ m - 1.0) / np.linalg.norm(m)
     rms = float(np.sqrt(np.mean(residual**2)))
-    return PlaneFit(m, covariance, np.ones(len(points)), rms)
+    return PlaneFit(m, covariance, np.ones(n_groups), rms)
 
 
 def fit_robust(

@@ -5,12 +5,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from aqualvs.geometry.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
+from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.search import SearchAxis, StripeSearch
-from aqualvs.scanning.segments import link_segments
+from aqualvs.scanning.segments import Segments, link_segments
 from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.surfaces import Chunks
 from aqualvs.scanning.triangulate import Triangulator
 
 # Position noise of a return: a floor (texture, compression), and what grey-level noise makes of
@@ -84,22 +84,14 @@ class Readings:
         index : int array, shape (N,)
             Row of each reading's chunk.
         """
-        is_first = np.diff(self.chunk, prepend=-1) != 0
-        index = np.cumsum(is_first) - 1
-        first = np.flatnonzero(is_first)
-        n_lines = np.diff(first, append=len(self))
-        lines_of_stretch = np.bincount(self.stretch)[self.stretch[first]]
-        pieces = self.observations(index, len(first), FORWARD)
-        chunks = Chunks(
-            centroid=pieces.points,
-            sensitivity=pieces.sensitivity,
-            n_lines=n_lines,
-            weight=n_lines * np.minimum(1.0, _LOUDEST_STRETCH / lines_of_stretch),
-            first_line=self.line[first],
-            last_line=self.line[first + n_lines - 1],
-            laser=self.laser[first],
-        )
-        return chunks, index
+        index = np.empty(len(self), np.int64)
+        n = _number_chunks(self.chunk, index)
+        facts = np.empty((4, n), np.int64)
+        voice = np.empty(n)
+        _chunk_facts(index, self.line, self.laser, self.stretch, facts, voice)
+        pieces = self.observations(index, n, FORWARD)
+        table = np.vstack([pieces.points.T, pieces.sensitivity.T, voice])
+        return Chunks(table, *facts), index
 
     def observations(self, index: IntArray, n: int, normal: FloatArray) -> "Observations":
         """Average groups of readings, weighted by the light in each return.
@@ -110,18 +102,28 @@ class Readings:
         Parameters
         ----------
         index : int array, shape (N,)
-            Group of each reading, 0 to n - 1; no group is empty.
+            Group of each reading, 0 to n - 1, or -1 to leave it out; no group is empty.
         n : int
             Number of groups.
         normal : array, shape (3,)
             Normal of the surface as far as it is known; spread is measured along it.
         """
-        table = np.zeros((n, 9))
-        light = self.height * self.width
-        _summarise(index, light, self.points, self.sensitivity, self.sigma_px, normal, table)
-        laser = np.empty(n, np.int64)
-        laser[index] = self.laser
-        return Observations(table[:, 0:3].copy(), table[:, 3:6].copy(), table[:, 6].copy(), laser)
+        seen = Observations(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.empty(n, np.int64))
+        _summarise(
+            index,
+            self.laser,
+            self.height,
+            self.width,
+            self.points,
+            self.sensitivity,
+            self.sigma_px,
+            normal,
+            seen.points,
+            seen.sensitivity,
+            seen.sigma_px,
+            seen.laser,
+        )
+        return seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,80 +167,189 @@ def read_returns(
     Readings
         Only those whose ray meets the laser's sheet in front of the camera.
     """
-    parts = [
-        _candidates(i, search, returns[search.axis])
-        for i, search in enumerate(searches)
-        if search.axis in returns
-    ]
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    # Stretches and chunks of different lasers must differ.
-    for key in ("stretch", "chunk"):
-        count = [int(part[key].max(initial=-1)) + 1 for part in parts]
-        joined[key] += np.repeat(np.cumsum([0, *count[:-1]]), [len(part[key]) for part in parts])
-    along_x = joined.pop("along_x")
-    position = joined.pop("position")
-    pixels = np.stack([joined["line"], position], axis=-1)
-    pixels[along_x] = pixels[along_x, ::-1]
-    found = triangulator.triangulate(pixels, along_x, joined["laser"])
+    capacity = sum(len(returns[one.axis]) for one in searches if one.axis in returns)
+    numbers, measures = np.empty((6, capacity), np.int64), np.empty((3, capacity))
+    pixels = np.empty((capacity, 2))
+    n = 0
+    for i, search in enumerate(searches):
+        if search.axis in returns:
+            found = returns[search.axis]
+            segments = link_segments(found, search)
+            along_x = search.axis is SearchAxis.ALONG_X
+            n = _append(i, along_x, found, segments, search.line_px, n, numbers, measures, pixels)
+    source, laser, line, stretch, chunk, along = numbers[:, :n]
+    located = triangulator.triangulate(pixels[:n], along, laser)
     readings = Readings(
-        **joined,
-        pixels=pixels,
-        sigma_px=np.hypot(_FLOOR_PX, _FLANK_NOISE * joined["width"] / joined["height"]),
-        points=found.points_in_dome,
-        sensitivity=found.sensitivity,
+        source,
+        laser,
+        line,
+        stretch,
+        chunk,
+        pixels[:n],
+        measures[0, :n],
+        measures[1, :n],
+        measures[2, :n],
+        located.points_in_dome,
+        located.sensitivity,
     )
-    return readings if found.valid.all() else readings.where(found.valid)
+    return readings if located.valid.all() else readings.where(located.valid)
 
 
-def _candidates(laser: int, search: StripeSearch, returns: Returns) -> dict[str, AnyArray]:
-    segments = link_segments(returns, search)
-    order = segments.order
-    along_x = search.axis is SearchAxis.ALONG_X
-    return {
+def _append(
+    laser: int,
+    along_x: bool,
+    found: Returns,
+    segments: Segments,
+    line_px: int,
+    n: int,
+    numbers: IntArray,
+    measures: FloatArray,
+    pixels: FloatArray,
+) -> int:
+    """Append one laser's candidates to the columns from `n` on; returns the new count."""
+    _gather(
+        laser,
+        along_x,
+        line_px,
+        found.line,
+        found.position,
+        found.height,
+        found.width,
+        segments.order,
+        segments.stretch,
+        segments.chunk,
+        n,
+        numbers,
+        measures,
+        pixels,
+    )
+    return n + len(segments.order)
+
+
+@kernel
+def _gather(
+    laser: int,
+    along_x: bool,
+    line_px: int,
+    line: IntArray,
+    position: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    order: IntArray,
+    stretch: IntArray,
+    chunk: IntArray,
+    begin: int,
+    numbers: IntArray,
+    measures: FloatArray,
+    pixels: FloatArray,
+) -> None:
+    # Stretches and chunks of different lasers must differ.
+    first_stretch = 0
+    for i in range(begin):
+        first_stretch = max(first_stretch, numbers[3, i] + 1)
+    first_chunk = numbers[4, begin - 1] + 1 if begin > 0 else 0
+    across, along = (1, 0) if along_x else (0, 1)
+    for k in range(order.shape[0]):
+        i, r = begin + k, order[k]
         # Returns of the two search directions get odd and even numbers.
-        "source": 2 * order + along_x,
-        "laser": np.full(len(order), laser),
-        "line": returns.line[order],
-        "stretch": segments.stretch,
-        "chunk": segments.chunk,
-        "along_x": np.full(len(order), along_x),
-        "position": returns.position[order],
-        "height": returns.height[order],
-        "width": returns.width[order],
-    }
+        numbers[0, i] = 2 * r + along_x
+        numbers[1, i] = laser
+        numbers[2, i] = line[r]
+        numbers[3, i] = first_stretch + stretch[k]
+        numbers[4, i] = first_chunk + chunk[k]
+        numbers[5, i] = along_x
+        measures[0, i] = height[r]
+        measures[1, i] = width[r]
+        measures[2, i] = np.hypot(_FLOOR_PX, _FLANK_NOISE * width[r] / height[r])
+        # The middle of a search line that is several pixels wide.
+        pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
+        pixels[i, along] = position[r]
+
+
+@kernel
+def _number_chunks(chunk: IntArray, index: IntArray) -> int:
+    """Renumber ascending chunks without gaps, and count them."""
+    n = 0
+    for i in range(chunk.shape[0]):
+        if i > 0 and chunk[i] != chunk[i - 1]:
+            n += 1
+        index[i] = n
+    return n + 1 if chunk.shape[0] else 0
+
+
+@kernel
+def _chunk_facts(
+    index: IntArray,
+    line: IntArray,
+    laser: IntArray,
+    stretch: IntArray,
+    facts: IntArray,
+    voice: FloatArray,
+) -> None:
+    """Write (n_lines, first_line, last_line, laser) and the voice of each chunk."""
+    n_stretches = 0
+    for i in range(stretch.shape[0]):
+        n_stretches = max(n_stretches, stretch[i] + 1)
+    lines_of_stretch = np.zeros(n_stretches)
+    facts[0] = 0
+    for i in range(index.shape[0]):
+        c = index[i]
+        if facts[0, c] == 0:
+            facts[1, c] = line[i]
+            facts[3, c] = laser[i]
+        facts[0, c] += 1
+        facts[2, c] = line[i]
+        lines_of_stretch[stretch[i]] += 1.0
+    for i in range(index.shape[0]):
+        n_lines = float(facts[0, index[i]])
+        voice[index[i]] = n_lines * min(1.0, _LOUDEST_STRETCH / lines_of_stretch[stretch[i]])
 
 
 @kernel
 def _summarise(
     index: IntArray,
-    light: FloatArray,
+    laser: IntArray,
+    height: FloatArray,
+    width: FloatArray,
     points: FloatArray,
     sensitivity: FloatArray,
     sigma_px: FloatArray,
     normal: FloatArray,
-    table: FloatArray,
+    centroid: FloatArray,
+    mean_sensitivity: FloatArray,
+    group_sigma_px: FloatArray,
+    group_laser: IntArray,
 ) -> None:
-    """Fill rows of (centroid 3, sensitivity 3, sigma_px, spread², light), one a chunk."""
+    """Write the centroids, mean sensitivities, position errors and lasers of groups."""
+    n = group_sigma_px.shape[0]
+    total, spread = np.zeros(n), np.zeros(n)
     for i in range(index.shape[0]):
-        row = table[index[i]]
-        row[8] += light[i]
+        c = index[i]
+        if c < 0:
+            continue
+        light = height[i] * width[i]
+        total[c] += light
         for k in range(3):
-            row[k] += light[i] * points[i, k]
-            row[3 + k] += light[i] * sensitivity[i, k]
+            centroid[c, k] += light * points[i, k]
+            mean_sensitivity[c, k] += light * sensitivity[i, k]
         # Error of a weighted mean of independent positions.
-        row[6] += (light[i] * sigma_px[i]) ** 2
-    for c in range(table.shape[0]):
-        for k in range(6):
-            table[c, k] /= table[c, 8]
-        table[c, 6] /= table[c, 8] * table[c, 8]
+        group_sigma_px[c] += (light * sigma_px[i]) ** 2
+        group_laser[c] = laser[i]
+    for c in range(n):
+        for k in range(3):
+            centroid[c, k] /= total[c]
+            mean_sensitivity[c, k] /= total[c]
+        group_sigma_px[c] /= total[c] * total[c]
     for i in range(index.shape[0]):
-        row = table[index[i]]
+        c = index[i]
+        if c < 0:
+            continue
         offset = 0.0
         per_px = 0.0
         for k in range(3):
-            offset += normal[k] * (points[i, k] - row[k])
-            per_px += normal[k] * row[3 + k]
-        row[7] += light[i] * (offset / per_px) ** 2
-    for c in range(table.shape[0]):
-        spread_sq = table[c, 7] / table[c, 8]
-        table[c, 6] = np.sqrt(table[c, 6] + _CHUNK_FLOOR_PX**2 + _SPREAD_SHARE**2 * spread_sq)
+            offset += normal[k] * (points[i, k] - centroid[c, k])
+            per_px += normal[k] * mean_sensitivity[c, k]
+        spread[c] += height[i] * width[i] * (offset / per_px) ** 2
+    for c in range(n):
+        variance = group_sigma_px[c] + _SPREAD_SHARE**2 * spread[c] / total[c]
+        group_sigma_px[c] = np.sqrt(variance + _CHUNK_FLOOR_PX**2)

@@ -16,12 +16,14 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 
 SLOPE_CELL = 8
-"""Pixels per cell of the slope tables, and step of the grid that bands are computed on."""
+"""Positions, and search lines, per cell of the slope tables and of the grid bands come from."""
 
 # Points of a target at the far end of the range lie up to this much farther out, off the axis.
 _OFF_AXIS_STRETCH = 1.5
 # Targets are expected within this angle of facing the vehicle; it bounds the stripe's direction.
 _MAX_TARGET_TILT = np.deg2rad(45.0)
+# Wider pictures have finer pixels than stripes need; lines are binned to about this many.
+_PIXELS_PER_LINE_FROM = 1280
 # Slopes beyond this are as good as along the search line.
 _STEEPEST = 5.0
 
@@ -43,15 +45,18 @@ class StripeSearch:
     ----------
     axis : SearchAxis
         Direction of the search lines.
+    line_px : int
+        Pixels across one search line, which is the mean of so many pixel rows or columns.
     lowest, highest : int array, shape (n_lines,)
         First and last position of the band on each search line; lowest > highest where the laser
         cannot be seen.
     slope_low, slope_high : array, shape (ceil(length/8), ceil(n_lines/8))
         Range of d(position)/d(line) that a plane target within 45 degrees of square allows, by
-        cell of 8 x 8 pixels.
+        cell of 8 positions by 8 lines.
     """
 
     axis: SearchAxis
+    line_px: int
     lowest: IntArray
     highest: IntArray
     slope_low: FloatArray
@@ -82,30 +87,44 @@ def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
 
 
 def _plan_search(plane: Plane, working_range: tuple[float, float], camera: Camera) -> StripeSearch:
+    points, in_band = _points_on_grid(plane, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
+    rise, run = _stripe_directions(points)
+    axis = _search_axis(rise[0], run[0], in_band)
+    line_px = 2 if camera.size_px[0] >= _PIXELS_PER_LINE_FROM else 1
+    along_x = axis is SearchAxis.ALONG_X
+    wide = SLOPE_CELL * line_px
+    steps = (SLOPE_CELL, wide) if along_x else (wide, SLOPE_CELL)
+    points, in_band = _points_on_grid(plane, working_range, camera, steps)
+    if along_x:
+        points, in_band = points.swapaxes(0, 1), in_band.T
+    # Seen with search lines as columns, the change along a line is the rise.
+    rise, run = _stripe_directions(points)
+    length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
+    lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
+    return StripeSearch(axis, line_px, lowest, highest, *_slope_bounds(rise, run))
+
+
+def _points_on_grid(
+    plane: Plane,
+    working_range: tuple[float, float],
+    camera: Camera,
+    steps: tuple[int, int],
+) -> tuple[FloatArray, BoolArray]:
+    """Points on the sheet that a grid of pixels sees, and whether they lie in the working range."""
     width, height = camera.size_px
-    x = np.arange(0, width + SLOPE_CELL, SLOPE_CELL, dtype=np.float64)
-    y = np.arange(0, height + SLOPE_CELL, SLOPE_CELL, dtype=np.float64)
-    grid = np.stack(np.meshgrid(x, y), axis=-1)
-    points, valid = plane.intersect(camera.rays(grid))
+    x = np.arange(0, width + steps[0], steps[0], dtype=np.float64)
+    y = np.arange(0, height + steps[1], steps[1], dtype=np.float64)
+    points, valid = plane.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
     distance = np.linalg.norm(points, axis=-1)
     near, far = working_range
     # A plane at range d has no point nearer than d, so the near bound is exact.
     with np.errstate(invalid="ignore"):
         in_band = valid & (distance >= near) & (distance <= far * _OFF_AXIS_STRETCH)
-    rise, run = _stripe_directions(points)
-    axis = _search_axis(rise[0], run[0], in_band)
-    if axis is SearchAxis.ALONG_X:
-        in_band, rise, run = in_band.T, run.swapaxes(1, 2), rise.swapaxes(1, 2)
-        n_lines, length = height, width
-    else:
-        n_lines, length = width, height
-    slope_low, slope_high = _slope_bounds(rise, run)
-    lowest, highest = _band_limits(in_band, n_lines, length)
-    return StripeSearch(axis, lowest, highest, slope_low, slope_high)
+    return points, in_band
 
 
 def _stripe_directions(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Stripe direction (rise along y, run along x) at each grid point for several targets.
+    """Stripe direction (rise along the rows, run along the columns) for several targets.
 
     The stripe of a target n·X = d is the contour line of n·X over the image; square first.
     """

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.search import SLOPE_CELL, StripeSearch
 from aqualvs.scanning.stripe import Returns
@@ -64,28 +64,18 @@ def link_segments(returns: Returns, search: StripeSearch) -> Segments:
     -------
     Segments
     """
-    n = len(returns)
-    segment_of = np.empty(n, np.int64)
-    n_segments = _link(returns.line, returns.position, search.lowest, search.highest, segment_of)
-    order, segment, chunk = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    start = np.empty(n_segments + 1, np.int64)
-    kept = np.empty(n_segments, np.bool_)
-    n_kept = _group(
+    numbers = np.empty((3, len(returns)), np.int64)
+    n = _segment(
         returns.line,
         returns.position,
-        segment_of,
+        search.lowest,
+        search.highest,
         search.slope_low,
         search.slope_high,
-        start,
-        kept,
-        order,
-        segment,
-        chunk,
+        numbers,
     )
-    order, segment = order[:n_kept], segment[:n_kept]
-    stretch = np.empty(n_kept, np.int64)
-    _join(returns.line, returns.position, order, segment, stretch)
-    return Segments(order, stretch, chunk[:n_kept])
+    order, stretch, chunk = numbers[:, :n]
+    return Segments(order, stretch, chunk)
 
 
 @kernel
@@ -151,14 +141,12 @@ def _group(
     slope_low: FloatArray,
     slope_high: FloatArray,
     start: IntArray,
-    kept: BoolArray,
     order: IntArray,
     segment: IntArray,
     chunk: IntArray,
 ) -> int:
     """Sort by segment, counting, and keep the segments whose direction is possible."""
-    n_segments = kept.shape[0]
-    start[:] = 0
+    n_segments = start.shape[0] - 1
     for i in range(segment_of.shape[0]):
         if segment_of[i] >= 0:
             start[segment_of[i] + 1] += 1
@@ -252,3 +240,24 @@ def _join(
                         root[c] = low
     for k in range(n):
         stretch[k] = root[segment[k]]
+
+
+@kernel
+def _segment(
+    line: IntArray,
+    position: FloatArray,
+    lowest: IntArray,
+    highest: IntArray,
+    slope_low: FloatArray,
+    slope_high: FloatArray,
+    numbers: IntArray,
+) -> int:
+    """Write (order, stretch, chunk) of the kept returns; returns how many they are."""
+    n = line.shape[0]
+    segment_of, segment = np.empty(n, np.int64), np.empty(n, np.int64)
+    n_segments = _link(line, position, lowest, highest, segment_of)
+    order, stretch, chunk = numbers[0], numbers[1], numbers[2]
+    start = np.zeros(n_segments + 1, np.int64)
+    n_kept = _group(line, position, segment_of, slope_low, slope_high, start, order, segment, chunk)
+    _join(line, position, order[:n_kept], segment[:n_kept], stretch)
+    return n_kept

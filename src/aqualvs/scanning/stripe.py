@@ -97,6 +97,10 @@ class SearchView:
     u: U8Array | None
     u_lines: U8Array | None
 
+    def turned(self) -> "SearchView":
+        """Return the view of the other search direction."""
+        return SearchView(self.lines, self.luma, self.u_lines, self.u)
+
 
 class StripeDetector:
     """Finds returns along every search line of one direction; several per line.
@@ -190,7 +194,7 @@ class StripeDetector:
 
 
 @inline_kernel
-def _next_peak(lines: U8Array, x: int, start: int, last: int, base: int) -> tuple[int, int]:
+def _next_peak(lines: U8Array, x: int, start: int, last: int, base: np.int64) -> tuple[int, int]:
     """Return (peak, end) of the first return in [start, last]; the next one begins at `end`.
 
     `base` is the background: a valley between two returns is shallow or deep against it.
@@ -214,13 +218,13 @@ def _next_peak(lines: U8Array, x: int, start: int, last: int, base: int) -> tupl
 
 
 @inline_kernel
-def _separates(valley: int, lower_peak: int, base: int) -> bool:
-    return 10 * (valley - base) < _VALLEY_TENTHS * (lower_peak - base)
+def _separates(valley: np.int64, lower_peak: np.int64, base: np.int64) -> bool:
+    return bool(10 * (valley - base) < _VALLEY_TENTHS * (lower_peak - base))
 
 
 @inline_kernel
 def _half_height_centroid(
-    lines: U8Array, x: int, peak: int, low: int, high: int, height: int
+    lines: U8Array, x: int, peak: int, low: int, high: int, height: np.int64
 ) -> tuple[float, float, bool]:
     """Centroid and width of what stands above half `height` at `peak`, searched in [low, high].
 

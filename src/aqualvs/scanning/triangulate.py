@@ -52,23 +52,21 @@ class Triangulator:
             [[*laser.plane.normal, laser.plane.offset] for laser in rig.lasers]
         ).reshape(-1, 4)
 
-    def triangulate(self, pixels: FloatArray, along_x: BoolArray, laser: IntArray) -> Triangulation:
+    def triangulate(self, pixels: FloatArray, along_x: IntArray, laser: IntArray) -> Triangulation:
         """Triangulate pixels (N, 2), each with the laser whose index is given.
 
         Parameters
         ----------
         pixels : array, shape (N, 2)
             In `image`.
-        along_x : bool array, shape (N,)
-            Whether the position was measured along x, else along y.
+        along_x : int array, shape (N,)
+            1 where the position was measured along x, 0 where along y.
         laser : int array, shape (N,)
             Index into the rig's lasers.
         """
         n = len(pixels)
-        # The second half of the batch is the first, moved along the search line.
-        pairs = np.concatenate([pixels, pixels])
-        pairs[n:][along_x, 0] += _DIFFERENCE_PX
-        pairs[n:][~along_x, 1] += _DIFFERENCE_PX
+        pairs = np.empty((2 * n, 2))
+        _pair_pixels(pixels, along_x, pairs)
         origins, directions = np.empty((2 * n, 3)), np.empty((2 * n, 3))
         seen = np.empty(2 * n, np.bool_)
         self._camera.rays_into(pairs, origins, directions, seen)
@@ -77,6 +75,17 @@ class Triangulator:
             self._planes, laser, origins, directions, seen, points, sensitivity, valid
         )
         return Triangulation(points, sensitivity, valid)
+
+
+@kernel
+def _pair_pixels(pixels: FloatArray, along_x: IntArray, pairs: FloatArray) -> None:
+    """Write the pixels, and after them the same pixels moved along the search line."""
+    n = pixels.shape[0]
+    for i in range(n):
+        pairs[i, 0] = pixels[i, 0]
+        pairs[i, 1] = pixels[i, 1]
+        pairs[n + i, 0] = pixels[i, 0] + (_DIFFERENCE_PX if along_x[i] else 0.0)
+        pairs[n + i, 1] = pixels[i, 1] + (0.0 if along_x[i] else _DIFFERENCE_PX)
 
 
 @kernel

@@ -1,0 +1,199 @@
+"""The posture to one surface: which readings it rests on, and the fit to them."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.plane_fit import PlaneFit, fit_pseudo_inverse, fit_robust
+from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
+from aqualvs.scanning.readings import Readings
+from aqualvs.scanning.surfaces import Surface
+
+MIN_LINES = 30
+"""Stripe points that a posture needs."""
+
+# Two stripes disturb each other within this many full widths, and this many pixels more.
+_CROSSING_WIDTHS = 1.2
+_CROSSING_PX = 2.0
+
+
+class FitMethod(StrEnum):
+    """How the plane is fitted to the target's points."""
+
+    ROBUST = "robust"
+    """Weighted by each point's uncertainty, outliers rejected."""
+    PSEUDO_INVERSE = "pseudo_inverse"
+    """The paper's Eq. 24, for comparison: all points alike."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A posture, or why there is none, and the readings it rests on.
+
+    Attributes
+    ----------
+    posture : Posture or Refusal
+        The answer.
+    rests_on : bool array, shape (N,)
+        Readings in the posture; none where it is refused.
+    """
+
+    posture: Posture | Refusal
+    rests_on: BoolArray
+
+
+class PostureMeter:
+    """Measures postures to surfaces with one rig.
+
+    Parameters
+    ----------
+    rig : Rig
+        Lasers, working range and camera axis.
+    fit : FitMethod
+        How planes are fitted.
+    """
+
+    def __init__(self, rig: Rig, fit: FitMethod) -> None:
+        self._fit_method = fit
+        self._working_range = rig.working_range
+        self._planes = np.array([[*one.plane.normal, one.plane.offset] for one in rig.lasers])
+        self._focal_px = rig.focal_px
+        self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
+
+    def measure(self, readings: Readings, chunk_index: IntArray, target: Surface) -> Measurement:
+        """Measure the posture to a surface.
+
+        Parameters
+        ----------
+        readings : Readings
+            N of them.
+        chunk_index : int array, shape (N,)
+            Row of each reading's chunk in the surface's `members`.
+        target : Surface
+            What to measure to.
+        """
+        # On a net a stretch is one strand, whose light has one centre; on a wall a chunk is enough
+        # for errors to be independent.
+        piece = readings.stretch if target.is_mesh else readings.chunk
+        group = np.empty(len(readings), np.int64)
+        n_groups, n_readings = _select(
+            readings.points,
+            readings.laser,
+            readings.width,
+            piece,
+            target.members[chunk_index],
+            self._planes,
+            self._focal_px,
+            group,
+        )
+        if n_readings < MIN_LINES:
+            detail = f"only {n_readings} stripe points outside crossings"
+            return _nothing(readings, Refusal(Reason.TOO_FEW_POINTS, detail))
+        fit = self._fit(readings, group, n_groups, target)
+        if fit is None:
+            return _nothing(readings, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
+        rests_on = (group >= 0) & (fit.weights[group] > 0.0)
+        posture = posture_from_fit(
+            fit,
+            readings.points[rests_on],
+            camera_axis_in_dome=self._axis_in_dome,
+            working_range=self._working_range,
+        )
+        if not posture:
+            return _nothing(readings, posture)
+        return Measurement(posture, rests_on)
+
+    def _fit(
+        self, readings: Readings, group: IntArray, n_groups: int, target: Surface
+    ) -> PlaneFit | None:
+        seen = readings.observations(group, n_groups, target.plane.normal)
+        start = target.plane.normal / target.plane.offset
+        robust = fit_robust(seen.points, seen.sensitivity, seen.sigma_px, seen.laser, start)
+        if robust is None or self._fit_method is FitMethod.ROBUST:
+            return robust
+        return fit_pseudo_inverse(readings.points[group >= 0], n_groups, robust.covariance)
+
+
+def _nothing(readings: Readings, refusal: Refusal) -> Measurement:
+    return Measurement(refusal, np.zeros(len(readings), np.bool_))
+
+
+@kernel
+def _select(
+    points: FloatArray,
+    laser: IntArray,
+    width: FloatArray,
+    piece: IntArray,
+    on_target: BoolArray,
+    planes: FloatArray,
+    focal_px: float,
+    group: IntArray,
+) -> tuple[int, int]:
+    """Give numbers to pieces of stripe on the target, -1 to readings elsewhere or in crossings.
+
+    A piece belongs as a whole: a part of a strand's light would have its centre off the sheet.
+    The answer is the number of groups and of readings in them.
+    """
+    n = piece.shape[0]
+    n_pieces = 0
+    for i in range(n):
+        n_pieces = max(n_pieces, piece[i] + 1)
+    number = np.full(n_pieces, -1)
+    for i in range(n):
+        if on_target[i]:
+            number[piece[i]] = -2
+    mean_width = _mean_widths(laser, width, piece, number, planes.shape[0])
+    n_groups = 0
+    n_readings = 0
+    for i in range(n):
+        group[i] = -1
+        p = piece[i]
+        if number[p] == -1 or _in_crossing(points, i, laser[i], planes, mean_width, focal_px):
+            continue
+        if number[p] == -2:
+            number[p] = n_groups
+            n_groups += 1
+        group[i] = number[p]
+        n_readings += 1
+    return n_groups, n_readings
+
+
+@kernel
+def _mean_widths(
+    laser: IntArray, width: FloatArray, piece: IntArray, number: IntArray, n_lasers: int
+) -> FloatArray:
+    """Mean stripe width of each laser; a single width is inflated by the crossing itself."""
+    total, count = np.zeros(n_lasers), np.zeros(n_lasers)
+    for i in range(piece.shape[0]):
+        if number[piece[i]] != -1:
+            total[laser[i]] += width[i]
+            count[laser[i]] += 1.0
+    for index in range(n_lasers):
+        total[index] = total[index] / count[index] if count[index] > 0.0 else -1.0
+    return total
+
+
+@kernel
+def _in_crossing(
+    points: FloatArray,
+    i: int,
+    own: int,
+    planes: FloatArray,
+    mean_width: FloatArray,
+    focal_px: float,
+) -> bool:
+    """Whether another laser's stripe crosses the target here (paper, section 3.1)."""
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    px_per_m = focal_px / np.sqrt(x * x + y * y + z * z)
+    for b in range(planes.shape[0]):
+        if b == own or mean_width[b] < 0.0:
+            continue
+        gap = abs(planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3])
+        wide = max(mean_width[b], mean_width[own])
+        if gap * px_per_m < _CROSSING_WIDTHS * wide + _CROSSING_PX:
+            return True
+    return False

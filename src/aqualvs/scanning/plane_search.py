@@ -1,0 +1,192 @@
+"""The search for one plane among chunks of stripe: a deterministic, locally optimised RANSAC.
+
+Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44): chunks
+next to each other on a stripe more likely share a surface than distant ones. Hypotheses are scored
+by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), the promising ones refined.
+
+Chunks come as a table, one column a chunk and one row a quantity, so that scoring a hypothesis
+runs along memory and becomes vector instructions.
+"""
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.symmetric import solve_symmetric
+
+X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
+"""Rows of the table: centroid (m), sensitivity (m/px), voice (search lines)."""
+N_ROWS = 7
+
+_MAX_HYPOTHESES = 1500
+# A neighbour for sampling lies at most this many chunks away in the same laser's list.
+_NEIGHBOURHOOD = 8
+# Normals farther than this from the vehicle's forward axis are not a target in front of it.
+_MIN_FACING = float(np.cos(np.deg2rad(55.0)))
+# Distance of a chunk from a plane: this share of the range, and this shift of the stripe.
+_GATE_RANGE_SHARE = 0.003
+_GATE_PX = 1.0
+# Gate of a hypothesis before it is refined, and how near the best one it must come for that.
+_WIDE_GATE = 3.0
+_WORTH_REFINING = 0.8
+# The best laser cannot outvote the second by more than this: a plane rests on two.
+MOST_TO_SECOND = 3.0
+
+
+@inline_kernel
+def squared_gate(per_px: float, offset: float) -> float:
+    """Return the square of the largest distance (m) at which a chunk belongs to a plane."""
+    by_range = _GATE_RANGE_SHARE * offset
+    by_pixel = _GATE_PX * per_px
+    return by_range * by_range + by_pixel * by_pixel
+
+
+@kernel
+def _score(table: FloatArray, laser_start: IntArray, plane: FloatArray, stretch: float) -> float:
+    """Return the MSAC score of a plane (normal, offset) with a gate `stretch` times as wide."""
+    x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
+    jx, jy, jz = table[JX], table[JY], table[JZ]
+    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
+    first = 0.0
+    second = 0.0
+    total = 0.0
+    for i_laser in range(laser_start.shape[0] - 1):
+        value = 0.0
+        for k in range(laser_start[i_laser], laser_start[i_laser + 1]):
+            residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
+            gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
+            near = 1.0 - residual * residual / (stretch * stretch * gate)
+            value += weight[k] * max(near, 0.0)
+        total += value
+        second = max(second, min(first, value))
+        first = max(first, value)
+    return min(total, total - first + MOST_TO_SECOND * second)
+
+
+@kernel
+def _refine(
+    table: FloatArray, plane: FloatArray, stretch: float, normal: FloatArray, scratch: FloatArray
+) -> bool:
+    """Refit the plane to what lies in the stretched gate, X·m = 1 (paper, Eq. 24), in place."""
+    x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
+    jx, jy, jz = table[JX], table[JY], table[JZ]
+    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
+    xx = yy = zz = xy = yz = zx = sx = sy = sz = 0.0
+    for k in range(x.shape[0]):
+        residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
+        gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
+        w = weight[k] / gate if residual * residual < stretch * stretch * gate else 0.0
+        xx += w * x[k] * x[k]
+        yy += w * y[k] * y[k]
+        zz += w * z[k] * z[k]
+        xy += w * x[k] * y[k]
+        yz += w * y[k] * z[k]
+        zx += w * z[k] * x[k]
+        sx += w * x[k]
+        sy += w * y[k]
+        sz += w * z[k]
+    normal[0, 0], normal[1, 1], normal[2, 2] = xx, yy, zz
+    normal[1, 0], normal[2, 1], normal[2, 0] = xy, yz, zx
+    right, m = scratch[3], scratch[4]
+    right[0], right[1], right[2] = sx, sy, sz
+    if not solve_symmetric(normal, right, scratch, m):
+        return False
+    length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    if not (length > 0.0 and length < np.inf):
+        return False
+    plane[0], plane[1], plane[2] = m[0] / length, m[1] / length, m[2] / length
+    plane[3] = 1.0 / length
+    return True
+
+
+@inline_kernel
+def _plane_through(table: FloatArray, i: int, j: int, k: int, plane: FloatArray) -> bool:
+    """Write the plane through three chunks, normal outward; False where they are on a line."""
+    ax, ay, az = table[X, i], table[Y, i], table[Z, i]
+    ux, uy, uz = table[X, j] - ax, table[Y, j] - ay, table[Z, j] - az
+    vx, vy, vz = table[X, k] - ax, table[Y, k] - ay, table[Z, k] - az
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if length < 1e-9:
+        return False
+    offset = (nx * ax + ny * ay + nz * az) / length
+    if offset < 0.0:
+        length, offset = -length, -offset
+    plane[0], plane[1], plane[2], plane[3] = nx / length, ny / length, nz / length, offset
+    return True
+
+
+@inline_kernel
+def _next_random(state: np.uint64, bound: int) -> tuple[np.uint64, int]:
+    """One step of a 64-bit linear congruential generator (Knuth's MMIX constants)."""
+    state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+    return state, int((state >> np.uint64(33)) % np.uint64(bound))
+
+
+@kernel
+def search_plane(
+    table: FloatArray,
+    laser: IntArray,
+    laser_start: IntArray,
+    nearest: float,
+    farthest: float,
+    seed: int,
+    best_plane: FloatArray,
+) -> bool:
+    """Find the plane that chunks of at least two lasers agree on best.
+
+    Parameters
+    ----------
+    table : array, shape (7, C)
+        Chunks, ordered by laser.
+    laser : int array, shape (C,)
+        Index of each chunk's laser.
+    laser_start : int array, shape (n_lasers + 1,)
+        First chunk of each laser, and C.
+    nearest, farthest : float
+        Planes beyond are not considered, in metres.
+    seed : int
+        The same seed and chunks give the same plane.
+    best_plane : array, shape (4,)
+        Written: unit normal, pointing outward, and offset.
+    """
+    n = table.shape[1]
+    state = np.uint64(seed + 1)
+    plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
+    best = 0.0
+    best_rough = 0.0
+    total = np.sum(table[WEIGHT])
+    needed = _MAX_HYPOTHESES
+    trial = 0
+    while trial < needed:
+        trial += 1
+        state, i = _next_random(state, n)
+        state, step = _next_random(state, _NEIGHBOURHOOD)
+        state, k = _next_random(state, n)
+        j = i + 1 + step
+        if j >= n or laser[i] != laser[j] or laser[k] == laser[i]:
+            continue
+        if not _plane_through(table, i, j, k, plane):
+            continue
+        if plane[3] < nearest or plane[3] > farthest or plane[1] < _MIN_FACING:
+            continue
+        # A plane through neighbours is rough: judged by a wide gate, drawn in by narrower ones.
+        score = _score(table, laser_start, plane, _WIDE_GATE)
+        if score <= _WORTH_REFINING * best_rough:
+            continue
+        best_rough = max(best_rough, score)
+        for stretch in (_WIDE_GATE, 0.5 * (1.0 + _WIDE_GATE), 1.0):
+            _refine(table, plane, stretch, normal, scratch)
+        score = _score(table, laser_start, plane, 1.0)
+        if score <= best:
+            continue
+        best = score
+        best_plane[:] = plane
+        # With a share s of good chunks a trial succeeds with probability of about s^3 / 4: the
+        # neighbour and the other laser must fit as well.
+        share = min(best / total, 1.0)
+        needed = min(_MAX_HYPOTHESES, int(60.0 / (share * share * share)) + 20)
+    for _ in range(3):
+        if best > 0.0:
+            _refine(table, best_plane, 1.0, normal, scratch)
+    return best > 0.0

@@ -1,0 +1,47 @@
+"""The target: which of the surfaces in view the posture is measured to."""
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+from aqualvs.scanning.surfaces import WORTH_SHARE, Surface
+
+# Among meshes, one reaches far with this share of the widest one's extent.
+_EXTENT_SHARE = 0.75
+
+
+class TargetKind(StrEnum):
+    """What the posture is measured to."""
+
+    AUTO = "auto"
+    """A net where there is one, else the largest solid surface."""
+    NET = "net"
+    """Only a mesh-like surface."""
+    SOLID = "solid"
+    """Only a surface with unbroken stripes."""
+
+
+def choose_target(surfaces: Sequence[Surface], kind: TargetKind) -> Surface | None:
+    """Pick the surface that the posture is measured to, or None where the kind is absent.
+
+    A net is wanted before anything solid: what stands in front of it (a fish, a box) or behind it
+    (a tank wall) may have more stripe points, but is not what the vehicle follows. Of several
+    meshes the nearest that reaches far across the picture is the net: a fish is smaller, and a
+    wall behind the net, lit through its openings, may look broken as well. A handful of left-over
+    points that look like a mesh is no net beside a wall that fills the picture.
+    """
+    most = max((surface.support for surface in surfaces), default=0.0)
+    meshes = [one for one in surfaces if one.is_mesh and one.support >= WORTH_SHARE * most]
+    solids = [one for one in surfaces if not one.is_mesh]
+    solid = max(solids, key=lambda surface: surface.support, default=None)
+    net = _nearest_far_reaching(meshes)
+    return {
+        TargetKind.AUTO: net or solid,
+        TargetKind.NET: net,
+        TargetKind.SOLID: solid,
+    }[kind]
+
+
+def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
+    farthest = max((surface.extent for surface in meshes), default=0.0)
+    wide = [one for one in meshes if one.extent >= _EXTENT_SHARE * farthest]
+    return min(wide, key=lambda surface: surface.plane.offset, default=None)
