@@ -1,5 +1,6 @@
 """The posture to one surface: which readings it rests on, and the fit to them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -8,9 +9,16 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.plane_fit import PlaneFit, fit_pseudo_inverse, fit_robust
+from aqualvs.scanning.plane_fit import (
+    MESH_ERROR,
+    SOLID_ERROR,
+    PlaneFit,
+    fit_pseudo_inverse,
+    fit_robust,
+)
 from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
 from aqualvs.scanning.readings import Readings
+from aqualvs.scanning.search import StripeSearch
 from aqualvs.scanning.surfaces import Surface
 
 MIN_LINES = 30
@@ -19,6 +27,8 @@ MIN_LINES = 30
 # Two stripes disturb each other within this many full widths, and this many pixels more.
 _CROSSING_WIDTHS = 1.2
 _CROSSING_PX = 2.0
+# The light on a strand covers this many search lines; less is a fragment, off the strand's middle.
+_SHORTEST_STRAND = 3
 
 
 class FitMethod(StrEnum):
@@ -53,12 +63,15 @@ class PostureMeter:
     ----------
     rig : Rig
         Lasers, working range and camera axis.
+    searches : sequence of StripeSearch
+        One for each laser.
     fit : FitMethod
         How planes are fitted.
     """
 
-    def __init__(self, rig: Rig, fit: FitMethod) -> None:
+    def __init__(self, rig: Rig, searches: Sequence[StripeSearch], fit: FitMethod) -> None:
         self._fit_method = fit
+        self._n_lines = np.array([len(search.lowest) for search in searches])
         self._working_range = rig.working_range
         self._planes = np.array([[*one.plane.normal, one.plane.offset] for one in rig.lasers])
         self._focal_px = rig.focal_px
@@ -85,6 +98,7 @@ class PostureMeter:
             readings.laser,
             readings.width,
             piece,
+            _SHORTEST_STRAND if target.is_mesh else 1,
             target.members[chunk_index],
             self._planes,
             self._focal_px,
@@ -112,7 +126,15 @@ class PostureMeter:
     ) -> PlaneFit | None:
         seen = readings.observations(group, n_groups, target.plane.normal)
         start = target.plane.normal / target.plane.offset
-        robust = fit_robust(seen.points, seen.sensitivity, seen.sigma_px, seen.laser, start)
+        robust = fit_robust(
+            seen.points,
+            seen.sensitivity,
+            seen.sigma_px,
+            seen.laser,
+            2.0 * seen.line / self._n_lines[seen.laser] - 1.0,
+            start,
+            MESH_ERROR if target.is_mesh else SOLID_ERROR,
+        )
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
         return fit_pseudo_inverse(readings.points[group >= 0], n_groups, robust.covariance)
@@ -128,6 +150,7 @@ def _select(
     laser: IntArray,
     width: FloatArray,
     piece: IntArray,
+    min_lines: int,
     on_target: BoolArray,
     planes: FloatArray,
     focal_px: float,
@@ -143,8 +166,11 @@ def _select(
     for i in range(n):
         n_pieces = max(n_pieces, piece[i] + 1)
     number = np.full(n_pieces, -1)
+    lines = np.zeros(n_pieces, np.int64)
     for i in range(n):
-        if on_target[i]:
+        lines[piece[i]] += 1
+    for i in range(n):
+        if on_target[i] and lines[piece[i]] >= min_lines:
             number[piece[i]] = -2
     mean_width = _mean_widths(laser, width, piece, number, planes.shape[0])
     n_groups = 0

@@ -64,7 +64,7 @@ class Scanner:
         self._searches = plan_searches(rig, camera)
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
-        self._meter = PostureMeter(rig, self.options.fit)
+        self._meter = PostureMeter(rig, self._searches, self.options.fit)
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -98,7 +98,7 @@ class Scanner:
             self._search_range(),
             self.rig.focal_px,
         )
-        target = choose_target(surfaces, self.options.target)
+        target = choose_target(surfaces, self.options.target, self.rig.working_range)
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _no_target(readings, surfaces, self.options.target)

@@ -6,12 +6,33 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.symmetric import invert_symmetric, solve_symmetric
 
-COMMON_MODE_PX = 0.05
-"""Shift that all points of one laser may share in one frame, as a standard deviation.
 
-Texture, compression and the sheet's own profile move a whole stripe, not only single points.
-"""
+@dataclass(frozen=True, slots=True)
+class SharedError:
+    """What all of one laser's stripe may share in one frame, as standard deviations.
+
+    Texture, compression, the sheet's own profile and the glow beside it move a whole stripe, not
+    only single points; residuals of the fit do not show it.
+
+    Attributes
+    ----------
+    shift_px : float
+        Of the whole stripe.
+    tilt_px : float
+        At the image border, of a shift that grows from the image centre.
+    """
+
+    shift_px: float
+    tilt_px: float
+
+
+# Found on the simulator and on independently rendered dives alike.
+SOLID_ERROR = SharedError(shift_px=0.05, tilt_px=0.05)
+"""For unbroken stripes."""
+MESH_ERROR = SharedError(shift_px=0.08, tilt_px=0.12)
+"""For the broken stripes of a net: strands are cut off by knots, seams and each other."""
 
 _TUKEY = 4.685  # 95 % efficiency for normal errors
 _ITERATIONS = 6
@@ -62,7 +83,9 @@ def fit_robust(
     sensitivity: FloatArray,
     sigma_px: FloatArray,
     laser: IntArray,
+    along: FloatArray,
     start: FloatArray,
+    shared: SharedError,
 ) -> PlaneFit | None:
     """Fit m·X = 1 by iteratively re-weighted least squares with Tukey's biweight.
 
@@ -79,19 +102,25 @@ def fit_robust(
         Standard deviation of the stripe's position, up to a common factor.
     laser : int array, shape (N,)
         Index of the laser.
+    along : array, shape (N,)
+        Place along the stripe, from -1 at one image border to 1 at the other.
     start : array, shape (3,)
         A first m, such as RANSAC gives.
+    shared : SharedError
+        What each laser's stripe shares.
 
     Returns
     -------
     PlaneFit or None
         None where the points do not determine a plane. The covariance follows from the real
-        residuals (Huber 1981, section 7.6), widened by `COMMON_MODE_PX` for each laser.
+        residuals (Huber 1981, section 7.6), widened by
+        what each laser's stripe shares.
     """
     m = np.array(start, dtype=np.float64)
     covariance = np.empty((3, 3))
     weights = np.empty(len(points))
-    rms = _fit(points, sensitivity, sigma_px, laser, m, covariance, weights)
+    modes = np.array([shared.shift_px, shared.tilt_px])
+    rms = _fit(points, sensitivity, sigma_px, laser, along, modes, m, covariance, weights)
     if not np.isfinite(rms):
         return None
     return PlaneFit(m, covariance, weights, rms)
@@ -122,6 +151,7 @@ def _normal_equations(
     normal: FloatArray,
     right: FloatArray,
 ) -> None:
+    """Write the weighted normal equations of X·m = 1; the lower half of the matrix suffices."""
     normal[:] = 0.0
     right[:] = 0.0
     for i in range(points.shape[0]):
@@ -130,7 +160,6 @@ def _normal_equations(
             right[j] += w * points[i, j]
             for k in range(j + 1):
                 normal[j, k] += w * points[i, j] * points[i, k]
-    normal[0, 1], normal[0, 2], normal[1, 2] = normal[1, 0], normal[2, 0], normal[2, 1]
 
 
 @kernel
@@ -139,6 +168,8 @@ def _fit(
     sensitivity: FloatArray,
     sigma_px: FloatArray,
     laser: IntArray,
+    along: FloatArray,
+    modes: FloatArray,
     m: FloatArray,
     covariance: FloatArray,
     weights: FloatArray,
@@ -147,6 +178,7 @@ def _fit(
     z = np.empty(n)
     sigma = np.empty(n)
     normal = np.empty((3, 3))
+    inverse = np.empty((3, 3))
     right = np.empty(3)
     scale = 1.0
     for _ in range(_ITERATIONS):
@@ -157,15 +189,18 @@ def _fit(
             kept = max(1.0 - ratio * ratio, 0.0)
             weights[i] = kept * kept
         _normal_equations(points, sigma, weights, normal, right)
-        if not np.linalg.det(normal) > 0.0:
+        if not solve_symmetric(normal, right, inverse, m):
             return np.nan
-        m[:] = np.linalg.solve(normal, right)
-    inverse = np.linalg.inv(normal).astype(np.float64)
     _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
-    factor = _huber_factor(z, _TUKEY * scale)
+    # A scatter below the stated errors is luck where observations are few.
+    factor = max(_huber_factor(z, _TUKEY * scale), 1.0)
     _normal_equations(points, sigma, np.ones(n), normal, right)
-    covariance[:] = np.linalg.inv(normal) * factor
-    _add_common_mode(points, sensitivity, sigma, weights, laser, m, inverse, covariance)
+    if not invert_symmetric(normal, covariance):
+        return np.nan
+    covariance *= factor
+    _add_shared_error(
+        points, sensitivity, sigma, weights, laser, along, modes, m, inverse, covariance
+    )
     return _weighted_rms(sigma, z, weights, m)
 
 
@@ -193,31 +228,35 @@ def _huber_factor(z: FloatArray, cut: float) -> float:
 
 
 @kernel
-def _add_common_mode(
+def _add_shared_error(
     points: FloatArray,
     sensitivity: FloatArray,
     sigma: FloatArray,
     weights: FloatArray,
     laser: IntArray,
+    along: FloatArray,
+    modes: FloatArray,
     m: FloatArray,
     inverse: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Widen by one shared shift of `COMMON_MODE_PX` for each laser."""
+    """Widen by one shift and one tilt for each laser, each of its own."""
     n_lasers = 0
     for i in range(laser.shape[0]):
         n_lasers = max(n_lasers, laser[i] + 1)
-    pull = np.zeros((n_lasers, 3))
+    pull = np.zeros((n_lasers, 2, 3))
     for i in range(points.shape[0]):
         per_px = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
         w = weights[i] * per_px / (sigma[i] * sigma[i])
         for k in range(3):
-            pull[laser[i], k] += w * points[i, k]
+            pull[laser[i], 0, k] += w * points[i, k]
+            pull[laser[i], 1, k] += w * points[i, k] * along[i]
     for index in range(n_lasers):
-        shift = COMMON_MODE_PX * (inverse @ pull[index])
-        for j in range(3):
-            for k in range(3):
-                covariance[j, k] += shift[j] * shift[k]
+        for mode in range(2):
+            shift = modes[mode] * (inverse @ pull[index, mode])
+            for j in range(3):
+                for k in range(3):
+                    covariance[j, k] += shift[j] * shift[k]
 
 
 @kernel

@@ -1,7 +1,8 @@
 """The search for one plane among chunks of stripe: a deterministic, locally optimised RANSAC.
 
 Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44): chunks
-next to each other on a stripe more likely share a surface than distant ones. Hypotheses are scored
+next to each other on a stripe more likely share a surface than distant ones, and chunks with more
+voice more likely lie on any surface than specks. Hypotheses are scored
 by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), the promising ones refined.
 
 Chunks come as a table, one column a chunk and one row a quantity, so that scoring a hypothesis
@@ -18,7 +19,7 @@ X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), voice (search lines)."""
 N_ROWS = 7
 
-_MAX_HYPOTHESES = 1500
+_MAX_HYPOTHESES = 6000
 # A neighbour for sampling lies at most this many chunks away in the same laser's list.
 _NEIGHBOURHOOD = 8
 # Normals farther than this from the vehicle's forward axis are not a target in front of it.
@@ -117,10 +118,26 @@ def _plane_through(table: FloatArray, i: int, j: int, k: int, plane: FloatArray)
 
 
 @inline_kernel
-def _next_random(state: np.uint64, bound: int) -> tuple[np.uint64, int]:
-    """One step of a 64-bit linear congruential generator (Knuth's MMIX constants)."""
+def _next_random(state: np.uint64) -> tuple[np.uint64, float]:
+    """One step of a 64-bit linear congruential generator (Knuth's MMIX constants), in [0, 1)."""
     state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-    return state, int((state >> np.uint64(33)) % np.uint64(bound))
+    return state, float(state >> np.uint64(11)) / 9007199254740992.0
+
+
+@inline_kernel
+def _pick(voice_up_to: FloatArray, draw: float) -> int:
+    """Draw a chunk with a probability in proportion to its voice."""
+    n = voice_up_to.shape[0]
+    wanted = draw * voice_up_to[n - 1]
+    low = 0
+    high = n - 1
+    while low < high:
+        middle = (low + high) // 2
+        if voice_up_to[middle] > wanted:
+            high = middle
+        else:
+            low = middle + 1
+    return low
 
 
 @kernel
@@ -155,15 +172,17 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    total = np.sum(table[WEIGHT])
+    voice_up_to = np.cumsum(table[WEIGHT])
     needed = _MAX_HYPOTHESES
     trial = 0
     while trial < needed:
         trial += 1
-        state, i = _next_random(state, n)
-        state, step = _next_random(state, _NEIGHBOURHOOD)
-        state, k = _next_random(state, n)
-        j = i + 1 + step
+        state, draw = _next_random(state)
+        i = _pick(voice_up_to, draw)
+        state, draw = _next_random(state)
+        j = i + 1 + int(draw * _NEIGHBOURHOOD)
+        state, draw = _next_random(state)
+        k = _pick(voice_up_to, draw)
         if j >= n or laser[i] != laser[j] or laser[k] == laser[i]:
             continue
         if not _plane_through(table, i, j, k, plane):
@@ -182,10 +201,11 @@ def search_plane(
             continue
         best = score
         best_plane[:] = plane
-        # With a share s of good chunks a trial succeeds with probability of about s^3 / 4: the
-        # neighbour and the other laser must fit as well.
-        share = min(best / total, 1.0)
-        needed = min(_MAX_HYPOTHESES, int(60.0 / (share * share * share)) + 20)
+        # With a share s of the voice on the plane a trial succeeds with probability of about
+        # s^2 / 5: of neighbours half fit, and a third of the draws are of one laser. Five times the
+        # expected number of trials leaves one search in 150 short of it.
+        share = min(best / voice_up_to[n - 1], 1.0)
+        needed = min(_MAX_HYPOTHESES, int(25.0 / (share * share)) + 20)
     for _ in range(3):
         if best > 0.0:
             _refine(table, best_plane, 1.0, normal, scratch)

@@ -19,7 +19,7 @@ _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
 # Position noise of a chunk's centroid beyond that: a floor that neighbouring returns share, and a
 # share of the spread, because a strand's light may be cut off on one side by a knot or the border.
-_CHUNK_FLOOR_PX = 0.07
+_CHUNK_FLOOR_PX = 0.1
 _SPREAD_SHARE = 0.12
 # Search lines whose voice a whole stretch has at most when surfaces are sought.
 _LOUDEST_STRETCH = 48.0
@@ -108,10 +108,17 @@ class Readings:
         normal : array, shape (3,)
             Normal of the surface as far as it is known; spread is measured along it.
         """
-        seen = Observations(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.empty(n, np.int64))
+        seen = Observations(
+            points=np.zeros((n, 3)),
+            sensitivity=np.zeros((n, 3)),
+            sigma_px=np.zeros(n),
+            line=np.zeros(n),
+            laser=np.empty(n, np.int64),
+        )
         _summarise(
             index,
             self.laser,
+            self.line,
             self.height,
             self.width,
             self.points,
@@ -121,6 +128,7 @@ class Readings:
             seen.points,
             seen.sensitivity,
             seen.sigma_px,
+            seen.line,
             seen.laser,
         )
         return seen
@@ -136,6 +144,8 @@ class Observations:
         Centroid in `dome` (m) and its derivative by the stripe's position (m/px).
     sigma_px : array, shape (M,)
         Standard deviation of that position.
+    line : array, shape (M,)
+        Mean search line.
     laser : int array, shape (M,)
         Index of the laser.
     """
@@ -143,6 +153,7 @@ class Observations:
     points: FloatArray
     sensitivity: FloatArray
     sigma_px: FloatArray
+    line: FloatArray
     laser: IntArray
 
 
@@ -309,6 +320,7 @@ def _chunk_facts(
 def _summarise(
     index: IntArray,
     laser: IntArray,
+    line: IntArray,
     height: FloatArray,
     width: FloatArray,
     points: FloatArray,
@@ -318,6 +330,7 @@ def _summarise(
     centroid: FloatArray,
     mean_sensitivity: FloatArray,
     group_sigma_px: FloatArray,
+    group_line: FloatArray,
     group_laser: IntArray,
 ) -> None:
     """Write the centroids, mean sensitivities, position errors and lasers of groups."""
@@ -334,12 +347,14 @@ def _summarise(
             mean_sensitivity[c, k] += light * sensitivity[i, k]
         # Error of a weighted mean of independent positions.
         group_sigma_px[c] += (light * sigma_px[i]) ** 2
+        group_line[c] += light * line[i]
         group_laser[c] = laser[i]
     for c in range(n):
         for k in range(3):
             centroid[c, k] /= total[c]
             mean_sensitivity[c, k] /= total[c]
         group_sigma_px[c] /= total[c] * total[c]
+        group_line[c] /= total[c]
     for i in range(index.shape[0]):
         c = index[i]
         if c < 0:

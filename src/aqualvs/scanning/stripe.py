@@ -12,6 +12,8 @@ from aqualvs.scanning.runs import cells_in_band, cells_near_green, find_runs, so
 
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
+# Doubling the contrast threshold ends here.
+_HIGHEST_CONTRAST = 120
 _NO_CHROMA = np.empty((0, 0), np.uint8)
 
 
@@ -29,19 +31,25 @@ class StripeOptions:
     min_green_fall : float
         Smallest fall of the U chroma against the flanks, in grey levels: a laser line is greener
         than what surrounds it; twine and sun glare are not. Only used where the source has colour.
+    min_share : float
+        Returns lower than this share of the frame's bright returns (their 90 % quantile) are noise.
     max_returns : int
-        Returns kept per frame and search direction; what exceeds it is dropped.
+        Runs of pixels looked at per frame and search direction; where there are more, the contrast
+        threshold is doubled until there are not.
     """
 
     min_contrast: int = 12
     reach_share: float = 0.045
     min_green_fall: float = 3.0
+    min_share: float = 0.25
     max_returns: int = 16384
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
         if not 1 <= self.min_contrast <= 254:
             raise OptionError(f"min_contrast is {self.min_contrast}; use 1 to 254 grey levels")
+        if not 0.0 <= self.min_share < 1.0:
+            raise OptionError(f"min_share is {self.min_share}; use 0 to 1")
         if not 0.0 < self.reach_share < 0.5:
             raise OptionError(f"reach_share is {self.reach_share}; use 0 to 0.5 of the width")
 
@@ -157,17 +165,24 @@ class StripeDetector:
         found : Returns
             Copies: they stay valid after the next call.
         """
-        contrast = local_contrast(view.luma, self._workspace, self._options.min_contrast)
-        n_runs = find_runs(
-            self._cells_of_interest(view.u),
-            contrast.view(np.uint64),
-            contrast,
-            self._lowest,
-            self._highest,
-            self._open_start,
-            self._open_last,
-            self._runs,
-        )
+        cells = self._cells_of_interest(view.u)
+        min_contrast = self._options.min_contrast
+        while True:
+            contrast = local_contrast(view.luma, self._workspace, min_contrast)
+            n_runs = find_runs(
+                cells,
+                contrast.view(np.uint64),
+                contrast,
+                self._lowest,
+                self._highest,
+                self._open_start,
+                self._open_last,
+                self._runs,
+            )
+            if n_runs < len(self._runs) or min_contrast > _HIGHEST_CONTRAST:
+                break
+            # So many runs are noise; stripes stand higher than noise.
+            min_contrast *= 2
         sort_by_line(self._runs[:n_runs], self._line_start, self._sorted)
         n = _measure_runs(
             view.lines,
@@ -179,6 +194,7 @@ class StripeDetector:
             self._line,
             self._measures,
         )
+        n = _drop_faint(self._options.min_share, self._line[:n], self._measures[:, :n])
         position, height, width, green_fall = self._measures[:, :n].copy()
         return Returns(self._line[:n].copy(), position, height, width, green_fall)
 
@@ -316,3 +332,25 @@ def _measure_runs(
             measures[3, n] = green
             n += 1
     return n
+
+
+@kernel
+def _drop_faint(share: float, line: IntArray, measures: FloatArray) -> int:
+    """Keep the returns of at least `share` of the 90 % quantile of heights, in place."""
+    n = line.shape[0]
+    of_height = np.zeros(257, np.int64)
+    for i in range(n):
+        of_height[int(measures[1, i])] += 1
+    bright = 256
+    seen = 0
+    while seen <= 0.1 * n and bright > 0:
+        bright -= 1
+        seen += of_height[bright]
+    kept = 0
+    for i in range(n):
+        if measures[1, i] >= share * bright:
+            line[kept] = line[i]
+            for k in range(measures.shape[0]):
+                measures[k, kept] = measures[k, i]
+            kept += 1
+    return kept

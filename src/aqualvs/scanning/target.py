@@ -7,6 +7,8 @@ from aqualvs.scanning.surfaces import WORTH_SHARE, Surface
 
 # Among meshes, one reaches far with this share of the widest one's extent.
 _EXTENT_SHARE = 0.75
+# And it is well supported with this share of the best one's support.
+_SUPPORT_SHARE = 0.35
 
 
 class TargetKind(StrEnum):
@@ -20,8 +22,12 @@ class TargetKind(StrEnum):
     """Only a surface with unbroken stripes."""
 
 
-def choose_target(surfaces: Sequence[Surface], kind: TargetKind) -> Surface | None:
+def choose_target(
+    surfaces: Sequence[Surface], kind: TargetKind, working_range: tuple[float, float]
+) -> Surface | None:
     """Pick the surface that the posture is measured to, or None where the kind is absent.
+
+    What lies in the working range comes before what lies outside.
 
     A net is wanted before anything solid: what stands in front of it (a fish, a box) or behind it
     (a tank wall) may have more stripe points, but is not what the vehicle follows. Of several
@@ -29,6 +35,8 @@ def choose_target(surfaces: Sequence[Surface], kind: TargetKind) -> Surface | No
     wall behind the net, lit through its openings, may look broken as well. A handful of left-over
     points that look like a mesh is no net beside a wall that fills the picture.
     """
+    near, far = working_range
+    surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.support for surface in surfaces), default=0.0)
     meshes = [one for one in surfaces if one.is_mesh and one.support >= WORTH_SHARE * most]
     solids = [one for one in surfaces if not one.is_mesh]
@@ -43,5 +51,11 @@ def choose_target(surfaces: Sequence[Surface], kind: TargetKind) -> Surface | No
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
     farthest = max((surface.extent for surface in meshes), default=0.0)
-    wide = [one for one in meshes if one.extent >= _EXTENT_SHARE * farthest]
-    return min(wide, key=lambda surface: surface.plane.offset, default=None)
+    most = max((surface.support for surface in meshes), default=0.0)
+    wide = [
+        one
+        for one in meshes
+        if one.extent >= _EXTENT_SHARE * farthest and one.support >= _SUPPORT_SHARE * most
+    ]
+    best = max(meshes, key=lambda surface: surface.support, default=None)
+    return min(wide, key=lambda surface: surface.plane.offset, default=best)
