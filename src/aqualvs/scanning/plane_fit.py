@@ -29,7 +29,7 @@ class SharedError:
 
 
 # Found on the simulator and on independently rendered dives alike.
-SOLID_ERROR = SharedError(shift_px=0.05, tilt_px=0.05)
+SOLID_ERROR = SharedError(shift_px=0.035, tilt_px=0.035)
 """For unbroken stripes."""
 MESH_ERROR = SharedError(shift_px=0.08, tilt_px=0.12)
 """For the broken stripes of a net: strands are cut off by knots, seams and each other."""

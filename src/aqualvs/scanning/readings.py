@@ -19,7 +19,7 @@ _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
 # Position noise of a chunk's centroid beyond that: a floor that neighbouring returns share, and a
 # share of the spread, because a strand's light may be cut off on one side by a knot or the border.
-_CHUNK_FLOOR_PX = 0.1
+_CHUNK_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
 # Search lines whose voice a whole stretch has at most when surfaces are sought.
 _LOUDEST_STRETCH = 48.0
