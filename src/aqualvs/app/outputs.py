@@ -2,6 +2,7 @@
 
 ==================  ========================================================================
 `posture.csv`       one row for every frame, on disk when the frame is done
+`posture_bare.csv`  the same without the dome model, for comparison
 `points.arrows`     the points while the run is under way; becomes the next two at its end
 `points.parquet`    every stripe point
 `points.ply`        the points on the target
@@ -29,6 +30,7 @@ from aqualvs.errors import OutputError
 from aqualvs.scanning.scan import Scan
 
 POSTURE_CSV = "posture.csv"
+POSTURE_BARE_CSV = "posture_bare.csv"
 JOURNAL = "points.arrows"
 POINTS_PARQUET = "points.parquet"
 POINTS_PLY = "points.ply"
@@ -38,6 +40,7 @@ REPORT_HTML = "report.html"
 RUN_FILES = (
     RUN_YAML,
     POSTURE_CSV,
+    POSTURE_BARE_CSV,
     JOURNAL,
     POINTS_PARQUET,
     POINTS_PLY,

@@ -12,6 +12,7 @@ import numpy as np
 from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
 from aqualvs.app.progress import progress
 from aqualvs.app.report import write_report
+from aqualvs.app.run_bare_lens import RunBareLens
 from aqualvs.app.run_inputs import (
     FrameWindow,
     Water,
@@ -85,6 +86,8 @@ class RunResult:
     stopped_by : str
         Name of the signal that stopped it, or empty.
     tally : Tally
+    dome_lines : list of str
+        What the dome model is worth, in words.
     elapsed_s : float
         From the first frame to the complete folder, without the report.
     report : Path or None
@@ -96,6 +99,7 @@ class RunResult:
     exit_code: int
     stopped_by: str
     tally: Tally
+    dome_lines: list[str]
     elapsed_s: float
     report: Path | None
     comparison: TruthComparison | None
@@ -138,15 +142,18 @@ def run(
             with (
                 _outputs(request, rig, source) as outputs,
                 RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
+                RunBareLens(request.out, rig) as bare_lens,
                 StopSignals() as stop,
                 progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
             ):
                 for lost, frame in _with_losses(frames, request.frames.first, rig.n_water):
                     for scan in lost:
                         outputs.write(scan)
+                        bare_lens.write(scan)
                         overlay.write(None, scan)
                     scan = scanner.process(frame)
                     outputs.write(scan)
+                    bare_lens.write(scan)
                     overlay.write(frame, scan)
                     tick(1 + len(lost))
                     if stop.caught:
@@ -158,6 +165,7 @@ def run(
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
         tally=outputs.tally,
+        dome_lines=bare_lens.lines(),
         elapsed_s=time.perf_counter() - started,
         report=_report(request),
         comparison=_comparison(request),
@@ -185,6 +193,7 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
     """Return what the command prints at the end."""
     lines = [f"{request.source}: {result.tally.n_frames} frames in {result.elapsed_s:.1f} s"]
     lines += result.tally.lines()
+    lines += result.dome_lines
     if result.comparison is not None:
         lines += result.comparison.lines()
     if result.stopped_by:

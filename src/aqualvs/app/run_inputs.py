@@ -9,8 +9,9 @@ from aqualvs.live.sources import FrameSource
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.water import seawater_index_vacuum
+from aqualvs.scanning.measure import FitMethod
 from aqualvs.scanning.mesh import MeshFilterOptions
-from aqualvs.scanning.pipeline import FitMethod, ScannerOptions
+from aqualvs.scanning.pipeline import ScannerOptions
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions

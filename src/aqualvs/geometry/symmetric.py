@@ -1,4 +1,4 @@
-"""Symmetric 3 x 3 systems inside compiled kernels, where a call to LAPACK costs more than the job."""
+"""Symmetric 3 x 3 systems inside compiled kernels, where calling LAPACK costs more than the job."""
 
 import numpy as np
 
@@ -38,7 +38,5 @@ def solve_symmetric(
     if not invert_symmetric(matrix, scratch):
         return False
     for i in range(3):
-        solution[i] = (
-            scratch[i, 0] * right[0] + scratch[i, 1] * right[1] + scratch[i, 2] * right[2]
-        )
+        solution[i] = scratch[i, 0] * right[0] + scratch[i, 1] * right[1] + scratch[i, 2] * right[2]
     return True

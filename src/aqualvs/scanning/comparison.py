@@ -12,8 +12,6 @@ from aqualvs.scanning.triangulate import Triangulator
 # Neighbouring points say the same; a few hundred are plenty for a comparison.
 _EVERY = 4
 _MIN_POINTS = 6
-# Whatever the bare lens makes of the range is what the comparison is about.
-_ANY_RANGE = (0.0, float("inf"))
 
 
 class BareLensComparison:
@@ -37,7 +35,11 @@ class BareLensComparison:
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def measure(self, scan: Scan) -> Posture | Refusal:
-        """Return the bare-lens posture to the target of a scan, or the refusal in its place."""
+        """Return the bare-lens posture to the target of a scan, or the refusal in its place.
+
+        However unlikely it looks, it is returned: what the bare lens makes of the target is what
+        the comparison is about.
+        """
         if not scan.posture:
             return scan.posture
         rows = np.flatnonzero(scan.points.label == Label.TARGET)[::_EVERY]
@@ -60,9 +62,4 @@ class BareLensComparison:
         )
         if fit is None:
             return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
-        return posture_from_fit(
-            fit,
-            points[fit.weights > 0.0],
-            camera_axis_in_dome=self._axis_in_dome,
-            working_range=_ANY_RANGE,
-        )
+        return posture_from_fit(fit, points[fit.weights > 0.0], self._axis_in_dome)

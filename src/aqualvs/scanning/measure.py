@@ -16,7 +16,7 @@ from aqualvs.scanning.plane_fit import (
     fit_pseudo_inverse,
     fit_robust,
 )
-from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
+from aqualvs.scanning.posture import Posture, Reason, Refusal, believable, posture_from_fit
 from aqualvs.scanning.readings import Readings
 from aqualvs.scanning.search import StripeSearch
 from aqualvs.scanning.surfaces import Surface
@@ -111,12 +111,8 @@ class PostureMeter:
         if fit is None:
             return _nothing(readings, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
         rests_on = (group >= 0) & (fit.weights[group] > 0.0)
-        posture = posture_from_fit(
-            fit,
-            readings.points[rests_on],
-            camera_axis_in_dome=self._axis_in_dome,
-            working_range=self._working_range,
-        )
+        measured = posture_from_fit(fit, readings.points[rests_on], self._axis_in_dome)
+        posture = believable(measured, self._working_range)
         if not posture:
             return _nothing(readings, posture)
         return Measurement(posture, rests_on)

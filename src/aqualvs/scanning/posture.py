@@ -88,14 +88,8 @@ class Posture:
         return True
 
 
-def posture_from_fit(
-    fit: PlaneFit,
-    points: FloatArray,
-    *,
-    camera_axis_in_dome: FloatArray,
-    working_range: tuple[float, float],
-) -> Posture | Refusal:
-    """Turn a plane fit into a posture (paper, Eq. 23-26), or say why it is none.
+def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: FloatArray) -> Posture:
+    """Turn a plane fit into a posture (paper, Eq. 23-26), whatever it is worth.
 
     Parameters
     ----------
@@ -105,27 +99,53 @@ def posture_from_fit(
         The stripe points that the fit rests on, in `dome`, metres.
     camera_axis_in_dome : array, shape (3,)
         Unit vector along which the camera looks.
-    working_range : (float, float)
-        Nearest and farthest range that is believed, in metres.
     """
     distance, pitch, yaw = range_pitch_yaw(fit.m)
     jacobian = _range_pitch_yaw_jacobian(fit.m)
-    covariance = jacobian @ fit.covariance @ jacobian.T
-    refusal = _refuse(distance, covariance, fit.rms, working_range)
-    if refusal is not None:
-        return refusal
     approach = float(fit.m @ camera_axis_in_dome)
     return Posture(
         range=distance,
         pitch=pitch,
         yaw=yaw,
-        covariance=covariance,
+        covariance=jacobian @ fit.covariance @ jacobian.T,
         normal_in_dome=fit.m * distance,
         slant_range=1.0 / approach if approach > 0.0 else float("inf"),
         nearest=float(np.sqrt(np.min(np.sum(points**2, axis=1)))),
         n_points=len(points),
         rms=fit.rms,
     )
+
+
+def believable(posture: Posture, working_range: tuple[float, float]) -> Posture | Refusal:
+    """Return the posture if a pilot may rely on it, else why not.
+
+    Parameters
+    ----------
+    posture : Posture
+        As measured.
+    working_range : (float, float)
+        Nearest and farthest range that is believed, in metres.
+    """
+    near, far = working_range
+    distance = posture.range
+    sigma_range, sigma_pitch, sigma_yaw = np.sqrt(np.diag(posture.covariance))
+    if not (1.0 - _RANGE_TOLERANCE) * near <= distance <= (1.0 + _RANGE_TOLERANCE) * far:
+        return Refusal(
+            Reason.OUT_OF_RANGE,
+            f"range {distance:.3f} m is outside the working range {near:.2f} to {far:.2f} m",
+        )
+    if posture.rms > _MAX_RMS_SHARE * distance:
+        return Refusal(
+            Reason.NOT_A_PLANE, f"points are {1e3 * posture.rms:.1f} mm rms off the best plane"
+        )
+    worst = max(sigma_pitch, sigma_yaw)
+    if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
+        return Refusal(
+            Reason.COLLINEAR,
+            f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
+            f"{np.rad2deg(worst):.1f} deg",
+        )
+    return posture
 
 
 def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
@@ -148,25 +168,3 @@ def _range_pitch_yaw_jacobian(m: FloatArray) -> FloatArray:
             [y / xy, -x / xy, 0.0],
         ]
     )
-
-
-def _refuse(
-    distance: float, covariance: FloatArray, rms: float, working_range: tuple[float, float]
-) -> Refusal | None:
-    near, far = working_range
-    sigma_range, sigma_pitch, sigma_yaw = np.sqrt(np.diag(covariance))
-    if not (1.0 - _RANGE_TOLERANCE) * near <= distance <= (1.0 + _RANGE_TOLERANCE) * far:
-        return Refusal(
-            Reason.OUT_OF_RANGE,
-            f"range {distance:.3f} m is outside the working range {near:.2f} to {far:.2f} m",
-        )
-    if rms > _MAX_RMS_SHARE * distance:
-        return Refusal(Reason.NOT_A_PLANE, f"points are {1e3 * rms:.1f} mm rms off the best plane")
-    worst = max(sigma_pitch, sigma_yaw)
-    if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
-        return Refusal(
-            Reason.COLLINEAR,
-            f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
-            f"{np.rad2deg(worst):.1f} deg",
-        )
-    return None

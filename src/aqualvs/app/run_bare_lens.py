@@ -1,0 +1,71 @@
+"""What ignoring the dome would have made of a run, frame by frame."""
+
+import statistics
+from array import array
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from aqualvs.app.disk import writing
+from aqualvs.app.outputs import POSTURE_BARE_CSV
+from aqualvs.app.posture_csv import PostureCsv
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.comparison import BareLensComparison
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Scan
+
+
+class RunBareLens:
+    """Writes `posture_bare.csv` while a run goes on, or does nothing for a rig without a dome.
+
+    Parameters
+    ----------
+    folder : Path
+    rig : Rig
+
+    Raises
+    ------
+    OutputError
+        From every method, if the file cannot be written.
+    """
+
+    def __init__(self, folder: Path, rig: Rig) -> None:
+        self._path = folder / POSTURE_BARE_CSV
+        self._comparison = BareLensComparison(rig) if rig.dome is not None else None
+        self._ratios = array("d")
+        self._file: PostureCsv | None = None
+        if self._comparison is not None:
+            with writing(self._path):
+                self._file = PostureCsv(self._path)
+
+    def write(self, scan: Scan) -> None:
+        """Append the row of one frame."""
+        if self._comparison is None or self._file is None:
+            return
+        posture = self._comparison.measure(scan)
+        if isinstance(posture, Posture) and isinstance(scan.posture, Posture):
+            self._ratios.append(posture.range / scan.posture.range)
+        with writing(self._path):
+            self._file.write(replace(scan, posture=posture))
+
+    def lines(self) -> list[str]:
+        """Say in words what the dome is worth."""
+        if not self._ratios:
+            return []
+        percent = 100.0 * (statistics.median(self._ratios) - 1.0)
+        return [f"without the dome model the range would read {percent:+.1f} % (median)"]
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
