@@ -79,14 +79,75 @@ def _drop_explained(
 
 
 def _scan_points(readings: Readings, label: NDArray[np.uint8], rows: IntArray) -> ScanPoints:
-    sigma_px, sensitivity = readings.sigma_px[rows], readings.sensitivity[rows]
-    return ScanPoints(
-        laser=readings.laser[rows].astype(np.int8),
-        pixels=readings.pixels[rows],
-        points_in_dome=readings.points[rows],
-        sigma=sigma_px * np.sqrt(np.einsum("ij,ij->i", sensitivity, sensitivity)),
-        intensity=readings.height[rows],
-        width=readings.width[rows],
-        quality=np.minimum(_BEST_SIGMA_PX / sigma_px, 1.0),
+    found = ScanPoints(
+        laser=np.empty(len(rows), np.int8),
+        pixels=np.empty((len(rows), 2)),
+        points_in_dome=np.empty((len(rows), 3)),
+        sigma=np.empty(len(rows)),
+        intensity=np.empty(len(rows)),
+        width=np.empty(len(rows)),
+        quality=np.empty(len(rows)),
         label=label[rows],
     )
+    _copy_numbers(
+        rows,
+        readings.laser,
+        readings.height,
+        readings.width,
+        found.laser,
+        found.intensity,
+        found.width,
+    )
+    _copy_places(
+        rows,
+        readings.pixels,
+        readings.points,
+        readings.sensitivity,
+        readings.sigma_px,
+        found.pixels,
+        found.points_in_dome,
+        found.sigma,
+        found.quality,
+    )
+    return found
+
+
+@kernel
+def _copy_numbers(
+    rows: IntArray,
+    laser: IntArray,
+    height: FloatArray,
+    width: FloatArray,
+    out_laser: NDArray[np.int8],
+    out_height: FloatArray,
+    out_width: FloatArray,
+) -> None:
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        out_laser[k] = laser[i]
+        out_height[k] = height[i]
+        out_width[k] = width[i]
+
+
+@kernel
+def _copy_places(
+    rows: IntArray,
+    pixels: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    out_pixels: FloatArray,
+    out_points: FloatArray,
+    out_sigma: FloatArray,
+    out_quality: FloatArray,
+) -> None:
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        for axis in range(2):
+            out_pixels[k, axis] = pixels[i, axis]
+        square = 0.0
+        for axis in range(3):
+            out_points[k, axis] = points[i, axis]
+            square += sensitivity[i, axis] * sensitivity[i, axis]
+        out_sigma[k] = sigma_px[i] * np.sqrt(square)
+        out_quality[k] = min(_BEST_SIGMA_PX / sigma_px[i], 1.0)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.plane_fit import PlaneFit
 
 # Beyond these a posture tells nothing that a pilot could use.
@@ -110,7 +111,7 @@ def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: Flo
         covariance=jacobian @ fit.covariance @ jacobian.T,
         normal_in_dome=fit.m * distance,
         slant_range=1.0 / approach if approach > 0.0 else float("inf"),
-        nearest=float(np.sqrt(np.min(np.sum(points**2, axis=1)))),
+        nearest=_nearest(points),
         n_points=len(points),
         rms=fit.rms,
     )
@@ -168,3 +169,13 @@ def _range_pitch_yaw_jacobian(m: FloatArray) -> FloatArray:
             [y / xy, -x / xy, 0.0],
         ]
     )
+
+
+@kernel
+def _nearest(points: FloatArray) -> float:
+    """Return the smallest distance of points (N, 3) from the origin."""
+    square = np.inf
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        square = min(square, x * x + y * y + z * z)
+    return float(np.sqrt(square))

@@ -8,8 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
-from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.contrast import BLOCK, U8Array
+from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.scanning.contrast import BLOCK
+
+_LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
+_HIGH_BITS = np.uint64(0x8080808080808080)
+_FIRST_BIT = np.uint64(0x80)
 
 
 def cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray:
@@ -43,51 +47,71 @@ def cells_near_green(
             cells[b, w] = in_band[b, w] and near != 0
 
 
+@inline_kernel
+def _lit_bytes(word: np.uint64) -> np.uint64:
+    """Set the highest bit of every byte that is not zero, and no other bit."""
+    return ((word & _LOW_BITS) + _LOW_BITS | word) & _HIGH_BITS
+
+
 @kernel
 def find_runs(
     cells: BoolArray,
     words: NDArray[np.uint64],
-    contrast: U8Array,
     lowest: IntArray,
     highest: IntArray,
     open_start: IntArray,
-    open_last: IntArray,
     runs: IntArray,
 ) -> int:
-    """Collect runs (line, first, last) of non-zero contrast along the lines; 8 lines a look."""
+    """Collect runs (line, first, last) of marked pixels along the lines; 8 lines a look.
+
+    Parameters
+    ----------
+    cells : bool array, shape (n_blocks, n_words)
+        Where to look.
+    words : uint64 array, shape (length, n_words)
+        The marked image, zero where a pixel is not marked; 8 lines a word.
+    lowest, highest : int array, shape (n_lines,)
+        Runs that lie wholly outside are left out.
+    open_start : int array, shape (8 * n_words,)
+        Scratch.
+    runs : int array, shape (capacity, 3)
+        Written, up to its capacity.
+
+    Returns
+    -------
+    int
+        Number of runs written.
+    """
     length, n_words = words.shape
-    n_lines = lowest.shape[0]
+    nothing = np.uint64(0)
     n = 0
-    for x in range(n_lines):
-        open_start[x] = -1
-        open_last[x] = -2
-    active = np.empty(n_words, np.int64)
     for b in range(cells.shape[0]):
-        n_active = 0
+        first_row, last_row = b * BLOCK, min((b + 1) * BLOCK, length) - 1
         for w in range(n_words):
-            if cells[b, w]:
-                active[n_active] = w
-                n_active += 1
-        for v in range(b * BLOCK, min((b + 1) * BLOCK, length)):
-            for k in range(n_active):
-                w = active[k]
-                if words[v, w] == 0:
+            if not cells[b, w]:
+                continue
+            goes_on_before = b > 0 and cells[b - 1, w]
+            goes_on_after = last_row + 1 < length and cells[b + 1, w]
+            before = _lit_bytes(words[first_row - 1, w]) if goes_on_before else nothing
+            here = _lit_bytes(words[first_row, w])
+            for v in range(first_row, last_row + 1):
+                after = nothing
+                if v < last_row or goes_on_after:
+                    after = _lit_bytes(words[v + 1, w])
+                starts, ends = here & ~before, here & ~after
+                before, here = here, after
+                if starts | ends == nothing:
                     continue
-                for x in range(8 * w, min(8 * w + 8, n_lines)):
-                    if contrast[v, x] == 0 or v < lowest[x] or v > highest[x]:
+                for k in range(8):
+                    bit = _FIRST_BIT << np.uint64(8 * k)
+                    x = 8 * w + k
+                    if starts & bit != nothing:
+                        open_start[x] = v
+                    if ends & bit == nothing or open_start[x] > highest[x] or v < lowest[x]:
                         continue
-                    if open_last[x] == v - 1:
-                        open_last[x] = v
-                        continue
-                    if open_start[x] >= 0 and n < runs.shape[0]:
-                        runs[n, 0], runs[n, 1], runs[n, 2] = x, open_start[x], open_last[x]
+                    if n < runs.shape[0]:
+                        runs[n, 0], runs[n, 1], runs[n, 2] = x, open_start[x], v
                         n += 1
-                    open_start[x] = v
-                    open_last[x] = v
-    for x in range(n_lines):
-        if open_start[x] >= 0 and n < runs.shape[0]:
-            runs[n, 0], runs[n, 1], runs[n, 2] = x, open_start[x], open_last[x]
-            n += 1
     return n
 
 

@@ -149,8 +149,7 @@ class StripeDetector:
         self._in_band = cells_in_band(length, lowest, highest)
         self._cells = np.empty_like(self._in_band)
         self._any_green = np.empty(self._in_band.shape, np.uint32)
-        self._open_start = np.empty(n_lines, np.int64)
-        self._open_last = np.empty(n_lines, np.int64)
+        self._open_start = np.empty(-(-n_lines // 8) * 8, np.int64)
         self._runs = np.empty((options.max_returns, 3), np.int64)
         self._sorted = np.empty_like(self._runs)
         self._line_start = np.empty(n_lines + 1, np.int64)
@@ -172,11 +171,9 @@ class StripeDetector:
             n_runs = find_runs(
                 cells,
                 contrast.view(np.uint64),
-                contrast,
                 self._lowest,
                 self._highest,
                 self._open_start,
-                self._open_last,
                 self._runs,
             )
             if n_runs < len(self._runs) or min_contrast > _HIGHEST_CONTRAST:

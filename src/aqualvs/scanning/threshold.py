@@ -61,8 +61,7 @@ class ThresholdDetector:
         self._lowest, self._highest = lowest, highest
         self._cells = cells_in_band(length, lowest, highest)
         self._bright: U8Array = np.zeros((length, -(-n_lines // 8) * 8), np.uint8)
-        self._open_start = np.empty(n_lines, np.int64)
-        self._open_last = np.empty(n_lines, np.int64)
+        self._open_start = np.empty(-(-n_lines // 8) * 8, np.int64)
         self._runs = np.empty((options.max_returns, 3), np.int64)
         self._line_start = np.empty(n_lines + 1, np.int64)
 
@@ -73,11 +72,9 @@ class ThresholdDetector:
         n = find_runs(
             self._cells,
             self._bright.view(np.uint64),
-            self._bright,
             self._lowest,
             self._highest,
             self._open_start,
-            self._open_last,
             self._runs,
         )
         runs = np.empty((n, 3), np.int64)

@@ -82,6 +82,23 @@ _BUILT_IN: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
                 "bubbles": 40,
             },
         ),
+        "demo": (
+            "the bundled dive: along a fouled net with a hole, among fish and bubbles",
+            {
+                "duration_s": 6.0,
+                "motion": {
+                    "range_mm": {"values": [800, 450, 600, 520], "sway": 8, "period_s": 2.9},
+                    "pitch_deg": {"values": [-6, 4, -2, 3], "sway": 2, "period_s": 3.1},
+                    "yaw_deg": {"values": [12, -4, -10, 2], "sway": 2, "period_s": 2.3},
+                    "slide_x_mm": [0, 120, 260],
+                    "slide_z_mm": [0, -30, 25],
+                },
+                "net": {"bar_mm": 25, "twine_mm": 2.5, "fouling": 0.12, "holes_mm": [[80, 10, 40]]},
+                "walls": [{"behind_mm": 600, "yaw_deg": 5, "tile_mm": 200}],
+                "fish": 4,
+                "bubbles": 30,
+            },
+        ),
         "lasers_off": (
             "a wall with the lasers off: no posture may come of it",
             {"duration_s": 1.0, "walls": [{}], "lasers_on": False},

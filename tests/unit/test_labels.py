@@ -1,0 +1,223 @@
+"""Labels: every return once, and what each was found to be."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.labels import label_readings
+from aqualvs.scanning.readings import Readings, read_returns
+from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.triangulate import Triangulator
+from aqualvs.simulation.example_rigs import example_rig
+
+Lit: TypeAlias = Callable[[FloatArray], BoolArray]
+NET = Plane.from_normal([-0.1, 1.0, 0.05], 0.45)
+WALL = Plane.from_normal([0.07, 1.0, 0.0], 0.8)
+
+
+def everywhere(points: FloatArray) -> BoolArray:
+    return np.ones(len(points), np.bool_)
+
+
+def strands(points: FloatArray) -> BoolArray:
+    """6 mm of light every 30 mm, along whichever way the stripe runs."""
+    lit: BoolArray = (points[:, 0] + points[:, 2]) % 0.03 < 0.006
+    return lit
+
+
+def behind_strands(points: FloatArray) -> BoolArray:
+    lit: BoolArray = (points[:, 0] + points[:, 2] + 0.002) % 0.04 > 0.012
+    return lit
+
+
+def lit_stripe(
+    rig: Rig, search: StripeSearch, laser: Plane, target: Plane, lit: Lit
+) -> tuple[IntArray, FloatArray]:
+    """Search lines and exact positions of one laser's stripe on a target, where it is lit."""
+    along = np.cross(laser.normal, target.normal)
+    along /= np.linalg.norm(along)
+    foot = np.linalg.solve(
+        np.array([laser.normal, target.normal, along]), [laser.offset, target.offset, 0.0]
+    )
+    points = foot + np.linspace(-0.8, 0.8, 8001)[:, None] * along
+    camera = rig.camera()
+    pixels, valid = camera.project(points)
+    seen = valid & camera.inside_image(pixels)
+    points, pixels = points[seen], pixels[seen]
+    across, position = (1, 0) if search.axis is SearchAxis.ALONG_X else (0, 1)
+    order = np.argsort(pixels[:, across])
+    points, pixels = points[order], pixels[order]
+    first, last = np.ceil(pixels[0, across]), np.floor(pixels[-1, across])
+    line = np.arange(first, last + 1.0)
+    at = np.searchsorted(pixels[:, across], line).clip(0, len(pixels) - 1)
+    shown = lit(points[at])
+    place = np.interp(line, pixels[:, across], pixels[:, position])
+    return line[shown].astype(np.int64), place[shown]
+
+
+def returns_of(
+    rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = 0.0
+) -> dict[SearchAxis, Returns]:
+    """Returns of every laser on every target, each in the search direction of its laser."""
+    rng = np.random.default_rng(7)
+    stripes: dict[SearchAxis, list[tuple[IntArray, FloatArray]]] = {}
+    for laser, search in zip(rig.lasers, plan_searches(rig, rig.camera()), strict=True):
+        for target, lit in targets:
+            stripe = lit_stripe(rig, search, laser.plane, target, lit)
+            stripes.setdefault(search.axis, []).append(stripe)
+    found = {}
+    for axis, parts in stripes.items():
+        line = np.concatenate([part[0] for part in parts])
+        position = np.concatenate([part[1] for part in parts])
+        position = position + rng.normal(0.0, noise_px, len(line))
+        order = np.lexsort((position, line))
+        n = len(line)
+        found[axis] = Returns(
+            line=line[order],
+            position=position[order],
+            height=np.full(n, 80.0),
+            width=np.full(n, 5.0),
+            green_fall=np.full(n, 20.0),
+        )
+    return found
+
+
+class Labelled(NamedTuple):
+    returns: dict[SearchAxis, Returns]
+    readings: Readings
+    index: IntArray
+    surfaces: list[Surface]
+    points: ScanPoints
+
+
+def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Labelled:
+    """Label the light on some targets; the posture rests on all that lies on one of them."""
+    rig = example_rig()
+    camera = rig.camera()
+    returns = returns_of(rig, targets, 0.1)
+    readings = read_returns(returns, plan_searches(rig, camera), Triangulator(rig, camera))
+    chunks, index = readings.chunks()
+    surfaces = find_surfaces(chunks, index, readings.pixels, 3, rig.working_range, 850.0)
+    target = None
+    in_posture = np.zeros(len(readings), np.bool_)
+    if posture_to is not None:
+        offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
+        target = surfaces[int(np.argmin(offsets))]
+        in_posture = target.members[index]
+    points = label_readings(readings, index, surfaces, target, in_posture)
+    return Labelled(returns, readings, index, surfaces, points)
+
+
+def all_pixels(returns: dict[SearchAxis, Returns]) -> FloatArray:
+    along_x, along_y = returns[SearchAxis.ALONG_X], returns[SearchAxis.ALONG_Y]
+    return np.concatenate(
+        [
+            np.stack([along_x.position, along_x.line], axis=-1),
+            np.stack([along_y.line, along_y.position], axis=-1),
+        ]
+    )
+
+
+def times_seen(points: ScanPoints) -> IntArray:
+    """How often each of the points' pixels is among them."""
+    _, inverse, counts = np.unique(
+        points.pixels, axis=0, return_inverse=True, return_counts=True
+    )
+    times: IntArray = counts[inverse.ravel()]
+    return times
+
+
+def test_light_on_the_target_is_labelled_once_with_its_laser() -> None:
+    found = label([(WALL, everywhere)], WALL)
+    points = found.points
+    on_target = points.label == Label.TARGET
+    assert np.all(times_seen(points)[on_target] == 1)
+    off = np.abs(WALL.signed_distance(points.points_in_dome[on_target]))
+    assert np.percentile(off, 99) < 0.005
+    n_returns = len(all_pixels(found.returns))
+    assert np.count_nonzero(on_target) > 0.95 * n_returns
+    assert np.all(np.diff(points.laser) >= 0)
+
+
+def test_no_return_is_lost() -> None:
+    found = label([(NET, strands), (WALL, behind_strands)], NET)
+    missing = 0
+    for pixel in all_pixels(found.returns):
+        gap = np.abs(found.points.pixels - pixel).max(axis=1).min()
+        # What another reading of the same light explains is left out: within two cells of 6 px.
+        missing += gap > 12.0
+    # Long segments that no laser could have made are dropped before.
+    assert missing < 0.02 * len(all_pixels(found.returns))
+
+
+def test_the_wall_behind_is_another_surface() -> None:
+    found = label([(NET, strands), (WALL, behind_strands)], NET)
+    points = found.points
+    on_wall = np.abs(WALL.signed_distance(points.points_in_dome)) < 0.004
+    on_net = np.abs(NET.signed_distance(points.points_in_dome)) < 0.003
+    assert np.mean(points.label[on_net & ~on_wall] == Label.TARGET) > 0.9
+    assert np.mean(points.label[on_wall & ~on_net] == Label.OTHER_SURFACE) > 0.9
+
+
+def test_without_a_target_nothing_is_target() -> None:
+    found = label([(WALL, everywhere)], None)
+    assert len(found.surfaces) >= 1
+    assert not np.any(found.points.label == Label.TARGET)
+    assert np.mean(found.points.label == Label.OTHER_SURFACE) > 0.9
+
+
+def test_what_the_posture_left_out_of_its_target_is_ambiguous() -> None:
+    found = label([(WALL, everywhere)], WALL)
+    target = found.surfaces[0]
+    on_it = target.members[found.index]
+    left_out = on_it & (found.readings.pixels[:, 1] < 200.0)
+    points = label_readings(
+        found.readings, found.index, found.surfaces, target, on_it & ~left_out
+    )
+    assert np.count_nonzero(left_out) > 50
+    ambiguous = points.label == Label.AMBIGUOUS
+    assert np.count_nonzero(ambiguous) >= np.count_nonzero(left_out)
+    assert not np.any((points.label == Label.TARGET) & (points.pixels[:, 1] < 200.0))
+
+
+def test_light_that_nothing_explains_is_clutter_or_ambiguous() -> None:
+    found = label([(WALL, everywhere)], None)
+    points = label_readings(
+        found.readings,
+        found.index,
+        [],
+        None,
+        np.zeros(len(found.readings), np.bool_),
+    )
+    assert len(points) == len(found.readings)
+    several = times_seen(points) > 1
+    assert np.all(points.label[several] == Label.AMBIGUOUS)
+    assert np.all(points.label[~several] == Label.CLUTTER)
+    assert several.any()
+    assert (~several).any()
+
+
+def test_sigma_and_quality_follow_from_the_returns() -> None:
+    points = label([(WALL, everywhere)], WALL).points
+    assert np.all(points.sigma > 0.0)
+    assert np.all((points.quality > 0.0) & (points.quality <= 1.0))
+    np.testing.assert_array_equal(points.intensity, 80.0)
+    np.testing.assert_array_equal(points.width, 5.0)
+    for name in ("laser", "pixels", "points_in_dome", "sigma", "quality", "label"):
+        assert len(getattr(points, name)) == len(points)
+
+
+def test_no_readings() -> None:
+    def nowhere(points: FloatArray) -> BoolArray:
+        return np.zeros(len(points), np.bool_)
+
+    points = label([(WALL, nowhere)], None).points
+    assert len(points) == 0
+    assert points.points_in_dome.shape == (0, 3)

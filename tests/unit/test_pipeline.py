@@ -1,0 +1,328 @@
+"""The main path on painted frames: postures, every reason to refuse, labels."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+import pytest
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.measure import FitMethod
+from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.threshold import ThresholdOptions
+from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+
+Lit: TypeAlias = Callable[[FloatArray], BoolArray]
+BACKGROUND = 40.0
+SIGMA_PX = 2.2
+ALL = (0, 1, 2)
+
+
+def plane(distance: float, pitch: float = 0.0, yaw: float = 0.0) -> Plane:
+    normal = np.array([np.tan(np.deg2rad(yaw)), 1.0, np.tan(np.deg2rad(pitch))])
+    return Plane(normal / np.linalg.norm(normal), distance)
+
+
+def everywhere(points: FloatArray) -> BoolArray:
+    return np.ones(points.shape[:-1], np.bool_)
+
+
+def strands(points: FloatArray) -> BoolArray:
+    """Upright and level twine of 3 mm, every 25 mm."""
+    twine: BoolArray = (points[..., 0] % 0.025 < 0.003) | (points[..., 2] % 0.025 < 0.003)
+    return twine
+
+
+def light_on(
+    rig: Rig, targets: Sequence[tuple[Plane, Lit]], lasers: Sequence[int]
+) -> FloatArray:
+    """Light of the lasers on the first target that each pixel meets, nearest first."""
+    width, height = rig.size_px
+    rays = rig.camera().rays(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1))
+    light = np.zeros((height, width))
+    open_ = np.ones((height, width), np.bool_)
+    for target, lit in targets:
+        points, valid = target.intersect(rays)
+        points = np.where(valid[..., None], points, 0.0)
+        here = open_ & valid & lit(points)
+        open_ &= ~here
+        px_per_m = max(rig.lens.fx, rig.lens.fy) / np.linalg.norm(points[here], axis=-1)
+        for i in lasers:
+            off = rig.lasers[i].plane.signed_distance(points[here]) * px_per_m
+            light[here] += 130.0 * np.exp(-0.5 * (off / SIGMA_PX) ** 2)
+    return light
+
+
+def frame_of(light: FloatArray, *, grey: bool = False, noise: float = 0.0) -> Frame:
+    rng = np.random.default_rng(9)
+    value = BACKGROUND + light + rng.normal(0.0, noise, light.shape)
+    luma = np.clip(np.rint(value), 0, 255).astype(np.uint8)
+    if grey:
+        return Frame(3, 0.12, luma)
+    height, width = light.shape
+    half = light.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
+    u = np.rint(120.0 - 50.0 * np.clip(half / 130.0, 0.0, 1.0)).astype(np.uint8)
+    return Frame(3, 0.12, luma, (u, np.full_like(u, 110)))
+
+
+def scan(
+    targets: Sequence[tuple[Plane, Lit]],
+    *,
+    rig: Rig | None = None,
+    lasers: Sequence[int] = ALL,
+    options: ScannerOptions | None = None,
+    grey: bool = False,
+    noise: float = 0.0,
+) -> Scan:
+    rig = rig or example_rig()
+    frame = frame_of(light_on(rig, targets, lasers), grey=grey, noise=noise)
+    return Scanner(rig, options).process(frame)
+
+
+def assert_posture(
+    found: Posture | Refusal, target: Plane, share: float = 0.001, deg: float = 0.1
+) -> None:
+    assert found, found
+    n = target.normal
+    assert abs(found.range / target.offset - 1.0) < share
+    assert abs(np.rad2deg(found.pitch - np.arctan2(n[2], n[1]))) < deg
+    assert abs(np.rad2deg(found.yaw - np.arctan2(n[0], n[1]))) < deg
+
+
+def reason(found: Posture | Refusal) -> Reason:
+    assert not found, found
+    assert found.detail
+    return found.reason
+
+
+TILTS = [plane(0.4), plane(0.6, 18.0, -22.0), plane(0.9, -12.0, 9.0)]
+
+
+@pytest.mark.parametrize("target", TILTS, ids=str)
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_wall(target: Plane, grey: bool) -> None:
+    found = scan([(target, everywhere)], grey=grey, noise=2.0)
+    # Painted stripes are exact; grey levels, noise and crossings leave hundredths of a pixel.
+    assert_posture(found.posture, target)
+    assert found.posture
+    sigma = np.sqrt(np.diag(found.posture.covariance))
+    assert sigma[0] < 0.002 * target.offset
+    assert np.all(np.rad2deg(sigma[1:]) < 0.3)
+    assert found.posture.nearest >= 0.99 * found.posture.range
+    assert (found.index, found.time_s) == (3, 0.12)
+    assert found.n_water == example_rig().n_water
+
+
+@pytest.mark.parametrize("target", [plane(0.5, 5.0, -8.0), plane(1.0, -10.0, 14.0)], ids=str)
+def test_a_wall_in_a_wide_picture(target: Plane) -> None:
+    found = scan([(target, everywhere)], rig=bluerov2_rig())
+    assert_posture(found.posture, target)
+
+
+@pytest.mark.parametrize("target", [plane(0.4), plane(0.55, -6.0, 11.0)], ids=str)
+def test_a_net_in_open_water(target: Plane) -> None:
+    found = scan([(target, strands)])
+    # Strands cut stripes off askew: the light's centre on a strand is only nearly on the sheet.
+    assert_posture(found.posture, target, share=0.006, deg=0.8)
+
+
+def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> None:
+    net, wall = plane(0.45, 2.0, -5.0), plane(0.85, 0.0, 4.0)
+    both = [(net, strands), (wall, everywhere)]
+    for kind, target in (
+        (TargetKind.AUTO, net),
+        (TargetKind.NET, net),
+        (TargetKind.SOLID, wall),
+    ):
+        found = scan(both, options=ScannerOptions(target=kind))
+        assert_posture(found.posture, target, share=0.01, deg=1.5)
+    found = scan(both)
+    on_wall = np.abs(wall.signed_distance(found.points.points_in_dome)) < 0.004
+    on_net = np.abs(net.signed_distance(found.points.points_in_dome)) < 0.003
+    assert np.mean(found.points.label[on_wall & ~on_net] == Label.OTHER_SURFACE) > 0.85
+    assert not np.any(found.points.label[on_wall & ~on_net] == Label.TARGET)
+    assert np.mean(found.points.label[on_net & ~on_wall] == Label.TARGET) > 0.5
+
+
+def test_crossings_are_ambiguous_and_the_rest_is_target() -> None:
+    target = plane(0.5, 3.0, -4.0)
+    rig = example_rig()
+    points = scan([(target, everywhere)]).points
+    near = np.zeros(len(points), np.bool_)
+    for i, laser in enumerate(rig.lasers):
+        off = np.abs(laser.plane.signed_distance(points.points_in_dome))
+        near |= (points.laser != i) & (off * 878.0 / 0.5 < SIGMA_PX)
+    on_it = np.abs(target.signed_distance(points.points_in_dome)) < 0.003
+    assert np.count_nonzero(near & on_it) > 3
+    assert np.all(points.label[near & on_it] == Label.AMBIGUOUS)
+    assert np.mean(points.label[on_it & ~near] == Label.TARGET) > 0.9
+
+
+def test_every_point_has_its_pixel_laser_and_label() -> None:
+    rig = example_rig()
+    points = scan([(plane(0.5), everywhere)]).points
+    pixels, valid = rig.camera().project(points.points_in_dome)
+    assert valid.all()
+    np.testing.assert_allclose(pixels, points.pixels, rtol=0.0, atol=1e-6)
+    assert set(np.unique(points.label)) <= {int(one) for one in Label}
+    target = points.label == Label.TARGET
+    _, counts = np.unique(points.pixels[target], axis=0, return_counts=True)
+    assert counts.max() == 1
+
+
+def test_nothing_lit() -> None:
+    for grey in (False, True):
+        found = scan([], grey=grey)
+        assert reason(found.posture) is Reason.NO_STRIPES
+        assert len(found.points) == 0
+
+
+def test_hardly_anything_lit() -> None:
+    def a_spot(points: FloatArray) -> BoolArray:
+        lit: BoolArray = (np.abs(points[..., 0]) < 0.006) & (points[..., 2] < 0.02)
+        return lit
+
+    found = scan([(plane(0.5), a_spot)], lasers=(0,))
+    assert reason(found.posture) is Reason.TOO_FEW_POINTS
+
+
+@pytest.mark.parametrize("laser", [0, 1, 2])
+def test_one_laser_on(laser: int) -> None:
+    found = scan([(plane(0.5), everywhere)], lasers=(laser,))
+    # Light of one laser may lie in the bands of others; no two of them make it a plane.
+    assert reason(found.posture) in {Reason.ONE_LASER, Reason.NOT_A_PLANE}
+
+
+def test_a_rig_of_one_laser() -> None:
+    rig = example_rig()
+    found = scan([(plane(0.5), everywhere)], rig=replace(rig, lasers=rig.lasers[:1]), lasers=(0,))
+    assert reason(found.posture) is Reason.ONE_LASER
+
+
+def test_two_lasers_are_enough() -> None:
+    target = plane(0.5, 4.0, -7.0)
+    assert_posture(scan([(target, everywhere)], lasers=(0, 1)).posture, target)
+
+
+def test_lasers_on_different_surfaces_share_no_plane() -> None:
+    rig = example_rig()
+    light = sum(
+        light_on(rig, [(target, everywhere)], (i,))
+        for i, target in enumerate((plane(0.35, 30.0), plane(0.65, 0.0, 35.0), plane(0.95, -30.0)))
+    )
+    found = Scanner(rig).process(frame_of(np.asarray(light)))
+    assert reason(found.posture) is Reason.NOT_A_PLANE
+
+
+def test_points_near_one_line_do_not_fix_a_plane() -> None:
+    """All light within a few millimetres of the crossing of two stripes and along one of them."""
+    rig = example_rig()
+    target = plane(0.5)
+    first, second = rig.lasers[0].plane, rig.lasers[1].plane
+    corner = np.linalg.solve(
+        np.array([first.normal, second.normal, target.normal]),
+        [first.offset, second.offset, target.offset],
+    )
+
+    def near_the_crossing(points: FloatArray) -> BoolArray:
+        gap = np.linalg.norm(points - corner, axis=-1)
+        lit: BoolArray = (gap < 0.024) & (gap > 0.008)
+        return lit
+
+    found = scan([(target, near_the_crossing)], lasers=(0, 1))
+    assert reason(found.posture) in {Reason.COLLINEAR, Reason.TOO_FEW_POINTS}
+
+
+def test_a_wall_where_a_net_was_asked_for() -> None:
+    found = scan([(plane(0.5), everywhere)], options=ScannerOptions(target=TargetKind.NET))
+    assert reason(found.posture) is Reason.NO_TARGET
+    assert found.posture == Refusal(Reason.NO_TARGET, "surfaces in view, but none of kind net")
+    assert np.mean(found.points.label == Label.OTHER_SURFACE) > 0.9
+
+
+@pytest.mark.parametrize("distance", [0.27, 1.1])
+def test_a_wall_out_of_range(distance: float) -> None:
+    found = scan([(plane(distance), everywhere)])
+    assert reason(found.posture) is Reason.OUT_OF_RANGE
+    assert isinstance(found.posture, Refusal)
+    assert f"range {distance:.2f}" in found.posture.detail
+    assert not np.any(found.points.label == Label.TARGET)
+
+
+def test_frames_do_not_depend_on_each_other() -> None:
+    rig = example_rig()
+    frames = [
+        frame_of(light_on(rig, targets, ALL), noise=3.0)
+        for targets in (
+            [(plane(0.5, 4.0), everywhere)],
+            [],
+            [(plane(0.45), strands), (plane(0.8), everywhere)],
+        )
+    ]
+    scanner = Scanner(rig)
+    in_order = [scanner.process(frame) for frame in frames]
+    again = [scanner.process(frame) for frame in reversed(frames)][::-1]
+    for one, other in zip(in_order, again, strict=True):
+        assert bool(one.posture) == bool(other.posture)
+        np.testing.assert_array_equal(one.points.points_in_dome, other.points.points_in_dome)
+        np.testing.assert_array_equal(one.points.label, other.points.label)
+        if one.posture and other.posture:
+            assert one.posture.range == other.posture.range
+            np.testing.assert_array_equal(one.posture.covariance, other.posture.covariance)
+
+
+def test_a_frame_is_left_as_it_was() -> None:
+    rig = example_rig()
+    frame = frame_of(light_on(rig, [(plane(0.5), everywhere)], ALL))
+    assert frame.chroma is not None
+    planes = (frame.luma, *frame.chroma)
+    before = [one.copy() for one in planes]
+    for one in planes:
+        one.flags.writeable = False
+    assert Scanner(rig).process(frame).posture
+    for one, kept in zip(planes, before, strict=True):
+        np.testing.assert_array_equal(one, kept)
+
+
+@pytest.mark.parametrize("size", [(720, 575), (360, 288), (576, 720)])
+def test_a_frame_of_another_size_is_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=f"frame is {size[0]} x {size[1]}"):
+        Scanner(example_rig()).process(Frame(0, 0.0, np.zeros(size[::-1], np.uint8)))
+
+
+@pytest.mark.parametrize(
+    ("options", "share", "deg"),
+    [
+        (ScannerOptions(fit=FitMethod.PSEUDO_INVERSE), 0.002, 0.2),
+        # Half a pixel at each end of a run, over hundreds of them.
+        (ScannerOptions(detector=ThresholdOptions(level=110)), 0.003, 0.3),
+    ],
+    ids=["pseudo-inverse", "threshold"],
+)
+def test_the_paper_s_own_methods(options: ScannerOptions, share: float, deg: float) -> None:
+    target = plane(0.5, 6.0, -9.0)
+    found = scan([(target, everywhere)], options=options)
+    assert_posture(found.posture, target, share=share, deg=deg)
+
+
+def test_the_paper_s_mesh_filter_takes_a_wall_away_and_leaves_a_net() -> None:
+    options = ScannerOptions(mesh_filter=MeshFilterOptions())
+    wall = scan([(plane(0.5), everywhere)], options=options)
+    without = scan([(plane(0.5), everywhere)])
+    assert len(wall.points) < 0.5 * len(without.points)
+    net = scan([(plane(0.45), strands)], options=options)
+    assert len(net.points) > 30
+
+
+def test_without_its_dome_the_camera_reads_another_posture() -> None:
+    rig, target = example_rig(), plane(0.9)
+    frame = frame_of(light_on(rig, [(target, everywhere)], ALL))
+    found = Scanner(rig, camera=rig.bare_camera()).process(frame).posture
+    assert not found or abs(found.range / 0.9 - 1.0) > 0.03 or abs(np.rad2deg(found.pitch)) > 3.0

@@ -1,0 +1,207 @@
+"""Readings: every return as a point of each laser that could have made it."""
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.readings import Readings, read_returns
+from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.triangulate import Triangulator
+from aqualvs.simulation.example_rigs import example_rig
+
+Lit: TypeAlias = Callable[[FloatArray], BoolArray]
+WALL = Plane(np.array([0.0, 1.0, 0.0]), 0.5)
+TILTED = Plane.from_normal([0.25, 1.0, -0.2], 0.55)
+
+
+def everywhere(points: FloatArray) -> BoolArray:
+    return np.ones(len(points), np.bool_)
+
+
+def strands(points: FloatArray) -> BoolArray:
+    """6 mm of light every 30 mm, along whichever way the stripe runs."""
+    lit: BoolArray = (points[:, 0] + points[:, 2]) % 0.03 < 0.006
+    return lit
+
+
+def lit_stripe(
+    rig: Rig, search: StripeSearch, laser: Plane, target: Plane, lit: Lit
+) -> tuple[IntArray, FloatArray]:
+    """Search lines and exact positions of one laser's stripe on a target, where it is lit."""
+    along = np.cross(laser.normal, target.normal)
+    along /= np.linalg.norm(along)
+    foot = np.linalg.solve(
+        np.array([laser.normal, target.normal, along]), [laser.offset, target.offset, 0.0]
+    )
+    points = foot + np.linspace(-0.8, 0.8, 8001)[:, None] * along
+    camera = rig.camera()
+    pixels, valid = camera.project(points)
+    seen = valid & camera.inside_image(pixels)
+    points, pixels = points[seen], pixels[seen]
+    across, position = (1, 0) if search.axis is SearchAxis.ALONG_X else (0, 1)
+    order = np.argsort(pixels[:, across])
+    points, pixels = points[order], pixels[order]
+    first, last = np.ceil(pixels[0, across]), np.floor(pixels[-1, across])
+    line = np.arange(first, last + 1.0)
+    at = np.searchsorted(pixels[:, across], line).clip(0, len(pixels) - 1)
+    shown = lit(points[at])
+    place = np.interp(line, pixels[:, across], pixels[:, position])
+    return line[shown].astype(np.int64), place[shown]
+
+
+def returns_of(
+    rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = 0.0
+) -> dict[SearchAxis, Returns]:
+    """Returns of every laser on every target, each in the search direction of its laser."""
+    rng = np.random.default_rng(7)
+    stripes: dict[SearchAxis, list[tuple[IntArray, FloatArray]]] = {}
+    for laser, search in zip(rig.lasers, plan_searches(rig, rig.camera()), strict=True):
+        for target, lit in targets:
+            stripe = lit_stripe(rig, search, laser.plane, target, lit)
+            stripes.setdefault(search.axis, []).append(stripe)
+    found = {}
+    for axis, parts in stripes.items():
+        line = np.concatenate([part[0] for part in parts])
+        position = np.concatenate([part[1] for part in parts])
+        position = position + rng.normal(0.0, noise_px, len(line))
+        order = np.lexsort((position, line))
+        n = len(line)
+        found[axis] = Returns(
+            line=line[order],
+            position=position[order],
+            height=np.full(n, 80.0),
+            width=np.full(n, 5.0),
+            green_fall=np.full(n, 20.0),
+        )
+    return found
+
+
+def read(rig: Rig, returns: dict[SearchAxis, Returns]) -> Readings:
+    camera = rig.camera()
+    return read_returns(returns, plan_searches(rig, camera), Triangulator(rig, camera))
+
+
+def test_every_return_is_read_as_the_laser_that_made_it() -> None:
+    rig = example_rig()
+    returns = returns_of(rig, [(TILTED, everywhere)])
+    readings = read(rig, returns)
+    n_returns = sum(len(found) for found in returns.values())
+    on_target = np.abs(TILTED.signed_distance(readings.points)) < 1e-6
+    # Exact positions, interpolated between projections half a pixel apart.
+    assert len(np.unique(readings.source[on_target])) == n_returns
+    assert set(readings.laser[on_target].tolist()) == {0, 1, 2}
+    # Every reading lies on the sheet of the laser it is read as.
+    for i, laser in enumerate(rig.lasers):
+        off = laser.plane.signed_distance(readings.points[readings.laser == i])
+        assert np.abs(off).max() < 1e-9
+
+
+def test_pixels_are_the_projections_of_the_points() -> None:
+    rig = example_rig()
+    readings = read(rig, returns_of(rig, [(WALL, strands)]))
+    pixels, valid = rig.camera().project(readings.points)
+    assert valid.all()
+    np.testing.assert_allclose(pixels, readings.pixels, rtol=0.0, atol=1e-6)
+
+
+def test_sources_tell_returns_of_both_searches_apart() -> None:
+    rig = example_rig()
+    returns = returns_of(rig, [(WALL, everywhere)])
+    readings = read(rig, returns)
+    # Readings of one return share its pixel.
+    for source in np.unique(readings.source)[::25]:
+        same = readings.pixels[readings.source == source]
+        assert np.ptp(same, axis=0).max() == 0.0
+    assert len(np.unique(readings.source)) <= sum(len(found) for found in returns.values())
+
+
+def test_groups_of_different_lasers_differ_and_chunks_ascend() -> None:
+    rig = example_rig()
+    readings = read(rig, returns_of(rig, [(WALL, strands)]))
+    assert np.all(np.diff(readings.laser) >= 0)
+    assert np.all(np.diff(readings.chunk) >= 0)
+    for group in (readings.chunk, readings.stretch):
+        laser_of = [len(np.unique(readings.laser[group == k])) for k in np.unique(group)]
+        assert set(laser_of) == {1}
+
+
+def test_sigma_grows_with_width_over_height() -> None:
+    rig = example_rig()
+    plain = returns_of(rig, [(WALL, everywhere)])
+    faint = {
+        axis: Returns(
+            found.line, found.position, found.height / 4.0, found.width, found.green_fall
+        )
+        for axis, found in plain.items()
+    }
+    one, other = read(rig, plain), read(rig, faint)
+    # Flanks of 5 px and 80 grey levels: 0.45 * 3 * 5 / 80 px by noise of 3 grey levels, and a
+    # floor of a tenth of a pixel that no brightness removes.
+    assert np.all((one.sigma_px > 0.1) & (one.sigma_px < 0.2))
+    assert np.all((other.sigma_px > 0.3) & (other.sigma_px < 0.5))
+
+
+def test_chunks_are_centroids_and_their_errors_shrink() -> None:
+    rig = example_rig()
+    readings = read(rig, returns_of(rig, [(WALL, strands)], noise_px=0.1))
+    chunks, index = readings.chunks()
+    assert index.shape == (len(readings),)
+    assert np.all(np.diff(index) >= 0)
+    n = int(index[-1]) + 1
+    assert len(chunks) == n == len(np.unique(readings.chunk))
+    np.testing.assert_array_equal(chunks.n_lines, np.bincount(index))
+    for c in range(0, n, 7):
+        mine = index == c
+        assert chunks.laser[c] == readings.laser[mine][0]
+        assert chunks.first_line[c] == readings.line[mine].min()
+        assert chunks.last_line[c] == readings.line[mine].max()
+
+
+def test_observations_are_weighed_by_light() -> None:
+    rig = example_rig()
+    readings = read(rig, returns_of(rig, [(WALL, everywhere)]))
+    mine = readings.where(readings.stretch == readings.stretch[0])
+    light = np.linspace(10.0, 100.0, len(mine))
+    shaded = Readings(
+        **{
+            name: light if name == "height" else getattr(mine, name)
+            for name in Readings.__dataclass_fields__
+        }
+    )
+    index = np.zeros(len(mine), np.int64)
+    seen = shaded.observations(index, 1, WALL.normal)
+    weight = light * mine.width
+    expected = np.average(mine.points, axis=0, weights=weight)
+    np.testing.assert_allclose(seen.points[0], expected, atol=1e-12)
+    expected = np.average(mine.sensitivity, axis=0, weights=weight)
+    np.testing.assert_allclose(seen.sensitivity[0], expected, atol=1e-12)
+    assert seen.laser[0] == mine.laser[0]
+    # Many returns are better than one, but neighbours share errors.
+    assert 0.05 < seen.sigma_px[0] < mine.sigma_px.min()
+
+
+def test_nothing_in_nothing_out() -> None:
+    rig = example_rig()
+    nothing = {
+        axis: Returns(np.empty(0, np.int64), *(np.empty(0) for _ in range(4)))
+        for axis in SearchAxis
+    }
+    readings = read(rig, nothing)
+    assert len(readings) == 0
+    chunks, index = readings.chunks()
+    assert len(chunks) == len(index) == 0
+
+
+def test_where_keeps_the_columns_together() -> None:
+    rig = example_rig()
+    readings = read(rig, returns_of(rig, [(WALL, strands)]))
+    mask = readings.laser == 1
+    some = readings.where(mask)
+    assert len(some) == np.count_nonzero(mask)
+    np.testing.assert_array_equal(some.points, readings.points[mask])
+    np.testing.assert_array_equal(some.source, readings.source[mask])

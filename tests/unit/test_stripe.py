@@ -1,0 +1,399 @@
+"""The sub-pixel detector: where it finds a stripe, how well, and where it finds none."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.detection import FrameDetector
+from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.stripe import Returns, StripeOptions
+from aqualvs.simulation.example_rigs import bluerov2_rig
+
+U8 = NDArray[np.uint8]
+Chroma = tuple[U8, U8]
+ALONG_X, ALONG_Y = SearchAxis.ALONG_X, SearchAxis.ALONG_Y
+FWHM = 2.3548  # full width at half height of a Gaussian over its sigma
+# A seventh of the width of the small pictures here: wider than any stripe in them.
+WIDE = StripeOptions(reach_share=0.15)
+
+
+def detector_for(
+    image: U8,
+    axis: SearchAxis = ALONG_Y,
+    band: tuple[int, int] | None = None,
+    options: StripeOptions = WIDE,
+) -> FrameDetector:
+    """Search the whole picture, or the same stretch of every search line."""
+    height, width = image.shape
+    length, n_lines = (height, width) if axis is ALONG_Y else (width, height)
+    low, high = band or (0, length - 1)
+    free = np.zeros((-(-length // 8), -(-n_lines // 8)))
+    search = StripeSearch(
+        axis=axis,
+        line_px=1,
+        lowest=np.full(n_lines, low),
+        highest=np.full(n_lines, high),
+        slope_low=free - 5.0,
+        slope_high=free + 5.0,
+    )
+    return FrameDetector((width, height), [search], options)
+
+
+def detect(
+    image: U8,
+    chroma: Chroma | None = None,
+    axis: SearchAxis = ALONG_Y,
+    band: tuple[int, int] | None = None,
+    options: StripeOptions = WIDE,
+) -> Returns:
+    found = detector_for(image, axis, band, options).detect(Frame(0, 0.0, image, chroma))
+    return found[axis]
+
+
+def gaussian(
+    centres: FloatArray,
+    *,
+    sigma: float = 2.5,
+    height: float = 120.0,
+    length: int = 200,
+) -> FloatArray:
+    """Light of one stripe, shape (length, n_lines)."""
+    v = np.arange(length)[:, None]
+    light: FloatArray = height * np.exp(-0.5 * ((v - centres) / sigma) ** 2)
+    return light
+
+
+def as_image(light: FloatArray) -> U8:
+    return np.clip(np.rint(light), 0, 255).astype(np.uint8)
+
+
+def assert_same(found: Returns, expected: Returns) -> None:
+    assert len(found) > 0
+    for field in fields(Returns):
+        one, other = getattr(found, field.name), getattr(expected, field.name)
+        np.testing.assert_array_equal(one, other, err_msg=field.name)
+
+
+CENTRES = 100.0 + np.linspace(-8.0, 8.0, 161)
+
+
+@pytest.mark.parametrize("sigma", [1.2, 2.5, 5.0])
+def test_centre_width_and_height_of_a_clean_stripe(sigma: float) -> None:
+    found = detect(as_image(40.0 + gaussian(CENTRES, sigma=sigma)))
+    np.testing.assert_array_equal(found.line, np.arange(161))
+    error = found.position - CENTRES
+    # Rounding to grey levels alone, against flanks of 120 grey levels; narrow stripes also feel
+    # the change of the level with the place of the peak between pixels.
+    assert abs(error.mean()) < 0.003
+    assert np.abs(error).max() < 0.05
+    assert abs(found.width.mean() / (FWHM * sigma) - 1.0) < 0.05
+    # A peak between two pixels is up to 8 % lower than a narrow stripe.
+    assert 109.0 < found.height.min() <= found.height.max() <= 120.0
+    assert np.isnan(found.green_fall).all()
+
+
+@pytest.mark.parametrize("slope", [-0.4, 0.4])
+def test_a_sloping_background_pulls_by_hundredths(slope: float) -> None:
+    background = 60.0 + slope * (np.arange(200)[:, None] - 100.0)
+    error = detect(as_image(background + gaussian(CENTRES))).position - CENTRES
+    # Light of slope g below a Gaussian moves its peak by g sigma²/height = 0.02 px; a centroid
+    # above a level moves up to three times as far.
+    assert 0.005 < np.sign(slope) * error.mean() < 0.07
+
+
+def test_a_clipped_top_keeps_its_place() -> None:
+    found = detect(as_image(40.0 + gaussian(CENTRES, height=600.0)))
+    error = found.position - CENTRES
+    assert len(error) == 161
+    assert abs(error.mean()) < 0.003
+    # Only the flanks tell, two steep pixels each.
+    assert np.abs(error).max() < 0.1
+    assert found.height.max() <= 215.0
+
+
+def noisy_errors(noise: float, height: float) -> FloatArray:
+    rng = np.random.default_rng(11)
+    centres = 100.0 + rng.uniform(-0.5, 0.5, 4000)
+    light = 60.0 + gaussian(centres, height=height)
+    # What noise alone raises is not asked for here.
+    options = StripeOptions(reach_share=24.0 / 4000.0, min_contrast=30)
+    found = detect(as_image(light + rng.normal(0.0, noise, light.shape)), options=options)
+    return found.position - centres[found.line]
+
+
+@pytest.mark.parametrize(("noise", "height"), [(2.0, 60.0), (3.0, 60.0), (3.0, 120.0)])
+def test_noise_moves_the_centre_as_two_flanks_do(noise: float, height: float) -> None:
+    error = noisy_errors(noise, height)
+    # Now and then noise parts a stripe in two.
+    assert 4000 <= len(error) <= 4004
+    # 0.45 width/height per grey level is what readings take for it; two-sided, because too good
+    # would mean that something smooths along the stripe.
+    expected = 0.45 * noise * FWHM * 2.5 / height
+    assert 0.6 * expected < error.std() < 1.4 * expected
+    # Four standard errors of the mean, and rounding.
+    assert abs(error.mean()) < 4.0 * expected / np.sqrt(len(error)) + 0.003
+
+
+def test_noise_alone_stays_below_the_least_contrast() -> None:
+    rng = np.random.default_rng(12)
+    image = as_image(60.0 + rng.normal(0.0, 2.0, (200, 160)))
+    # Contrast counts from the darkest pixel of the flanks, here about 3 sigma below the mean.
+    assert len(detect(image, options=StripeOptions(reach_share=0.15, min_contrast=18))) == 0
+
+
+@pytest.mark.parametrize("places", [(60.0, 80.3), (50.2, 70.6, 131.4), (40.0, 60.0, 80.5, 100.7)])
+def test_several_returns_on_one_line(places: Sequence[float]) -> None:
+    n = 24
+    light = np.sum([gaussian(np.full(n, place)) for place in places], axis=0)
+    found = detect(as_image(30.0 + light))
+    np.testing.assert_array_equal(found.line, np.repeat(np.arange(n), len(places)))
+    np.testing.assert_allclose(found.position.reshape(n, -1) - places, 0.0, atol=0.03)
+
+
+def test_two_peaks_part_where_the_valley_is_deep() -> None:
+    apart, merged = (
+        detect(as_image(30.0 + gaussian(np.full(9, 90.0)) + gaussian(np.full(9, 90.0 + gap))))
+        for gap in (10.0, 5.0)
+    )
+    # At 4 sigma the valley has 27 % of the peaks, at 2 sigma there is none.
+    np.testing.assert_allclose(apart.position.reshape(9, 2) - [90.0, 100.0], 0.0, atol=0.3)
+    np.testing.assert_allclose(merged.position, 92.5, atol=0.05)
+
+
+def test_a_weak_return_beside_a_strong_one_is_kept() -> None:
+    light = gaussian(np.full(9, 80.0), height=180.0) + gaussian(np.full(9, 110.0), height=25.0)
+    found = detect(as_image(30.0 + light))
+    np.testing.assert_allclose(found.position.reshape(9, 2) - [80.0, 110.0], 0.0, atol=0.2)
+
+
+@pytest.mark.parametrize("at", [96, 99, 101])
+@pytest.mark.parametrize("blur", [0.2, 2.0])
+def test_a_step_edge_is_no_return(at: int, blur: float) -> None:
+    edge = 20.0 + 180.0 / (1.0 + np.exp(-(np.arange(200)[:, None] - at) / blur))
+    image = as_image(np.repeat(edge, 80, axis=1))
+    assert len(detect(image)) == 0
+    assert len(detect(image[::-1].copy())) == 0
+
+
+def test_a_stripe_along_the_search_line_is_no_return() -> None:
+    image = as_image(30.0 + gaussian(np.full(200, 60.0), length=120).T)
+    assert len(detect(image)) == 0
+    assert len(detect(image, axis=ALONG_X)) == 200
+
+
+def test_what_is_wider_than_the_reach_is_no_return() -> None:
+    broad = as_image(30.0 + gaussian(np.full(160, 100.0), sigma=20.0))
+    assert len(detect(broad)) == 0
+
+
+@pytest.mark.parametrize("end", ["first", "last"])
+def test_near_a_border_a_stripe_is_found_as_long_as_both_flanks_show(end: str) -> None:
+    found = {}
+    for distance in (0, 2, 30):
+        at = distance if end == "first" else 199 - distance
+        found[distance] = detect(as_image(30.0 + gaussian(np.full(16, float(at)))))
+    assert len(found[0]) == 0
+    # Half height lies three pixels from the centre, beyond the border.
+    assert len(found[2]) == 0
+    np.testing.assert_allclose(found[30].position, 30.0 if end == "first" else 169.0, atol=0.01)
+
+
+@pytest.mark.parametrize("shape", [(97, 83), (90, 161), (101, 90), (89, 65)])
+@pytest.mark.parametrize("with_chroma", [False, True])
+def test_odd_sizes_and_both_directions(shape: tuple[int, int], with_chroma: bool) -> None:
+    height, width = shape
+    centres = 45.0 + 0.02 * np.arange(width)
+    image = as_image(30.0 + gaussian(centres, length=height))
+    chroma = green_chroma(image) if with_chroma else None
+    upright = detect(image, chroma)
+    np.testing.assert_array_equal(upright.line, np.arange(width))
+    np.testing.assert_allclose(upright.position, centres, atol=0.05)
+    turned = None if chroma is None else (chroma[0].T.copy(), chroma[1].T.copy())
+    # The reach is a share of the width, the longer side of one picture and the shorter of another.
+    same_reach = StripeOptions(reach_share=0.15 * width / height)
+    assert_same(detect(image.T.copy(), turned, axis=ALONG_X, options=same_reach), upright)
+
+
+def green_chroma(image: U8, fall: float = 60.0) -> Chroma:
+    """U falls where the picture is bright, as for green light."""
+    rows, columns = -(-image.shape[0] // 2), -(-image.shape[1] // 2)
+    padded = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2)), mode="edge")
+    mean = padded.reshape(rows, 2, columns, 2).mean(axis=(1, 3)) - 30.0
+    u = as_image(120.0 - fall * np.clip(mean / 120.0, 0.0, 1.0))
+    return u, np.full_like(u, 120)
+
+
+_HALF_A_CHROMA_PIXEL = pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="an odd number of chroma columns cannot be halved"
+)
+
+
+@pytest.mark.parametrize(
+    ("size", "with_chroma"),
+    [
+        ((1280, 720), False),
+        ((1366, 768), False),
+        ((1283, 727), False),
+        ((1280, 720), True),
+        ((1283, 727), True),
+        pytest.param((1366, 768), True, marks=_HALF_A_CHROMA_PIXEL),
+        pytest.param((1282, 722), True, marks=_HALF_A_CHROMA_PIXEL),
+    ],
+)
+def test_wide_pictures_of_any_size(size: tuple[int, int], with_chroma: bool) -> None:
+    width, height = size
+    rig = replace(bluerov2_rig(), size_px=size)
+    image = as_image(30.0 + gaussian(300.3 + 0.02 * np.arange(width), length=height))
+    chroma = green_chroma(image) if with_chroma else None
+    searches = [s for s in plan_searches(rig, rig.camera()) if s.axis is ALONG_Y]
+    assert len(searches) > 0
+    detector = FrameDetector(size, searches, StripeOptions())
+    found = detector.detect(Frame(0, 0.0, image, chroma))[ALONG_Y]
+    line_px = searches[0].line_px
+    assert len(found) == len(searches[0].lowest)
+    column = found.line * line_px + 0.5 * (line_px - 1)
+    np.testing.assert_allclose(found.position, 300.3 + 0.02 * column, atol=0.05)
+
+
+def test_white_glare_is_rejected_by_its_colour_and_green_light_is_not() -> None:
+    glare, laser = gaussian(np.full(160, 60.3)), gaussian(np.full(160, 120.7))
+    image = as_image(30.0 + glare + laser)
+    chroma = green_chroma(as_image(30.0 + laser))
+    assert len(detect(image)) == 320
+    found = detect(image, chroma)
+    np.testing.assert_array_equal(found.line, np.arange(160))
+    np.testing.assert_allclose(found.position, 120.7, atol=0.05)
+    # U is averaged over two rows; most of its fall of 60 must show.
+    assert np.all((found.green_fall > 40.0) & (found.green_fall <= 60.0))
+    assert len(detect(image, green_chroma(image, fall=0.0))) == 0
+
+
+def test_a_saturated_core_is_white_but_its_rim_is_green() -> None:
+    light = gaussian(np.full(160, 100.0), sigma=4.0, height=500.0)
+    image = as_image(30.0 + light)
+    u, v = green_chroma(image)
+    core = np.abs(2.0 * np.arange(100) + 0.5 - 100.0) < 5.0
+    u[core] = 120
+    found = detect(image, (u, v))
+    np.testing.assert_array_equal(found.line, np.arange(160))
+    np.testing.assert_allclose(found.position, 100.0, atol=0.05)
+
+
+def test_strange_memory_gives_the_same_returns() -> None:
+    rng = np.random.default_rng(8)
+    light = 40.0 + gaussian(90.0 + 0.1 * np.arange(101), length=181)
+    image = as_image(light + rng.normal(0.0, 2.0, light.shape))
+    chroma = green_chroma(image)
+    padded = np.full((181, 128), 77, np.uint8)
+    padded[:, :101] = image
+    luma = padded[:, :101]
+    interleaved = np.empty((91, 64, 2), np.uint8)
+    interleaved[:, :51, 0], interleaved[:, :51, 1] = chroma
+    u, v = interleaved[:, :51, 0], interleaved[:, :51, 1]
+    for plane in (luma, u, v):
+        plane.flags.writeable = False
+    for axis in SearchAxis:
+        strange = detector_for(image, axis).detect(Frame(0, 0.0, luma, (u, v)))[axis]
+        plain = detect(image, chroma, axis)
+        if axis is ALONG_Y:
+            assert len(plain) >= 101
+            assert_same(strange, plain)
+        else:
+            np.testing.assert_array_equal(strange.position, plain.position)
+    np.testing.assert_array_equal(luma, image)
+
+
+def test_returns_outlive_the_next_frame_and_frames_do_not_mix() -> None:
+    bright = as_image(30.0 + gaussian(np.full(80, 90.0)))
+    detector = detector_for(bright)
+    first = detector.detect(Frame(0, 0.0, bright))[ALONG_Y]
+    kept = first.position.copy()
+    other = as_image(30.0 + gaussian(np.full(80, 140.4)))
+    second = detector.detect(Frame(1, 0.0, other))[ALONG_Y]
+    np.testing.assert_array_equal(first.position, kept)
+    assert_same(second, detect(other))
+    assert len(detector.detect(Frame(2, 0.0, np.full_like(bright, 30)))[ALONG_Y]) == 0
+
+
+def test_only_the_band_is_searched_but_its_edge_cuts_no_stripe() -> None:
+    image = as_image(30.0 + sum(gaussian(np.full(80, at)) for at in (50.0, 100.0, 150.0)))
+    found = detect(image, band=(98, 160))
+    np.testing.assert_allclose(found.position.reshape(80, 2), [[100.0, 150.0]] * 80, atol=0.02)
+
+
+def test_more_than_may_be_kept_is_dropped_without_harm() -> None:
+    image = as_image(30.0 + gaussian(np.full(80, 50.0)) + gaussian(np.full(80, 100.0)))
+    found = detect(image, options=StripeOptions(reach_share=0.2, max_returns=100))
+    assert 0 < len(found) <= 100
+    near = np.minimum(np.abs(found.position - 50.0), np.abs(found.position - 100.0))
+    assert near.max() < 0.05
+
+
+@pytest.mark.xfail(strict=True, reason="a low foot is read as a second return at the stripe")
+def test_a_foot_beside_a_stripe_does_not_double_it() -> None:
+    profile = np.full(96, 20, np.uint8)
+    # 13 above the background, then 11: below the least contrast, so a run of its own.
+    profile[46:54] = [33, 31, 80, 140, 160, 140, 80, 20]
+    found = detect(np.repeat(profile[:, None], 80, axis=1))
+    stripe = found.height > 100.0
+    assert np.count_nonzero(stripe) == 80
+    assert np.all(found.position[~stripe] < 48.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    height=st.integers(1, 120),
+    width=st.integers(1, 90),
+    smooth=st.booleans(),
+    colour=st.booleans(),
+    min_contrast=st.sampled_from([1, 2, 12, 60]),
+)
+def test_any_picture_gives_orderly_returns(
+    seed: int, height: int, width: int, smooth: bool, colour: bool, min_contrast: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    light = rng.uniform(0.0, 255.0, (height, width))
+    if smooth:
+        light = light.cumsum(axis=0) % 256.0 * 0.3
+    image = as_image(light)
+    chroma = None
+    if colour:
+        half = (-(-height // 2), -(-width // 2))
+        u = rng.integers(90, 140, half, dtype=np.uint8)
+        chroma = u, u
+    options = StripeOptions(reach_share=0.2, min_contrast=min_contrast)
+    found = detect(image, chroma, options=options)
+    reach_px = max(8, round(0.2 * width))
+    assert np.all(np.diff(found.line) >= 0)
+    assert np.all((found.position >= 0.0) & (found.position <= height - 1))
+    assert np.all(found.height >= min_contrast)
+    assert np.all((found.width > 0.0) & (found.width <= reach_px))
+    assert np.all(np.isnan(found.green_fall) if not colour else found.green_fall >= 3.0)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (200, 0), (0, 160), (160, 200), (200, 161)])
+def test_a_frame_of_another_size_is_refused(shape: tuple[int, int]) -> None:
+    detector = detector_for(np.zeros((200, 160), np.uint8))
+    with pytest.raises(ValueError, match="frame is"):
+        detector.detect(Frame(0, 0.0, np.zeros(shape, np.uint8)))
+
+
+@pytest.mark.parametrize("value", [0, 255, -1])
+def test_an_impossible_contrast_is_refused(value: int) -> None:
+    with pytest.raises(OptionError, match=f"min_contrast is {value};"):
+        StripeOptions(min_contrast=value)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, -0.1, float("nan")])
+def test_an_impossible_reach_is_refused(value: float) -> None:
+    with pytest.raises(OptionError, match="reach_share is"):
+        StripeOptions(reach_share=value)

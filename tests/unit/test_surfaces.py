@@ -1,0 +1,288 @@
+"""Surfaces: which planes several lasers agree on, and which of them is the target."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+import pytest
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.readings import Readings, read_returns
+from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.triangulate import Triangulator
+from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+
+Lit: TypeAlias = Callable[[FloatArray], BoolArray]
+NOISE_PX = 0.15
+
+
+def plane(distance: float, pitch: float = 0.0, yaw: float = 0.0) -> Plane:
+    normal = np.array([np.tan(np.deg2rad(yaw)), 1.0, np.tan(np.deg2rad(pitch))])
+    return Plane(normal / np.linalg.norm(normal), distance)
+
+
+def everywhere(points: FloatArray) -> BoolArray:
+    return np.ones(len(points), np.bool_)
+
+
+def strands(points: FloatArray) -> BoolArray:
+    """6 mm of light every 30 mm, along whichever way the stripe runs."""
+    lit: BoolArray = (points[:, 0] + points[:, 2]) % 0.03 < 0.006
+    return lit
+
+
+def behind_strands(points: FloatArray) -> BoolArray:
+    """The wall behind: what a net lets through, its shadow grown by half."""
+    lit: BoolArray = (points[:, 0] + points[:, 2] + 0.002) % 0.04 > 0.012
+    return lit
+
+
+def right_half(points: FloatArray) -> BoolArray:
+    lit: BoolArray = points[:, 0] > 0.02
+    return lit
+
+
+def left_half(points: FloatArray) -> BoolArray:
+    return ~right_half(points)
+
+
+def lit_stripe(
+    rig: Rig, search: StripeSearch, laser: Plane, target: Plane, lit: Lit
+) -> tuple[IntArray, FloatArray]:
+    """Search lines and exact positions of one laser's stripe on a target, where it is lit."""
+    along = np.cross(laser.normal, target.normal)
+    along /= np.linalg.norm(along)
+    foot = np.linalg.solve(
+        np.array([laser.normal, target.normal, along]), [laser.offset, target.offset, 0.0]
+    )
+    points = foot + np.linspace(-0.8, 0.8, 8001)[:, None] * along
+    camera = rig.camera()
+    pixels, valid = camera.project(points)
+    seen = valid & camera.inside_image(pixels)
+    points, pixels = points[seen], pixels[seen]
+    across, position = (1, 0) if search.axis is SearchAxis.ALONG_X else (0, 1)
+    order = np.argsort(pixels[:, across])
+    points, pixels = points[order], pixels[order]
+    first, last = np.ceil(pixels[0, across]), np.floor(pixels[-1, across])
+    line = np.arange(first, last + 1.0)
+    at = np.searchsorted(pixels[:, across], line).clip(0, len(pixels) - 1)
+    shown = lit(points[at])
+    place = np.interp(line, pixels[:, across], pixels[:, position])
+    return line[shown].astype(np.int64), place[shown]
+
+
+def returns_of(
+    rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = 0.0
+) -> dict[SearchAxis, Returns]:
+    """Returns of every laser on every target, each in the search direction of its laser."""
+    rng = np.random.default_rng(7)
+    stripes: dict[SearchAxis, list[tuple[IntArray, FloatArray]]] = {}
+    for laser, search in zip(rig.lasers, plan_searches(rig, rig.camera()), strict=True):
+        for target, lit in targets:
+            stripe = lit_stripe(rig, search, laser.plane, target, lit)
+            stripes.setdefault(search.axis, []).append(stripe)
+    found = {}
+    for axis, parts in stripes.items():
+        line = np.concatenate([part[0] for part in parts])
+        position = np.concatenate([part[1] for part in parts])
+        position = position + rng.normal(0.0, noise_px, len(line))
+        order = np.lexsort((position, line))
+        n = len(line)
+        found[axis] = Returns(
+            line=line[order],
+            position=position[order],
+            height=np.full(n, 80.0),
+            width=np.full(n, 5.0),
+            green_fall=np.full(n, 20.0),
+        )
+    return found
+
+
+def surfaces_of(
+    rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = NOISE_PX
+) -> tuple[list[Surface], Readings, IntArray]:
+    camera = rig.camera()
+    readings = read_returns(
+        returns_of(rig, targets, noise_px), plan_searches(rig, camera), Triangulator(rig, camera)
+    )
+    chunks, index = readings.chunks()
+    found = find_surfaces(
+        chunks,
+        index,
+        readings.pixels,
+        len(rig.lasers),
+        rig.working_range,
+        max(rig.lens.fx, rig.lens.fy),
+    )
+    return found, readings, index
+
+
+def assert_near(found: Plane, expected: Plane, share: float = 0.01, deg: float = 1.5) -> None:
+    assert abs(found.offset / expected.offset - 1.0) < share
+    assert np.rad2deg(np.arccos(min(1.0, float(found.normal @ expected.normal)))) < deg
+
+
+def binned(make_rig: Callable[[], Rig]) -> Rig:
+    """Pixels of the returns are made for search lines one pixel wide."""
+    rig = make_rig()
+    return rig if rig.size_px[0] < 1280 else replace(rig, size_px=(1278, 1080))
+
+
+@pytest.mark.parametrize("make_rig", [example_rig, bluerov2_rig])
+@pytest.mark.parametrize(
+    "target", [plane(0.35), plane(0.6, 15.0, -20.0), plane(0.9, -10.0, 12.0)], ids=str
+)
+def test_a_wall_alone(make_rig: Callable[[], Rig], target: Plane) -> None:
+    rig = binned(make_rig)
+    found, readings, index = surfaces_of(rig, [(target, everywhere)])
+    assert len(found) >= 1
+    first = found[0]
+    assert_near(first.plane, target)
+    assert not first.is_mesh
+    assert first.plane.offset > 0.0
+    on_it = first.members[index]
+    right = np.abs(target.signed_distance(readings.points)) < 0.01 * target.offset
+    # Nearly all right readings belong to it, and hardly a wrong one.
+    assert np.mean(on_it[right]) > 0.95
+    assert np.mean(right[on_it]) > 0.97
+    assert choose(found, TargetKind.AUTO) is first
+    assert choose(found, TargetKind.SOLID) is first
+    assert choose(found, TargetKind.NET) is None
+
+
+@pytest.mark.parametrize("target", [plane(0.4), plane(0.55, -8.0, 14.0)], ids=str)
+def test_a_net_alone(target: Plane) -> None:
+    found, *_ = surfaces_of(example_rig(), [(target, strands)])
+    net = choose(found, TargetKind.NET)
+    assert net is not None
+    assert net.is_mesh
+    assert_near(net.plane, target)
+    assert choose(found, TargetKind.AUTO) is net
+
+
+@pytest.mark.parametrize("gap", [0.25, 0.4])
+def test_a_net_before_a_wall_is_the_target_though_the_wall_shows_more(gap: float) -> None:
+    net, wall = plane(0.45, 3.0, -6.0), plane(0.45 + gap, 0.0, 4.0)
+    found, *_ = surfaces_of(example_rig(), [(net, strands), (wall, behind_strands)])
+    target = choose(found, TargetKind.AUTO)
+    assert target is not None
+    assert_near(target.plane, net)
+    assert choose(found, TargetKind.NET) is target
+    solid = choose(found, TargetKind.SOLID)
+    assert solid is not None
+    assert_near(solid.plane, wall)
+    assert solid.n_lines > target.n_lines
+
+
+def test_two_faces_of_a_box_are_two_surfaces() -> None:
+    left, right = plane(0.45, 0.0, 25.0), plane(0.5, 0.0, -25.0)
+    found, *_ = surfaces_of(example_rig(), [(left, left_half), (right, right_half)])
+    yaws = [np.rad2deg(np.arctan2(s.plane.normal[0], s.plane.normal[1])) for s in found[:2]]
+    np.testing.assert_allclose(sorted(yaws), [-25.0, 25.0], atol=2.0)
+    # No light belongs to both.
+    assert not np.any(found[0].members & found[1].members)
+
+
+def test_the_same_readings_give_the_same_surfaces() -> None:
+    net, wall = plane(0.45, 3.0, -6.0), plane(0.8, 0.0, 4.0)
+    one, other = (
+        surfaces_of(example_rig(), [(net, strands), (wall, behind_strands)])[0] for _ in range(2)
+    )
+    assert len(one) == len(other) > 1
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.plane.normal, b.plane.normal)
+        assert a.plane.offset == b.plane.offset
+        np.testing.assert_array_equal(a.members, b.members)
+
+
+def test_one_laser_gives_no_surface() -> None:
+    rig = example_rig()
+    single = replace(rig, lasers=rig.lasers[:1])
+    found, readings, _ = surfaces_of(single, [(plane(0.5), everywhere)])
+    assert len(readings) > 300
+    assert found == []
+    assert choose(found, TargetKind.AUTO) is None
+
+
+def test_two_lasers_are_enough() -> None:
+    rig = example_rig()
+    target = plane(0.5, 6.0, -9.0)
+    pair = replace(rig, lasers=rig.lasers[:2])
+    found, *_ = surfaces_of(pair, [(target, everywhere)])
+    assert_near(found[0].plane, target)
+
+
+def test_nothing_gives_no_surface() -> None:
+    def nowhere(points: FloatArray) -> BoolArray:
+        return np.zeros(len(points), np.bool_)
+
+    found, readings, _ = surfaces_of(example_rig(), [(plane(0.5), nowhere)])
+    assert len(readings) == 0
+    assert found == []
+
+
+def test_scattered_light_gives_no_surface_worth_a_target() -> None:
+    """Marine snow: returns anywhere, as many as a wall's."""
+    rig = example_rig()
+    rng = np.random.default_rng(5)
+    returns = {}
+    for axis in SearchAxis:
+        length, n_lines = rig.size_px if axis is SearchAxis.ALONG_X else rig.size_px[::-1]
+        line = np.sort(rng.integers(0, n_lines, 300))
+        returns[axis] = Returns(
+            line=line,
+            position=rng.uniform(10.0, length - 10.0, 300),
+            height=np.full(300, 30.0),
+            width=np.full(300, 4.0),
+            green_fall=np.full(300, 10.0),
+        )
+    camera = rig.camera()
+    readings = read_returns(returns, plan_searches(rig, camera), Triangulator(rig, camera))
+    chunks, index = readings.chunks()
+    found = find_surfaces(chunks, index, readings.pixels, 3, rig.working_range, 850.0)
+    # Chance puts some specks on a plane, never a fifth of them.
+    assert all(surface.n_lines < 0.2 * len(readings) for surface in found)
+
+
+def choose(
+    found: Sequence[Surface], kind: TargetKind, working_range: tuple[float, float] = (0.3, 1.0)
+) -> Surface | None:
+    return choose_target(found, kind, working_range)
+
+
+def surface(offset: float, support: float, is_mesh: bool, extent: float = 300.0) -> Surface:
+    return Surface(
+        plane=plane(offset),
+        members=np.ones(4, np.bool_),
+        n_lines=int(support),
+        support=support,
+        extent=extent,
+        is_mesh=is_mesh,
+    )
+
+
+def test_which_of_several_is_the_target() -> None:
+    net, far_net = surface(0.5, 200, True), surface(0.9, 400, True)
+    wall, box = surface(0.9, 900, False), surface(0.4, 300, False)
+    assert choose([wall, box, net], TargetKind.AUTO) is net
+    assert choose([wall, box, net], TargetKind.SOLID) is wall
+    assert choose([far_net, net], TargetKind.AUTO) is net
+    assert choose([box, wall], TargetKind.AUTO) is wall
+    assert choose([box, wall], TargetKind.NET) is None
+    assert choose([net], TargetKind.SOLID) is None
+    # Left-overs that look like a mesh are no net.
+    crumbs = surface(0.3, 20, True)
+    assert choose([wall, crumbs], TargetKind.AUTO) is wall
+    # A small mesh before a wide one is not the net.
+    fish = surface(0.35, 150, True, extent=60.0)
+    assert choose([net, fish], TargetKind.AUTO) is net
+    assert choose([], TargetKind.AUTO) is None
+    # What lies outside the working range is only taken where there is nothing inside.
+    assert choose([wall, net], TargetKind.AUTO, (0.7, 1.0)) is wall
+    assert choose([wall, net], TargetKind.AUTO, (0.1, 0.2)) is net
