@@ -82,7 +82,7 @@ def test_a_dive_from_video_to_report(tmp_path, rig, capsys):
         assert float(row["n_water"]) == pytest.approx(1.3333)
     assert sorted(path.name for path in out.iterdir()) == [
         *("overlay.mp4", "points.parquet", "points.ply"),
-        *("posture.csv", "report.html", "run.yaml"),
+        *("posture.csv", "posture_bare.csv", "report.html", "run.yaml"),
     ]
 
 

@@ -171,25 +171,15 @@ def test_truth_gives_the_errors(dive: Dive, tmp_path: Path) -> None:
     assert len(data_of(page)["posture"]["strips"][0]["truth"]["x"]) == 40
 
 
-@pytest.mark.parametrize("where", ["csv", "run.yaml"])
-def test_bare_lens_is_compared(tmp_path: Path, where: str) -> None:
+def test_bare_lens_is_compared(tmp_path: Path) -> None:
     dive = make_dive(tmp_path / "run", video=False)
     frames = [i for i in range(40) if i not in dive.refused]
-    if where == "csv":
-        text = (dive.folder / "posture.csv").read_text().splitlines()
-        rows = [line.split(",") for line in text[1:]]
-        for row in rows:
-            row[4] = f"{0.8 * float(row[4]):.6f}" if row[4] else ""
-        lines = [text[0], *(",".join(row) for row in rows)]
-        (dive.folder / "posture_bare.csv").write_text("\n".join(lines) + "\n")
-    else:
-        bare = [
-            {"frame": i, "range_m": float(0.8 * dive.range_m[i]), "pitch_deg": 0.0, "yaw_deg": 0.0}
-            for i in frames
-        ]
-        run = yaml.safe_load((dive.folder / "run.yaml").read_text())
-        run["comparison"] = {"bare_lens": bare}
-        (dive.folder / "run.yaml").write_text(yaml.safe_dump(run))
+    text = (dive.folder / "posture.csv").read_text().splitlines()
+    rows = [line.split(",") for line in text[1:]]
+    for row in rows:
+        row[4] = f"{0.8 * float(row[4]):.6f}" if row[4] else ""
+    lines = [text[0], *(",".join(row) for row in rows)]
+    (dive.folder / "posture_bare.csv").write_text("\n".join(lines) + "\n")
     page = write_report(dive.folder, truth=write_truth(dive, 0.0)).read_text()
     words = " ".join(visible(page).split())
     assert "range without, relative to with −20.00 % −20.00 % −20.00 %" in words

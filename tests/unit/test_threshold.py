@@ -67,9 +67,7 @@ def test_every_run_of_any_picture_is_found_once(shape: tuple[int, int]) -> None:
     bright = np.pad(image >= 200, ((1, 1), (0, 0)))
     starts = bright[1:-1] & ~bright[:-2]
     found = detect(image, level=200)
-    np.testing.assert_array_equal(
-        np.bincount(found.line, minlength=shape[1]), starts.sum(axis=0)
-    )
+    np.testing.assert_array_equal(np.bincount(found.line, minlength=shape[1]), starts.sum(axis=0))
     assert found.width.sum() == np.count_nonzero(image >= 200)
 
 

@@ -37,9 +37,7 @@ def triangulate(
 
 @pytest.mark.parametrize("make_rig", RIGS)
 @pytest.mark.parametrize("bare", [False, True])
-def test_exact_projections_give_their_points_back(
-    make_rig: Callable[[], Rig], bare: bool
-) -> None:
+def test_exact_projections_give_their_points_back(make_rig: Callable[[], Rig], bare: bool) -> None:
     rig = make_rig()
     camera = rig.bare_camera() if bare else rig.camera()
     points, laser = random_sheet_points(rig, camera)

@@ -57,7 +57,10 @@ def run(
         bool, typer.Option("--overwrite", help="Replace a run that is there.")
     ] = False,
     target: Annotated[
-        Literal["auto", "net", "solid"], typer.Option(help="What the lasers hit.")
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."
+        ),
     ] = "auto",
     detector: Annotated[
         Literal["ridge", "threshold"],

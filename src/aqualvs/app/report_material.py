@@ -93,7 +93,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
         run=run,
         track=track,
         truth=None if truth is None else read_truth(truth, track),
-        bare=read_bare(run_dir, run, track),
+        bare=read_bare(run_dir, track),
         points=points,
         lasers=lasers,
         picture_rows=picture_rows,

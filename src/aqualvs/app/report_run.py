@@ -1,6 +1,5 @@
 """Read what a run left behind: `run.yaml`, `posture.csv`, truth and the bare-lens posture."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,8 @@ import pyarrow as pa
 import yaml
 from pyarrow import csv
 
+from aqualvs.app.outputs import POSTURE_BARE_CSV
+from aqualvs.app.truth import read_truth as truth_by_frame
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 
@@ -115,7 +116,7 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     Parameters
     ----------
     path : Path
-        CSV with columns `frame`, `range_mm` or `range_m`, `pitch_deg`, `yaw_deg`.
+        As `aqualvs.app.truth.read_truth` takes it.
     track : Track
 
     Returns
@@ -128,40 +129,27 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     SourceError
         If the file cannot be read or shares no frame with the track.
     """
-    columns = _read_columns(path, ("frame", "range_mm", *POSTURE), ())
-    range_m = columns["range_m"]
-    range_m = np.where(np.isfinite(range_m), range_m, columns["range_mm"] / 1e3)
-    values = np.stack([range_m, columns["pitch_deg"], columns["yaw_deg"]], axis=-1)
-    truth = _onto(track.frame, columns["frame"], values)
+    rows = truth_by_frame(path)
+    values = np.array([*rows.values()], dtype=np.float64).reshape(-1, 3)
+    truth = _onto(track.frame, np.array([*rows], dtype=np.float64), values)
     if not np.isfinite(truth).any():
         raise SourceError(f"{path}: no frame in common with the run; give the truth of this dive")
     return truth
 
 
-def read_bare(run_dir: Path, run: Mapping[str, Any], track: Track) -> FloatArray | None:
+def read_bare(run_dir: Path, track: Track) -> FloatArray | None:
     """Return the posture that a bare-lens camera gives on the same pixels, if the run has it.
-
-    Taken from `posture_bare.csv`, else from `comparison: bare_lens:` in `run.yaml`, a list of rows
-    with the same columns.
 
     Returns
     -------
     posture : array, shape (N, 3), or None
         As `Track.posture`, on the frames of `track`.
     """
-    path = run_dir / "posture_bare.csv"
-    if path.is_file():
-        bare = read_track(path)
-        return _onto(track.frame, bare.frame.astype(np.float64), bare.posture)
-    comparison = run.get("comparison")
-    rows = comparison.get("bare_lens") if isinstance(comparison, dict) else None
-    if not isinstance(rows, list):
+    path = run_dir / POSTURE_BARE_CSV
+    if not path.is_file():
         return None
-    numbers = [_row(row) for row in rows if isinstance(row, dict)]
-    if not numbers:
-        return None
-    table = np.array(numbers, dtype=np.float64)
-    return _onto(track.frame, table[:, 0], table[:, 1:])
+    bare = read_track(path)
+    return _onto(track.frame, bare.frame.astype(np.float64), bare.posture)
 
 
 def number(value: object) -> float:
@@ -169,10 +157,6 @@ def number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return float("nan")
     return float(value) if np.isfinite(value) else float("nan")
-
-
-def _row(row: Mapping[str, Any]) -> list[float]:
-    return [number(row.get("frame")), *(number(row.get(name)) for name in POSTURE)]
 
 
 def _onto(frames: IntArray, from_frames: FloatArray, values: FloatArray) -> FloatArray:

@@ -4,16 +4,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.target_file import target_facts
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.sources import FrameSource
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.measure import FitMethod
-from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.pipeline import ScannerOptions
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions
 
 _INDEX_LIMITS = (1.0, 1.5)
@@ -94,15 +93,17 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
 
     Parameters
     ----------
-    target : {"auto", "net", "solid"}
+    target : str
+        "auto", "net", "solid" or the path of a target file, see `target_file`.
     detector : {"ridge", "threshold"}
     mesh_filter : {"none", "paper"}
     fit : {"robust", "pseudo_inverse"}
     """
+    facts = target_facts(target)
     return ScannerOptions(
-        target=TargetKind(target),
+        target=facts.kind,
         detector=ThresholdOptions() if detector == "threshold" else StripeOptions(),
-        mesh_filter=MeshFilterOptions() if mesh_filter == "paper" else None,
+        mesh_filter=facts.mesh_filter if mesh_filter == "paper" else None,
         fit=FitMethod(fit),
     )
 

@@ -11,6 +11,7 @@ from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray
 
 _RANGE_UNITS = {"range_m": 1.0, "range_mm": 1e-3}
+_LIT_PLANE = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +63,7 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     posture_csv : Path
         As a run writes it.
     truth_csv : Path
-        Columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`; others are ignored, and
-        so are rows without a finite value in all four.
+        As `read_truth` takes it.
 
     Raises
     ------
@@ -96,7 +96,10 @@ def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
     Parameters
     ----------
     path : Path
-        As `compare_with_truth` takes it.
+        Columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`. Where a row has
+        `visible_fit_range_mm`, `visible_fit_pitch_deg` and `visible_fit_yaw_deg` as well, these
+        count: the plane through what the lasers light. Light falls on the front of a net's twine,
+        a radius before the net's own plane. Other columns are ignored.
 
     Raises
     ------
@@ -108,9 +111,15 @@ def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
     unit = _RANGE_UNITS[range_column]
     found = {}
     for row in rows:
-        values = [_number(row[name]) for name in ("frame", range_column, "pitch_deg", "yaw_deg")]
-        if all(map(math.isfinite, values)):
-            found[int(values[0])] = (values[1] * unit, values[2], values[3])
+        frame = _number(row["frame"])
+        lit = [_number(row.get(name)) for name in _LIT_PLANE]
+        values = [_number(row[name]) for name in (range_column, "pitch_deg", "yaw_deg")]
+        if all(map(math.isfinite, lit)):
+            values, scale = lit, _RANGE_UNITS["range_mm"]
+        else:
+            scale = unit
+        if all(map(math.isfinite, [frame, *values])):
+            found[int(frame)] = (values[0] * scale, values[1], values[2])
     return found
 
 

@@ -28,16 +28,20 @@ class FrameSource(Protocol):
     """
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def name(self) -> str:
+        """How messages call it."""
 
     @property
-    def size_px(self) -> tuple[int, int]: ...  # noqa: D102
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
 
     @property
-    def fps(self) -> float | None: ...  # noqa: D102
+    def fps(self) -> float | None:
+        """Nominal frame rate, if there is one."""
 
     @property
-    def n_frames(self) -> int | None: ...  # noqa: D102
+    def n_frames(self) -> int | None:
+        """Promised frames, if known."""
 
     def __iter__(self) -> Iterator[Frame]: ...
 

@@ -1,0 +1,51 @@
+"""The target as a word or a file."""
+
+from pathlib import Path
+
+import pytest
+
+from aqualvs.app.target_file import target_facts
+from aqualvs.errors import OptionError
+from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.scanning.target import TargetKind
+
+
+@pytest.mark.parametrize("kind", list(TargetKind))
+def test_words(kind: TargetKind) -> None:
+    facts = target_facts(kind.value)
+    assert facts.kind is kind
+    assert facts.mesh_filter == MeshFilterOptions()
+
+
+def test_file(tmp_path: Path) -> None:
+    path = tmp_path / "net.yaml"
+    path.write_text("kind: net\nmesh_filter: {rd_theta_mm: 8, r_max_mm: 40}\n")
+    facts = target_facts(str(path))
+    assert facts.kind is TargetKind.NET
+    assert facts.mesh_filter == MeshFilterOptions(rd_theta=8e-3, r_max=40e-3)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("kind: fish", "kind is 'fish'; use one of auto, net, solid"),
+        ("type: net", "unknown key type; known are kind, mesh_filter"),
+        ("kind: net\nmesh_filter: {rd_mm: 3}", "unknown key mesh_filter.rd_mm"),
+        ("kind: net\nmesh_filter: {dd_mm: wide}", "mesh_filter.dd_mm is 'wide'"),
+        ("kind: net\nmesh_filter: {dd_mm: -1}", "dd is -1 mm"),
+        ("- net", "holds no keys"),
+        ("kind: [", "cannot be read as YAML"),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, content: str, words: str) -> None:
+    path = tmp_path / "net.yaml"
+    path.write_text(content)
+    with pytest.raises(OptionError, match=str(path)) as caught:
+        target_facts(str(path))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_neither_word_nor_file() -> None:
+    with pytest.raises(OptionError, match="neither a file nor one of auto, net, solid"):
+        target_facts("nets")
