@@ -60,7 +60,6 @@ def _measure(folder: Path, name: str, scanner: Scanner) -> Dive:
     )
 
 
-
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 

@@ -127,9 +127,7 @@ def all_pixels(returns: dict[SearchAxis, Returns]) -> FloatArray:
 
 def times_seen(points: ScanPoints) -> IntArray:
     """How often each of the points' pixels is among them."""
-    _, inverse, counts = np.unique(
-        points.pixels, axis=0, return_inverse=True, return_counts=True
-    )
+    _, inverse, counts = np.unique(points.pixels, axis=0, return_inverse=True, return_counts=True)
     times: IntArray = counts[inverse.ravel()]
     return times
 
@@ -178,9 +176,7 @@ def test_what_the_posture_left_out_of_its_target_is_ambiguous() -> None:
     target = found.surfaces[0]
     on_it = target.members[found.index]
     left_out = on_it & (found.readings.pixels[:, 1] < 200.0)
-    points = label_readings(
-        found.readings, found.index, found.surfaces, target, on_it & ~left_out
-    )
+    points = label_readings(found.readings, found.index, found.surfaces, target, on_it & ~left_out)
     assert np.count_nonzero(left_out) > 50
     ambiguous = points.label == Label.AMBIGUOUS
     assert np.count_nonzero(ambiguous) >= np.count_nonzero(left_out)
@@ -188,7 +184,7 @@ def test_what_the_posture_left_out_of_its_target_is_ambiguous() -> None:
 
 
 def test_light_that_nothing_explains_is_clutter_or_ambiguous() -> None:
-    found = label([(WALL, everywhere)], None)
+    found = label([(NET, strands), (WALL, behind_strands)], None)
     points = label_readings(
         found.readings,
         found.index,

@@ -9,6 +9,7 @@ from aqualvs.scanning.posture import (
     Posture,
     Reason,
     Refusal,
+    believable,
     posture_from_fit,
     range_pitch_yaw,
 )
@@ -34,9 +35,7 @@ def answer(
     working_range: tuple[float, float] = (0.3, 1.0),
 ) -> Posture | Refusal:
     fit = PlaneFit(m, covariance, np.ones(3), rms)
-    return posture_from_fit(
-        fit, POINTS, camera_axis_in_dome=axis, working_range=working_range
-    )
+    return believable(posture_from_fit(fit, POINTS, axis), working_range)
 
 
 @pytest.mark.parametrize(("pitch", "yaw"), [(0.0, 0.0), (12.0, -25.0), (-30.0, 7.0), (1e-6, 40.0)])

@@ -12,7 +12,7 @@ from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 
 Lit: TypeAlias = Callable[[FloatArray], BoolArray]
 WALL = Plane(np.array([0.0, 1.0, 0.0]), 0.5)
@@ -109,6 +109,26 @@ def test_pixels_are_the_projections_of_the_points() -> None:
     np.testing.assert_allclose(pixels, readings.pixels, rtol=0.0, atol=1e-6)
 
 
+def test_a_return_lies_in_the_middle_of_a_search_line_two_pixels_wide() -> None:
+    rig = bluerov2_rig()
+    searches = plan_searches(rig, rig.camera())
+    assert {search.line_px for search in searches} == {2}
+    line = np.arange(200, 240)
+    plain = {
+        axis: Returns(line, np.full(40, 640.25), *(np.full(40, 50.0) for _ in range(3)))
+        for axis in SearchAxis
+    }
+    readings = read(rig, plain)
+    upright = np.isin(readings.laser, [i for i, s in enumerate(searches) if s.axis.value == "x"])
+    assert upright.any()
+    assert (~upright).any()
+    for mine, across, along in ((upright, 1, 0), (~upright, 0, 1)):
+        np.testing.assert_array_equal(
+            readings.pixels[mine, across], 2.0 * readings.line[mine] + 0.5
+        )
+        np.testing.assert_array_equal(readings.pixels[mine, along], 640.25)
+
+
 def test_sources_tell_returns_of_both_searches_apart() -> None:
     rig = example_rig()
     returns = returns_of(rig, [(WALL, everywhere)])
@@ -134,9 +154,7 @@ def test_sigma_grows_with_width_over_height() -> None:
     rig = example_rig()
     plain = returns_of(rig, [(WALL, everywhere)])
     faint = {
-        axis: Returns(
-            found.line, found.position, found.height / 4.0, found.width, found.green_fall
-        )
+        axis: Returns(found.line, found.position, found.height / 4.0, found.width, found.green_fall)
         for axis, found in plain.items()
     }
     one, other = read(rig, plain), read(rig, faint)

@@ -52,9 +52,7 @@ def across_and_line(search: StripeSearch, pixels: FloatArray) -> tuple[FloatArra
 
 def in_band(search: StripeSearch, position: FloatArray, line: FloatArray) -> BoolArray:
     nearest: IntArray = np.rint(line).astype(np.int64).clip(0, len(search.lowest) - 1)
-    inside: BoolArray = (position >= search.lowest[nearest]) & (
-        position <= search.highest[nearest]
-    )
+    inside: BoolArray = (position >= search.lowest[nearest]) & (position <= search.highest[nearest])
     return inside
 
 

@@ -42,9 +42,7 @@ def returns_at(*stripes: tuple[IntArray, FloatArray]) -> Returns:
     )
 
 
-def straight(
-    first: int, last: int, at: float, slope: float = 0.0
-) -> tuple[IntArray, FloatArray]:
+def straight(first: int, last: int, at: float, slope: float = 0.0) -> tuple[IntArray, FloatArray]:
     line = np.arange(first, last + 1)
     return line, at + slope * (line - first)
 
@@ -74,6 +72,8 @@ def test_a_missing_line_does_not_part_a_stripe_and_a_wide_gap_does(slope: float)
     found = link_segments(returns_at((line[one_missing], position[one_missing])), search_for())
     assert len(found.order) == 99
     assert len(np.unique(found.stretch)) == 1
+    # One segment of 99 in even pieces, not two of 50 and 49.
+    assert len(np.unique(found.chunk)) == -(-99 // CHUNK_LINES)
     wide = (line < 55) | (line > 75)
     found = link_segments(returns_at((line[wide], position[wide])), search_for())
     assert members(found, found.stretch) == [set(range(45)), set(range(45, 79))]

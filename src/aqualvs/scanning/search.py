@@ -46,7 +46,7 @@ class StripeSearch:
     axis : SearchAxis
         Direction of the search lines.
     line_px : int
-        Pixels across one search line, which is the mean of so many pixel rows or columns.
+        Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels.
     lowest, highest : int array, shape (n_lines,)
         First and last position of the band on each search line; lowest > highest where the laser
         cannot be seen.

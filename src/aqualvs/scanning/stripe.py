@@ -9,6 +9,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.contrast import ContrastWorkspace, U8Array, local_contrast
 from aqualvs.scanning.runs import cells_in_band, cells_near_green, find_runs, sort_by_line
+from aqualvs.scanning.view import SearchView
 
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
@@ -81,33 +82,6 @@ class Returns:
     def __len__(self) -> int:
         """Return the number of returns."""
         return len(self.line)
-
-
-@dataclass(frozen=True, slots=True)
-class SearchView:
-    """A frame as one search direction sees it, both ways round.
-
-    What looks at many lines at once runs along the rows of `luma`, what follows one line along
-    the rows of `lines`: each along memory.
-
-    Attributes
-    ----------
-    luma : uint8 array, shape (length, n_lines)
-        Search lines are columns.
-    lines : uint8 array, shape (n_lines, length)
-        Its transpose: search lines are rows.
-    u, u_lines : uint8 array or None
-        U chroma of half the size, likewise; None for a grey source.
-    """
-
-    luma: U8Array
-    lines: U8Array
-    u: U8Array | None
-    u_lines: U8Array | None
-
-    def turned(self) -> "SearchView":
-        """Return the view of the other search direction."""
-        return SearchView(self.lines, self.luma, self.u_lines, self.u)
 
 
 class StripeDetector:

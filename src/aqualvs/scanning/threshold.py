@@ -9,7 +9,8 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.contrast import U8Array
 from aqualvs.scanning.runs import cells_in_band, find_runs, sort_by_line
-from aqualvs.scanning.stripe import Returns, SearchView
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.view import SearchView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
