@@ -8,17 +8,20 @@ are held in memory, so that decoding does not count. On the wall the reference m
 scanner before anything is reported; on the net it measures something, right or wrong.
 """
 
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from aqualvs.app.pictures import bgr_of
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.live.sources import open_source
 from aqualvs.optics.camera import DomeCamera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.detection import FrameDetector
@@ -35,6 +38,7 @@ from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.video import VideoWriter
 
 U8 = NDArray[np.uint8]
 # An area drawn by hand reaches this far to either side of the stripe, as a share of the width.
@@ -58,8 +62,8 @@ class Case:
 def make_case(rig: Rig, scenario: str) -> Case:
     scene = load_scenario(scenario).scene_at(1.0)
     picture = Renderer(rig, threads=2).render(scene, 1.0, np.random.default_rng(0))
-    bgr: U8 = cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR)
-    frame = Frame(0, 0.0, *planes_of_image(bgr))
+    frame = decoded(picture.image, rig.size_px)
+    bgr = bgr_of(frame)
     searches = plan_searches(rig, rig.camera())
     pixels = [picture.lit.pixels[picture.lit.laser == i] for i in range(len(rig.lasers))]
     return Case(
@@ -69,6 +73,20 @@ def make_case(rig: Rig, scenario: str) -> Case:
         [drawn_area(rig, pixels, i) for i in range(len(pixels))],
         [search.axis is SearchAxis.ALONG_X for search in searches],
     )
+
+
+def decoded(image: U8, size_px: tuple[int, int]) -> Frame:
+    """The picture as a decoder delivers it: through H.264, on planes of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "dive.mp4"
+        with VideoWriter(path, size_px, 25.0) as video:
+            for _ in range(3):
+                video.write(image)
+        with open_source(str(path)) as source:
+            frame = list(source)[-1]
+    assert frame.chroma is not None
+    u, v = frame.chroma
+    return Frame(0, 0.0, np.array(frame.luma), (np.array(u), np.array(v)))
 
 
 def drawn_area(rig: Rig, pixels: list[FloatArray], mine: int) -> BoolArray:

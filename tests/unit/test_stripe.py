@@ -333,7 +333,6 @@ def test_an_impossible_share_is_refused(value: float) -> None:
         StripeOptions(min_share=value)
 
 
-@pytest.mark.xfail(strict=True, reason="a low foot is read as a second return at the stripe")
 def test_a_foot_beside_a_stripe_does_not_double_it() -> None:
     profile = np.full(96, 20, np.uint8)
     # 13 above the background, then 11: below the least contrast, so a run of its own.

@@ -12,10 +12,7 @@ _LIT = "visible_fit_range_mm,visible_fit_pitch_deg,visible_fit_yaw_deg"
 def test_the_lit_plane_counts_where_it_is_known(tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
     path.write_text(
-        f"frame,range_mm,pitch_deg,yaw_deg,{_LIT}\n"
-        "0,500,1,2,499,1.5,2.5\n"
-        "1,600,3,4,,,\n"
-        "2,,3,4,,,\n"
+        f"frame,range_mm,pitch_deg,yaw_deg,{_LIT}\n0,500,1,2,499,1.5,2.5\n1,600,3,4,,,\n2,,3,4,,,\n"
     )
     truth = read_truth(path)
     assert truth[0] == pytest.approx((0.499, 1.5, 2.5))

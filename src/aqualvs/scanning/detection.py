@@ -62,8 +62,10 @@ class FrameDetector:
         Raises
         ------
         ValueError
-            If the frame has another size.
+            If the frame has another size, or is not of 8 bits.
         """
+        if frame.luma.dtype != np.uint8:
+            raise ValueError(f"frame holds {frame.luma.dtype} but expected uint8")
         height, width = frame.luma.shape
         if (width, height) != self._size_px:
             raise ValueError(f"frame is {width} x {height} but the rig's image is {self._size_px}")

@@ -17,7 +17,7 @@ from aqualvs.scanning.plane_fit import (
     fit_robust,
 )
 from aqualvs.scanning.posture import Posture, Reason, Refusal, believable, posture_from_fit
-from aqualvs.scanning.readings import Readings
+from aqualvs.scanning.readings import Observations, Readings
 from aqualvs.scanning.search import StripeSearch
 from aqualvs.scanning.surfaces import Surface
 
@@ -29,6 +29,8 @@ _CROSSING_WIDTHS = 1.2
 _CROSSING_PX = 2.0
 # The light on a strand covers this many search lines; less is a fragment, off the strand's middle.
 _SHORTEST_STRAND = 3
+# Independent pieces of stripe that the second best laser must show.
+_MIN_PIECES = 3
 
 
 class FitMethod(StrEnum):
@@ -107,9 +109,13 @@ class PostureMeter:
         if n_readings < MIN_LINES:
             detail = f"only {n_readings} stripe points outside crossings"
             return _nothing(readings, Refusal(Reason.TOO_FEW_POINTS, detail))
-        fit = self._fit(readings, group, n_groups, target)
+        observed = readings.observations(group, n_groups, target.plane.normal)
+        fit = self._fit(readings, group, observed, target)
         if fit is None:
             return _nothing(readings, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
+        if not _held_by_two_lasers(observed.laser[fit.weights > 0.0]):
+            detail = "all lasers but one show too little of the target"
+            return _nothing(readings, Refusal(Reason.ONE_LASER, detail))
         rests_on = (group >= 0) & (fit.weights[group] > 0.0)
         measured = posture_from_fit(fit, readings.points[rests_on], self._axis_in_dome)
         posture = believable(measured, self._working_range)
@@ -118,9 +124,8 @@ class PostureMeter:
         return Measurement(posture, rests_on)
 
     def _fit(
-        self, readings: Readings, group: IntArray, n_groups: int, target: Surface
+        self, readings: Readings, group: IntArray, seen: Observations, target: Surface
     ) -> PlaneFit | None:
-        seen = readings.observations(group, n_groups, target.plane.normal)
         start = target.plane.normal / target.plane.offset
         robust = fit_robust(
             seen.points,
@@ -133,7 +138,16 @@ class PostureMeter:
         )
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
-        return fit_pseudo_inverse(readings.points[group >= 0], n_groups, robust.covariance)
+        return fit_pseudo_inverse(readings.points[group >= 0], len(seen.laser), robust.covariance)
+
+
+def _held_by_two_lasers(laser: IntArray) -> bool:
+    """Whether a second laser fixes the plane's turn about the first one's stripe.
+
+    A line and one point always share a plane: a single piece would not show that it is wrong.
+    """
+    pieces = np.sort(np.bincount(laser, minlength=2))
+    return bool(pieces[-2] >= _MIN_PIECES)
 
 
 def _nothing(readings: Readings, refusal: Refusal) -> Measurement:

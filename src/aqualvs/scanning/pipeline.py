@@ -13,9 +13,9 @@ from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.scanning.search import plan_searches
+from aqualvs.scanning.search import plan_searches, searched_range
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.surfaces import MIN_LINES_PER_LASER, Surface, find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -95,7 +95,7 @@ class Scanner:
             chunk_index,
             readings.pixels,
             len(self.rig.lasers),
-            self._search_range(),
+            searched_range(self.rig.working_range),
             self.rig.focal_px,
         )
         target = choose_target(surfaces, self.options.target, self.rig.working_range)
@@ -106,11 +106,6 @@ class Scanner:
             found = self._meter.measure(readings, chunk_index, target)
         points = label_readings(readings, chunk_index, surfaces, target, found.rests_on)
         return Scan(frame.index, frame.time_s, found.posture, points, self.rig.n_water)
-
-    def _search_range(self) -> tuple[float, float]:
-        """Wider than the working range, so that a target beyond it is named as such."""
-        near, far = self.rig.working_range
-        return 0.8 * near, 1.2 * far
 
     def _filtered(self, readings: Readings) -> Readings:
         if self.options.mesh_filter is None or not len(readings):
@@ -133,12 +128,17 @@ def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) 
 
 
 def _why_no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Refusal:
-    if not len(readings):
+    returns, reading, readings_of = np.unique(
+        readings.source, return_index=True, return_counts=True
+    )
+    if not len(returns):
         return Refusal(Reason.NO_STRIPES, "no laser stripe in the picture")
     if surfaces:
         return Refusal(Reason.NO_TARGET, f"surfaces in view, but none of kind {wanted.value}")
-    if len(readings) < MIN_LINES:
-        return Refusal(Reason.TOO_FEW_POINTS, f"only {len(readings)} stripe points")
-    if len(np.unique(readings.laser)) < 2:
+    if len(returns) < MIN_LINES:
+        return Refusal(Reason.TOO_FEW_POINTS, f"only {len(returns)} stripe points")
+    # Lasers that a good many returns can only belong to.
+    own = np.bincount(readings.laser[reading[readings_of == 1]])
+    if np.count_nonzero(own >= MIN_LINES_PER_LASER) == 1:
         return Refusal(Reason.ONE_LASER, "stripes of one laser only")
-    return Refusal(Reason.NOT_A_PLANE, f"{len(readings)} stripe points share no plane")
+    return Refusal(Reason.NOT_A_PLANE, f"{len(returns)} stripe points share no plane")

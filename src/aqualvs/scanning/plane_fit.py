@@ -99,7 +99,7 @@ def fit_robust(
         different points should be independent: take centroids of chunks rather than single
         returns, which share the errors of their neighbours.
     sigma_px : array, shape (N,)
-        Standard deviation of the stripe's position, up to a common factor.
+        Least standard deviation of the stripe's position; greater scatter is recognised.
     laser : int array, shape (N,)
         Index of the laser.
     along : array, shape (N,)
@@ -121,7 +121,7 @@ def fit_robust(
     weights = np.empty(len(points))
     modes = np.array([shared.shift_px, shared.tilt_px])
     rms = _fit(points, sensitivity, sigma_px, laser, along, modes, m, covariance, weights)
-    if not np.isfinite(rms):
+    if not (np.isfinite(rms) and np.isfinite(covariance).all()):
         return None
     return PlaneFit(m, covariance, weights, rms)
 

@@ -20,6 +20,8 @@ X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 N_ROWS = 7
 
 _MAX_HYPOTHESES = 6000
+# Chunks looked at in all: a frame full of noise must not hold up a live run.
+_MAX_WORK = 10_000_000
 # A neighbour for sampling lies at most this many chunks away in the same laser's list.
 _NEIGHBOURHOOD = 8
 # Normals farther than this from the vehicle's forward axis are not a target in front of it.
@@ -161,7 +163,7 @@ def search_plane(
     laser_start : int array, shape (n_lasers + 1,)
         First chunk of each laser, and C.
     nearest, farthest : float
-        Planes beyond are not considered, in metres.
+        Hypotheses beyond are not considered, in metres.
     seed : int
         The same seed and chunks give the same plane.
     best_plane : array, shape (4,)
@@ -173,7 +175,8 @@ def search_plane(
     best = 0.0
     best_rough = 0.0
     voice_up_to = np.cumsum(table[WEIGHT])
-    needed = _MAX_HYPOTHESES
+    most = min(_MAX_HYPOTHESES, _MAX_WORK // n)
+    needed = most
     trial = 0
     while trial < needed:
         trial += 1
@@ -205,7 +208,7 @@ def search_plane(
         # s^2 / 5: of neighbours half fit, and a third of the draws are of one laser. Five times the
         # expected number of trials leaves one search in 150 short of it.
         share = min(best / voice_up_to[n - 1], 1.0)
-        needed = min(_MAX_HYPOTHESES, int(25.0 / (share * share)) + 20)
+        needed = min(most, int(25.0 / (share * share)) + 20)
     for _ in range(3):
         if best > 0.0:
             _refine(table, best_plane, 1.0, normal, scratch)

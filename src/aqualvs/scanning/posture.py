@@ -130,6 +130,13 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
     near, far = working_range
     distance = posture.range
     sigma_range, sigma_pitch, sigma_yaw = np.sqrt(np.diag(posture.covariance))
+    worst = max(sigma_pitch, sigma_yaw)
+    if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
+        return Refusal(
+            Reason.COLLINEAR,
+            f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
+            f"{np.rad2deg(worst):.1f} deg",
+        )
     if not (1.0 - _RANGE_TOLERANCE) * near <= distance <= (1.0 + _RANGE_TOLERANCE) * far:
         return Refusal(
             Reason.OUT_OF_RANGE,
@@ -138,13 +145,6 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
     if posture.rms > _MAX_RMS_SHARE * distance:
         return Refusal(
             Reason.NOT_A_PLANE, f"points are {1e3 * posture.rms:.1f} mm rms off the best plane"
-        )
-    worst = max(sigma_pitch, sigma_yaw)
-    if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
-        return Refusal(
-            Reason.COLLINEAR,
-            f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
-            f"{np.rad2deg(worst):.1f} deg",
         )
     return posture
 

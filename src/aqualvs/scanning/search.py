@@ -68,6 +68,12 @@ class StripeSearch:
         return bool(np.any(self.lowest <= self.highest))
 
 
+def searched_range(working_range: tuple[float, float]) -> tuple[float, float]:
+    """Widen the working range, so that a target beyond it is seen, and named as such."""
+    near, far = working_range
+    return 0.8 * near, 1.2 * far
+
+
 def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
     """Work out the search of each of the rig's lasers.
 
@@ -110,13 +116,13 @@ def _points_on_grid(
     camera: Camera,
     steps: tuple[int, int],
 ) -> tuple[FloatArray, BoolArray]:
-    """Points on the sheet that a grid of pixels sees, and whether they lie in the working range."""
+    """Points on the sheet that a grid of pixels sees, and whether they are to be looked for."""
     width, height = camera.size_px
     x = np.arange(0, width + steps[0], steps[0], dtype=np.float64)
     y = np.arange(0, height + steps[1], steps[1], dtype=np.float64)
     points, valid = plane.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
     distance = np.linalg.norm(points, axis=-1)
-    near, far = working_range
+    near, far = searched_range(working_range)
     # A plane at range d has no point nearer than d, so the near bound is exact.
     with np.errstate(invalid="ignore"):
         in_band = valid & (distance >= near) & (distance <= far * _OFF_AXIS_STRETCH)

@@ -215,7 +215,8 @@ def _half_height_centroid(
 ) -> tuple[float, float, bool]:
     """Centroid and width of what stands above half `height` at `peak`, searched in [low, high].
 
-    False when the profile does not fall to that level inside the interval.
+    False when the profile does not fall to that level inside the interval, or rises above the peak
+    before it does: then this is the foot of another stripe.
     """
     # Twice the grey levels keep half a level a whole number.
     level = 2 * np.int64(lines[x, peak]) - height
@@ -226,6 +227,8 @@ def _half_height_centroid(
         excess = 2 * np.int64(lines[x, a]) - level
         if excess <= 0:
             break
+        if excess > height:
+            return 0.0, 0.0, False
         total += excess
         moment += excess * (a - peak)
         a -= 1
@@ -234,6 +237,8 @@ def _half_height_centroid(
         excess = 2 * np.int64(lines[x, b]) - level
         if excess <= 0:
             break
+        if excess > height:
+            return 0.0, 0.0, False
         total += excess
         moment += excess * (b - peak)
         b += 1

@@ -88,7 +88,7 @@ def find_surfaces(
     n_lasers : int
         Lasers of the rig.
     working_range : (float, float)
-        Planes nearer or farther are not believed, in metres.
+        Hypotheses nearer or farther are not considered, in metres.
     focal_px : float
         Pixels per radian, roughly: turns search lines into lengths on the surface.
 
