@@ -189,7 +189,7 @@ def read_returns(
             along_x = search.axis is SearchAxis.ALONG_X
             n = _append(i, along_x, found, segments, search.line_px, n, numbers, measures, pixels)
     source, laser, line, stretch, chunk, along = numbers[:, :n]
-    located = triangulator.triangulate(pixels[:n], along, laser)
+    located = triangulator.triangulate(pixels[:n], along, laser, chunk)
     readings = Readings(
         source,
         laser,

@@ -52,7 +52,13 @@ class Triangulator:
             [[*laser.plane.normal, laser.plane.offset] for laser in rig.lasers]
         ).reshape(-1, 4)
 
-    def triangulate(self, pixels: FloatArray, along_x: IntArray, laser: IntArray) -> Triangulation:
+    def triangulate(
+        self,
+        pixels: FloatArray,
+        along_x: IntArray,
+        laser: IntArray,
+        group: IntArray | None = None,
+    ) -> Triangulation:
         """Triangulate pixels (N, 2), each with the laser whose index is given.
 
         Parameters
@@ -63,35 +69,55 @@ class Triangulator:
             1 where the position was measured along x, 0 where along y.
         laser : int array, shape (N,)
             Index into the rig's lasers.
+        group : int array, shape (N,), optional
+            Neighbours with equal numbers, which stand together, share the sensitivity of the first
+            of them; over a few pixels of one stripe it hardly changes.
         """
         n = len(pixels)
-        pairs = np.empty((2 * n, 2))
-        _pair_pixels(pixels, along_x, pairs)
-        origins, directions = np.empty((2 * n, 3)), np.empty((2 * n, 3))
-        seen = np.empty(2 * n, np.bool_)
-        self._camera.rays_into(pairs, origins, directions, seen)
+        rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
+        n_rays = _place_rays(
+            pixels, along_x, np.arange(n) if group is None else group, rays_px, owner
+        )
+        origins, directions = np.empty((n_rays, 3)), np.empty((n_rays, 3))
+        seen = np.empty(n_rays, np.bool_)
+        self._camera.rays_into(rays_px[:n_rays], origins, directions, seen)
         points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
         _intersect_sheets(
-            self._planes, laser, origins, directions, seen, points, sensitivity, valid
+            self._planes, laser, owner, origins, directions, seen, points, sensitivity, valid
         )
         return Triangulation(points, sensitivity, valid)
 
 
 @kernel
-def _pair_pixels(pixels: FloatArray, along_x: IntArray, pairs: FloatArray) -> None:
-    """Write the pixels, and after them the same pixels moved along the search line."""
+def _place_rays(
+    pixels: FloatArray,
+    along_x: IntArray,
+    group: IntArray,
+    rays_px: FloatArray,
+    owner: IntArray,
+) -> int:
+    """Write the pixels, and after them the first of each group moved along the search line.
+
+    `owner` gets the row of the moved pixel whose ray tells a pixel's sensitivity.
+    """
     n = pixels.shape[0]
+    n_rays = n
     for i in range(n):
-        pairs[i, 0] = pixels[i, 0]
-        pairs[i, 1] = pixels[i, 1]
-        pairs[n + i, 0] = pixels[i, 0] + (_DIFFERENCE_PX if along_x[i] else 0.0)
-        pairs[n + i, 1] = pixels[i, 1] + (0.0 if along_x[i] else _DIFFERENCE_PX)
+        rays_px[i, 0] = pixels[i, 0]
+        rays_px[i, 1] = pixels[i, 1]
+        if i == 0 or group[i] != group[i - 1]:
+            rays_px[n_rays, 0] = pixels[i, 0] + (_DIFFERENCE_PX if along_x[i] else 0.0)
+            rays_px[n_rays, 1] = pixels[i, 1] + (0.0 if along_x[i] else _DIFFERENCE_PX)
+            n_rays += 1
+        owner[i] = n_rays - 1
+    return int(n_rays)
 
 
 @kernel
 def _intersect_sheets(
     planes: FloatArray,
     laser: IntArray,
+    owner: IntArray,
     origins: FloatArray,
     directions: FloatArray,
     seen: BoolArray,
@@ -99,20 +125,26 @@ def _intersect_sheets(
     sensitivity: FloatArray,
     valid: BoolArray,
 ) -> None:
-    """Intersect pairs of rays (i, n + i) with n·X = d (Eq. 20)."""
-    n = points.shape[0]
-    for i in range(n):
+    """Intersect the rays with n·X = d (Eq. 20); the first of a group has a moved ray as well."""
+    slope = np.full(3, np.nan)
+    for i in range(points.shape[0]):
         nx, ny, nz, offset = planes[laser[i]]
-        j = n + i
         reach = _distance_to_sheet(origins[i], directions[i], nx, ny, nz, offset)
-        moved = _distance_to_sheet(origins[j], directions[j], nx, ny, nz, offset)
-        hit = seen[i] and seen[j] and 0.0 < reach < np.inf and 0.0 < moved < np.inf
-        valid[i] = hit
+        hit = seen[i] and 0.0 < reach < np.inf
         for k in range(3):
-            point = origins[i, k] + reach * directions[i, k]
-            other = origins[j, k] + moved * directions[j, k]
-            points[i, k] = point if hit else np.nan
-            sensitivity[i, k] = (other - point) / _DIFFERENCE_PX if hit else np.nan
+            points[i, k] = origins[i, k] + reach * directions[i, k] if hit else np.nan
+        j = owner[i]
+        if i == 0 or j != owner[i - 1]:
+            moved = _distance_to_sheet(origins[j], directions[j], nx, ny, nz, offset)
+            known = hit and seen[j] and 0.0 < moved < np.inf
+            for k in range(3):
+                other = origins[j, k] + moved * directions[j, k]
+                slope[k] = (other - points[i, k]) / _DIFFERENCE_PX if known else np.nan
+        valid[i] = hit and slope[0] == slope[0]
+        for k in range(3):
+            sensitivity[i, k] = slope[k]
+            if not valid[i]:
+                points[i, k] = np.nan
 
 
 @inline_kernel
