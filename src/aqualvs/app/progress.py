@@ -18,6 +18,9 @@ from rich.text import Text
 
 Tick: TypeAlias = Callable[[int], None]
 
+# Until the first frame is done; compiled code is kept for the next run.
+_FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
+
 
 class _Rate(ProgressColumn):
     """Frames per second."""
@@ -54,5 +57,9 @@ def progress(label: str, n_frames: int | None) -> Iterator[Tick]:
         disable=not console.is_terminal,
     )
     with bar:
-        task = bar.add_task(label, total=n_frames)
-        yield lambda n_done: bar.advance(task, n_done)
+        task = bar.add_task(f"{label} {_FIRST_RUN}", total=n_frames)
+
+        def tick(n_done: int) -> None:
+            bar.update(task, advance=n_done, description=label)
+
+        yield tick

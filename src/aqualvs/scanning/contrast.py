@@ -1,4 +1,4 @@
-"""Local contrast along search lines: how far a pixel stands above the background on both sides.
+"""Background along search lines: what a pixel must stand above on both sides.
 
 The search image is `(length, lines)`: a search line is a column, so that every inner loop runs
 along memory over many lines at once and becomes vector instructions.
@@ -19,8 +19,8 @@ BLOCK = 8
 U8Array = NDArray[np.uint8]
 
 
-class ContrastWorkspace:
-    """Buffers of `local_contrast` for one image size, allocated once.
+class BackgroundWorkspace:
+    """Buffers of `flank_background` for one image size, allocated once.
 
     Parameters
     ----------
@@ -31,86 +31,64 @@ class ContrastWorkspace:
     """
 
     def __init__(self, length: int, n_lines: int, reach_px: int) -> None:
-        self.n_blocks = -(-reach_px // BLOCK)
-        n_rows = -(-length // BLOCK) + 2 * self.n_blocks + 1
+        self.n_reach = -(-reach_px // BLOCK)
+        n_blocks = -(-length // BLOCK)
         # Rows beyond the image stay at 255: next to a border nothing can stand out, because one
         # of its flanks is not visible.
-        self.minima: U8Array = np.full((n_rows, n_lines), 255, np.uint8)
-        self.flanks: U8Array = np.empty((2, n_lines), np.uint8)
-        # Eight spare columns keep whole 8-byte words readable at the end of a row.
-        self.contrast: U8Array = np.zeros((length, -(-n_lines // 8) * 8), np.uint8)
+        self.minima: U8Array = np.full((n_blocks + 2 * self.n_reach + 1, n_lines), 255, np.uint8)
+        self.background: U8Array = np.empty((n_blocks, n_lines), np.uint8)
+        self.after: U8Array = np.empty(n_lines, np.uint8)
 
 
-def local_contrast(
-    search_image: U8Array, workspace: ContrastWorkspace, min_contrast: int
-) -> U8Array:
-    """Return the contrast of every pixel, zero below `min_contrast`.
+def flank_background(search_image: U8Array, workspace: BackgroundWorkspace) -> U8Array:
+    """Return the background of every block: the lighter of the minima on both sides.
 
     Parameters
     ----------
     search_image : uint8 array, shape (length, n_lines)
         Unit step along the second axis.
-    workspace : ContrastWorkspace
+    workspace : BackgroundWorkspace
         Made for this shape.
-    min_contrast : int
-        Grey levels.
 
     Returns
     -------
-    uint8 array, shape (length, n_lines rounded up to a multiple of 8)
+    uint8 array, shape (ceil(length / BLOCK), n_lines)
         A view of the workspace: overwritten by the next call.
     """
-    _local_contrast(
-        search_image,
-        workspace.n_blocks,
-        np.uint8(min_contrast),
-        workspace.contrast,
-        workspace.minima,
-        workspace.flanks,
+    _flank_background(
+        search_image, workspace.n_reach, workspace.minima, workspace.background, workspace.after
     )
-    return workspace.contrast
+    return workspace.background
 
 
 @kernel
-def _local_contrast(
-    image: U8Array,
-    n_blocks: int,
-    threshold: np.uint8,
-    contrast: U8Array,
-    minima: U8Array,
-    flanks: U8Array,
+def _flank_background(
+    image: U8Array, n_reach: int, minima: U8Array, background: U8Array, after: U8Array
 ) -> None:
     length, n_lines = image.shape
-    n_rows = (length + BLOCK - 1) // BLOCK
-    for b in range(n_rows):
+    n_blocks = background.shape[0]
+    for b in range(n_blocks):
         start = b * BLOCK
         for x in range(n_lines):
-            minima[n_blocks + b, x] = image[start, x]
+            minima[n_reach + b, x] = image[start, x]
         for i in range(1, min(BLOCK, length - start)):
             for x in range(n_lines):
-                low = minima[n_blocks + b, x]
+                low = minima[n_reach + b, x]
                 value = image[start + i, x]
-                minima[n_blocks + b, x] = low if low < value else value
-    for b in range(n_rows):
+                minima[n_reach + b, x] = low if low < value else value
+    for b in range(n_blocks):
         for x in range(n_lines):
-            flanks[0, x] = minima[b, x]
-            flanks[1, x] = minima[b + n_blocks + 1, x]
-        for i in range(1, n_blocks):
+            background[b, x] = minima[b, x]
+            after[x] = minima[b + n_reach + 1, x]
+        for i in range(1, n_reach):
             for x in range(n_lines):
-                low = flanks[0, x]
+                low = background[b, x]
                 value = minima[b + i, x]
-                flanks[0, x] = low if low < value else value
-                low = flanks[1, x]
-                value = minima[b + n_blocks + 1 + i, x]
-                flanks[1, x] = low if low < value else value
+                background[b, x] = low if low < value else value
+                low = after[x]
+                value = minima[b + n_reach + 1 + i, x]
+                after[x] = low if low < value else value
         for x in range(n_lines):
-            before = flanks[0, x]
-            after = flanks[1, x]
-            flanks[0, x] = before if before > after else after
-        start = b * BLOCK
-        for v in range(start, min(start + BLOCK, length)):
-            for x in range(n_lines):
-                value = image[v, x]
-                background = flanks[0, x]
-                height = np.uint8(value - background) if value > background else np.uint8(0)
-                contrast[v, x] = height if height >= threshold else np.uint8(0)
+            low = background[b, x]
+            high = after[x]
+            background[b, x] = low if low > high else high

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.scanning.contrast import BLOCK
+from aqualvs.scanning.contrast import BLOCK, U8Array
 
-_LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
 _HIGH_BITS = np.uint64(0x8080808080808080)
-_FIRST_BIT = np.uint64(0x80)
+_ONE = np.uint64(1)
 
 
 def cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray:
@@ -28,50 +27,72 @@ def cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray
 
 
 @kernel
-def cells_near_green(
-    in_band: BoolArray, green: NDArray[np.uint32], any_green: NDArray[np.uint32], cells: BoolArray
-) -> None:
+def mark_green(image: U8Array, background: U8Array, least: np.uint8, green: U8Array) -> None:
+    """Mark, for every `BLOCK` / 2 rows, the columns in which something stands above the background.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (length, n_lines)
+        Chroma at half the size of luma, inverted so that green is high.
+    background : uint8 array, shape (ceil(length / BLOCK), n_lines)
+        Of the image.
+    least : uint8
+        Least contrast.
+    green : uint8 array, shape (n_blocks of luma, at least n_lines)
+        Written up to column n_lines: not zero where marked.
+    """
+    length, n_lines = image.shape
+    for b in range(green.shape[0]):
+        for x in range(n_lines):
+            green[b, x] = np.uint8(0)
+        for v in range(b * BLOCK // 2, min((b + 1) * BLOCK // 2, length)):
+            row = v // BLOCK
+            for x in range(n_lines):
+                value, floor = image[v, x], background[row, x]
+                height = np.uint8(value - floor) if value > floor else np.uint8(0)
+                green[b, x] |= np.uint8(255) if height >= least else np.uint8(0)
+
+
+@kernel
+def cells_near_green(in_band: BoolArray, green: NDArray[np.uint32], cells: BoolArray) -> None:
     """Keep the cells with green in them or in the block before or after (a white core)."""
     n_blocks, n_words = in_band.shape
-    rows = BLOCK // 2
-    for b in range(n_blocks):
-        for w in range(n_words):
-            any_green[b, w] = green[rows * b, w]
-        for v in range(rows * b + 1, min(rows * (b + 1), green.shape[0])):
-            for w in range(n_words):
-                any_green[b, w] |= green[v, w]
     for b in range(n_blocks):
         before, after = max(b - 1, 0), min(b + 1, n_blocks - 1)
         for w in range(n_words):
-            near = any_green[before, w] | any_green[b, w] | any_green[after, w]
+            near = green[before, w] | green[b, w] | green[after, w]
             cells[b, w] = in_band[b, w] and near != 0
-
-
-@inline_kernel
-def _lit_bytes(word: np.uint64) -> np.uint64:
-    """Set the highest bit of every byte that is not zero, and no other bit."""
-    return ((word & _LOW_BITS) + _LOW_BITS | word) & _HIGH_BITS
 
 
 @kernel
 def find_runs(
+    image: U8Array,
+    background: U8Array,
+    least: np.uint8,
     cells: BoolArray,
-    words: NDArray[np.uint64],
     lowest: IntArray,
     highest: IntArray,
+    marks: U8Array,
+    words: NDArray[np.uint64],
     open_start: IntArray,
     runs: IntArray,
 ) -> int:
-    """Collect runs (line, first, last) of marked pixels along the lines; 8 lines a look.
+    """Collect runs (line, first, last) of pixels above the background; 8 lines a look.
 
     Parameters
     ----------
+    image : uint8 array, shape (length, n_lines)
+        Search lines are columns.
+    background : uint8 array, shape (n_blocks, n_lines)
+        Of the image.
+    least : uint8
+        Least contrast.
     cells : bool array, shape (n_blocks, n_words)
         Where to look.
-    words : uint64 array, shape (length, n_words)
-        The marked image, zero where a pixel is not marked; 8 lines a word.
     lowest, highest : int array, shape (n_lines,)
         Runs that lie wholly outside are left out.
+    marks, words : uint8 array, shape (BLOCK + 1, 8 * n_words), and its view as 64-bit words
+        Scratch, zero beyond n_lines. Holds one block, so that it stays in the nearest cache.
     open_start : int array, shape (8 * n_words,)
         Scratch.
     runs : int array, shape (capacity, 3)
@@ -82,36 +103,63 @@ def find_runs(
     int
         Number of runs written.
     """
-    length, n_words = words.shape
+    length, n_lines = image.shape
+    n_blocks, n_words = cells.shape
     nothing = np.uint64(0)
     n = 0
-    for b in range(cells.shape[0]):
-        first_row, last_row = b * BLOCK, min((b + 1) * BLOCK, length) - 1
+    for w in range(n_words):
+        words[BLOCK, w] = nothing
+    for b in range(n_blocks):
+        first_row = b * BLOCK
+        n_rows = min(BLOCK, length - first_row)
+        for r in range(n_rows):
+            for x in range(n_lines):
+                value, floor = image[first_row + r, x], background[b, x]
+                height = np.uint8(value - floor) if value > floor else np.uint8(0)
+                marks[r, x] = np.uint8(255) if height >= least else np.uint8(0)
         for w in range(n_words):
+            before = words[BLOCK, w]
             if not cells[b, w]:
+                if before != nothing:
+                    n = _close_runs(before, w, first_row - 1, lowest, highest, open_start, runs, n)
+                    words[BLOCK, w] = nothing
                 continue
-            goes_on_before = b > 0 and cells[b - 1, w]
-            goes_on_after = last_row + 1 < length and cells[b + 1, w]
-            before = _lit_bytes(words[first_row - 1, w]) if goes_on_before else nothing
-            here = _lit_bytes(words[first_row, w])
-            for v in range(first_row, last_row + 1):
-                after = nothing
-                if v < last_row or goes_on_after:
-                    after = _lit_bytes(words[v + 1, w])
-                starts, ends = here & ~before, here & ~after
-                before, here = here, after
-                if starts | ends == nothing:
-                    continue
-                for k in range(8):
-                    bit = _FIRST_BIT << np.uint64(8 * k)
-                    x = 8 * w + k
-                    if starts & bit != nothing:
-                        open_start[x] = v
-                    if ends & bit == nothing or open_start[x] > highest[x] or v < lowest[x]:
-                        continue
-                    if n < runs.shape[0]:
-                        runs[n, 0], runs[n, 1], runs[n, 2] = x, open_start[x], v
-                        n += 1
+            for r in range(n_rows):
+                here = words[r, w] & _HIGH_BITS
+                starts, ends = here & ~before, before & ~here
+                before = here
+                if starts != nothing:
+                    for k in range(8):
+                        if starts >> np.uint64(8 * k + 7) & _ONE != nothing:
+                            open_start[8 * w + k] = first_row + r
+                if ends != nothing:
+                    last = first_row + r - 1
+                    n = _close_runs(ends, w, last, lowest, highest, open_start, runs, n)
+            words[BLOCK, w] = before
+    for w in range(n_words):
+        n = _close_runs(words[BLOCK, w], w, length - 1, lowest, highest, open_start, runs, n)
+    return n
+
+
+@inline_kernel
+def _close_runs(
+    ends: np.uint64,
+    w: int,
+    last: int,
+    lowest: IntArray,
+    highest: IntArray,
+    open_start: IntArray,
+    runs: IntArray,
+    n: int,
+) -> int:
+    """Append the runs whose bytes are set and that reach their line's interval; the new count."""
+    for k in range(8):
+        if ends >> np.uint64(8 * k + 7) & _ONE == np.uint64(0):
+            continue
+        x = 8 * w + k
+        if open_start[x] <= highest[x] and last >= lowest[x] and n < runs.shape[0]:
+            runs[n, 0], runs[n, 1], runs[n, 2] = x, open_start[x], last
+            n += 1
     return n
 
 

@@ -7,8 +7,14 @@ import numpy as np
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.scanning.contrast import ContrastWorkspace, U8Array, local_contrast
-from aqualvs.scanning.runs import cells_in_band, cells_near_green, find_runs, sort_by_line
+from aqualvs.scanning.contrast import BLOCK, BackgroundWorkspace, U8Array, flank_background
+from aqualvs.scanning.runs import (
+    cells_in_band,
+    cells_near_green,
+    find_runs,
+    mark_green,
+    sort_by_line,
+)
 from aqualvs.scanning.view import SearchView
 
 # A valley below this many tenths of the lower of two peaks separates two returns.
@@ -116,14 +122,16 @@ class StripeDetector:
         self._options = options
         self._lowest, self._highest = lowest, highest
         self._reach_px = reach_px
-        self._workspace = ContrastWorkspace(length, n_lines, reach_px)
+        self._workspace = BackgroundWorkspace(length, n_lines, reach_px)
         half_length, half_lines = -(-length // 2), -(-n_lines // 2)
-        self._chroma_workspace = ContrastWorkspace(half_length, half_lines, -(-reach_px // 2))
+        self._u_workspace = BackgroundWorkspace(half_length, half_lines, -(-reach_px // 2))
         self._inverted_u: U8Array = np.empty((half_length, half_lines), np.uint8)
         self._in_band = cells_in_band(length, lowest, highest)
         self._cells = np.empty_like(self._in_band)
-        self._any_green = np.empty(self._in_band.shape, np.uint32)
-        self._open_start = np.empty(-(-n_lines // 8) * 8, np.int64)
+        n_blocks, n_words = self._in_band.shape
+        self._green: U8Array = np.zeros((n_blocks, 4 * n_words), np.uint8)
+        self._marks: U8Array = np.zeros((BLOCK + 1, 8 * n_words), np.uint8)
+        self._open_start = np.empty(8 * n_words, np.int64)
         self._runs = np.empty((options.max_returns, 3), np.int64)
         self._sorted = np.empty_like(self._runs)
         self._line_start = np.empty(n_lines + 1, np.int64)
@@ -138,15 +146,19 @@ class StripeDetector:
         found : Returns
             Copies: they stay valid after the next call.
         """
+        background = flank_background(view.luma, self._workspace)
         cells = self._cells_of_interest(view.u)
         min_contrast = self._options.min_contrast
         while True:
-            contrast = local_contrast(view.luma, self._workspace, min_contrast)
             n_runs = find_runs(
+                view.luma,
+                background,
+                np.uint8(min_contrast),
                 cells,
-                contrast.view(np.uint64),
                 self._lowest,
                 self._highest,
+                self._marks,
+                self._marks.view(np.uint64),
                 self._open_start,
                 self._runs,
             )
@@ -157,7 +169,7 @@ class StripeDetector:
         sort_by_line(self._runs[:n_runs], self._line_start, self._sorted)
         n = _measure_runs(
             view.lines,
-            contrast,
+            background,
             view.u_lines if view.u_lines is not None else _NO_CHROMA,
             self._sorted[:n_runs],
             self._reach_px,
@@ -174,9 +186,10 @@ class StripeDetector:
         if u_plane is None:
             return self._in_band
         np.subtract(255, u_plane, out=self._inverted_u)
-        threshold = max(1, int(self._options.min_green_fall))
-        green = local_contrast(self._inverted_u, self._chroma_workspace, threshold)
-        cells_near_green(self._in_band, green.view(np.uint32), self._any_green, self._cells)
+        background = flank_background(self._inverted_u, self._u_workspace)
+        least = np.uint8(max(1, int(self._options.min_green_fall)))
+        mark_green(self._inverted_u, background, least, self._green)
+        cells_near_green(self._in_band, self._green.view(np.uint32), self._cells)
         return self._cells
 
 
@@ -271,7 +284,7 @@ def _green_fall(u_lines: U8Array, x: int, peak: int, width: float) -> float:
 @kernel
 def _measure_runs(
     lines: U8Array,
-    contrast: U8Array,
+    background: U8Array,
     u_lines: U8Array,
     runs: IntArray,
     reach_px: int,
@@ -285,12 +298,12 @@ def _measure_runs(
     for i in range(runs.shape[0]):
         x, start, last = runs[i, 0], runs[i, 1], runs[i, 2]
         first = max(start - reach_px, 0)
-        base = np.int64(lines[x, start]) - np.int64(contrast[start, x])
+        base = np.int64(background[start // BLOCK, x])
         while start <= last and n < line.shape[0]:
             peak, end = _next_peak(lines, x, start, last, base)
             # Beyond the run the profile may still be falling towards half height.
             bound = min(last + reach_px, length - 1) if end > last else end
-            height = np.int64(contrast[peak, x])
+            height = np.int64(lines[x, peak]) - np.int64(background[peak // BLOCK, x])
             centre, width, found = _half_height_centroid(lines, x, peak, first, bound, height)
             first = end
             start = end

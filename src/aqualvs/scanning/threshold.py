@@ -7,7 +7,7 @@ import numpy as np
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.contrast import U8Array
+from aqualvs.scanning.contrast import BLOCK, U8Array
 from aqualvs.scanning.runs import cells_in_band, find_runs, sort_by_line
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.view import SearchView
@@ -61,20 +61,26 @@ class ThresholdDetector:
         self._options = options
         self._lowest, self._highest = lowest, highest
         self._cells = cells_in_band(length, lowest, highest)
-        self._bright: U8Array = np.zeros((length, -(-n_lines // 8) * 8), np.uint8)
-        self._open_start = np.empty(-(-n_lines // 8) * 8, np.int64)
+        # One grey level below the threshold everywhere: what stands above it by one is bright.
+        self._background: U8Array = np.full(
+            (len(self._cells), n_lines), options.level - 1, np.uint8
+        )
+        self._marks: U8Array = np.zeros((BLOCK + 1, 8 * self._cells.shape[1]), np.uint8)
+        self._open_start = np.empty(8 * self._cells.shape[1], np.int64)
         self._runs = np.empty((options.max_returns, 3), np.int64)
         self._line_start = np.empty(n_lines + 1, np.int64)
 
     def detect(self, view: SearchView) -> Returns:
         """Find the returns of one frame; colour is not looked at."""
-        n_lines = view.luma.shape[1]
-        np.greater_equal(view.luma, self._options.level, out=self._bright[:, :n_lines])
         n = find_runs(
+            view.luma,
+            self._background,
+            np.uint8(1),
             self._cells,
-            self._bright.view(np.uint64),
             self._lowest,
             self._highest,
+            self._marks,
+            self._marks.view(np.uint64),
             self._open_start,
             self._runs,
         )
