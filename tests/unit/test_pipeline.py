@@ -255,8 +255,9 @@ def test_stripes_side_by_side_far_away_do_not_fix_a_plane() -> None:
         lasers=(0, 1),
         noise=3.0,
     )
-    # Which of the two is found first depends on how many strands the fit believes.
-    assert reason(found.posture) in {Reason.COLLINEAR, Reason.ONE_LASER}
+    # What is noticed first depends on which strands are taken for which laser's.
+    reasons = {Reason.COLLINEAR, Reason.ONE_LASER, Reason.OUT_OF_RANGE}
+    assert reason(found.posture) in reasons
 
 
 def test_a_wall_where_a_net_was_asked_for() -> None:
