@@ -14,21 +14,35 @@ _FAST_BUT_NAN_SAFE = {"contract", "reassoc", "nsz", "arcp"}
 
 def kernel(function: F) -> F:
     """Compile a batch kernel; the machine code is cached on disk for the next process."""
-    compiled = numba.njit(cache=True, error_model="numpy", fastmath=_FAST_BUT_NAN_SAFE, nogil=True)(
-        function
-    )
-    _depend_on_callees(compiled, function)
-    return cast(F, compiled)
+    return _compiled(function)
 
 
 def inline_kernel(function: F) -> F:
     """Compile a scalar function that batch kernels call; always inlined by LLVM."""
+    return _compiled(function, forceinline=True)
+
+
+def borrowing_kernel(function: F) -> F:
+    """Compile a batch kernel that only borrows its arrays and creates none.
+
+    Counting references to arrays at every call of a small function, or for every row that is
+    looked at, can take longer than the work itself. Compilation fails where an array is created.
+    """
+    return _compiled(function, _nrt=False)
+
+
+def inline_borrowing_kernel(function: F) -> F:
+    """Compile a scalar function that borrowing kernels call; always inlined by LLVM."""
+    return _compiled(function, forceinline=True, _nrt=False)
+
+
+def _compiled(function: F, **options: bool) -> F:
     compiled = numba.njit(
         cache=True,
         error_model="numpy",
         fastmath=_FAST_BUT_NAN_SAFE,
         nogil=True,
-        forceinline=True,
+        **options,
     )(function)
     _depend_on_callees(compiled, function)
     return cast(F, compiled)

@@ -11,7 +11,7 @@ runs along the search line has none either.
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel
 
 BLOCK = 8
 """Pixels per background block."""
@@ -61,7 +61,7 @@ def flank_background(search_image: U8Array, workspace: BackgroundWorkspace) -> U
     return workspace.background
 
 
-@kernel
+@borrowing_kernel
 def _flank_background(
     image: U8Array, n_reach: int, minima: U8Array, background: U8Array, after: U8Array
 ) -> None:

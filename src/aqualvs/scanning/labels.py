@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.readings import Readings
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.surfaces import Surface, in_lit_cell, lit_cells
@@ -112,7 +112,7 @@ def _scan_points(readings: Readings, label: NDArray[np.uint8], rows: IntArray) -
     return found
 
 
-@kernel
+@borrowing_kernel
 def _copy_numbers(
     rows: IntArray,
     laser: IntArray,
@@ -129,7 +129,7 @@ def _copy_numbers(
         out_width[k] = width[i]
 
 
-@kernel
+@borrowing_kernel
 def _copy_places(
     rows: IntArray,
     pixels: FloatArray,

@@ -1,5 +1,6 @@
 """Posture relative to a plane target: range, pitch, yaw and how far to trust them."""
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -7,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.scanning.plane_fit import PlaneFit
 
 # Beyond these a posture tells nothing that a pilot could use.
@@ -129,7 +130,8 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
     """
     near, far = working_range
     distance = posture.range
-    sigma_range, sigma_pitch, sigma_yaw = np.sqrt(np.diag(posture.covariance))
+    variance = posture.covariance
+    sigma_range, sigma_pitch, sigma_yaw = (math.sqrt(variance[i, i]) for i in range(3))
     worst = max(sigma_pitch, sigma_yaw)
     if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
         return Refusal(
@@ -151,27 +153,25 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
 
 def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
     """Range (m), pitch and yaw (rad) of the plane m·X = 1 (paper, Eq. 25-26 as arctangents)."""
-    return (
-        float(1.0 / np.linalg.norm(m)),
-        float(np.arctan2(m[2], m[1])),
-        float(np.arctan2(m[0], m[1])),
-    )
+    x, y, z = m.tolist()
+    return 1.0 / math.hypot(x, y, z), math.atan2(z, y), math.atan2(x, y)
 
 
 def _range_pitch_yaw_jacobian(m: FloatArray) -> FloatArray:
     """Return the derivative (3, 3) of (range, pitch, yaw) by m."""
-    x, y, z = m
+    x, y, z = m.tolist()
     yz, xy = y * y + z * z, x * x + y * y
+    cube = -(math.hypot(x, y, z) ** 3)
     return np.array(
         [
-            -m / float(np.linalg.norm(m)) ** 3,
+            [x / cube, y / cube, z / cube],
             [0.0, -z / yz, y / yz],
             [y / xy, -x / xy, 0.0],
         ]
     )
 
 
-@kernel
+@borrowing_kernel
 def _nearest(points: FloatArray) -> float:
     """Return the smallest distance of points (N, 3) from the origin."""
     square = np.inf

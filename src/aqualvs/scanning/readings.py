@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import Segments, link_segments
@@ -237,7 +237,7 @@ def _append(
     return n + len(segments.order)
 
 
-@kernel
+@borrowing_kernel
 def _gather(
     laser: int,
     along_x: bool,
@@ -277,7 +277,7 @@ def _gather(
         pixels[i, along] = position[r]
 
 
-@kernel
+@borrowing_kernel
 def _number_chunks(chunk: IntArray, index: IntArray) -> int:
     """Renumber ascending chunks without gaps, and count them."""
     n = 0

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.scanning.contrast import BLOCK, U8Array
 
 _HIGH_BITS = np.uint64(0x8080808080808080)
@@ -26,7 +26,7 @@ def cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray
     return cells
 
 
-@kernel
+@borrowing_kernel
 def mark_green(image: U8Array, background: U8Array, least: np.uint8, green: U8Array) -> None:
     """Mark, for every `BLOCK` / 2 rows, the columns in which something stands above the background.
 
@@ -53,7 +53,7 @@ def mark_green(image: U8Array, background: U8Array, least: np.uint8, green: U8Ar
                 green[b, x] |= np.uint8(255) if height >= least else np.uint8(0)
 
 
-@kernel
+@borrowing_kernel
 def cells_near_green(in_band: BoolArray, green: NDArray[np.uint32], cells: BoolArray) -> None:
     """Keep the cells with green in them or in the block before or after (a white core)."""
     n_blocks, n_words = in_band.shape
@@ -64,7 +64,7 @@ def cells_near_green(in_band: BoolArray, green: NDArray[np.uint32], cells: BoolA
             cells[b, w] = in_band[b, w] and near != 0
 
 
-@kernel
+@borrowing_kernel
 def find_runs(
     image: U8Array,
     background: U8Array,
@@ -141,7 +141,7 @@ def find_runs(
     return n
 
 
-@inline_kernel
+@inline_borrowing_kernel
 def _close_runs(
     ends: np.uint64,
     w: int,
@@ -163,7 +163,7 @@ def _close_runs(
     return n
 
 
-@kernel
+@borrowing_kernel
 def sort_by_line(runs: IntArray, line_start: IntArray, ordered: IntArray) -> None:
     """Sort runs by line, counting; those of one line arrive in order of position and keep it."""
     for x in range(line_start.shape[0]):

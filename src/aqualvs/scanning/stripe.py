@@ -6,7 +6,7 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.scanning.contrast import BLOCK, BackgroundWorkspace, U8Array, flank_background
 from aqualvs.scanning.runs import (
     cells_in_band,
@@ -193,7 +193,7 @@ class StripeDetector:
         return self._cells
 
 
-@inline_kernel
+@inline_borrowing_kernel
 def _next_peak(lines: U8Array, x: int, start: int, last: int, base: np.int64) -> tuple[int, int]:
     """Return (peak, end) of the first return in [start, last]; the next one begins at `end`.
 
@@ -217,12 +217,12 @@ def _next_peak(lines: U8Array, x: int, start: int, last: int, base: np.int64) ->
     return peak, last + 1
 
 
-@inline_kernel
+@inline_borrowing_kernel
 def _separates(valley: np.int64, lower_peak: np.int64, base: np.int64) -> bool:
     return bool(10 * (valley - base) < _VALLEY_TENTHS * (lower_peak - base))
 
 
-@inline_kernel
+@inline_borrowing_kernel
 def _half_height_centroid(
     lines: U8Array, x: int, peak: int, low: int, high: int, height: np.int64
 ) -> tuple[float, float, bool]:
@@ -264,7 +264,7 @@ def _half_height_centroid(
     return peak + moment / total, (b - fall) - (a + rise), True
 
 
-@inline_kernel
+@inline_borrowing_kernel
 def _green_fall(u_lines: U8Array, x: int, peak: int, width: float) -> float:
     """Fall of U against both flanks, where it is deepest: a saturated core is white, not green."""
     row = x // 2
@@ -281,7 +281,7 @@ def _green_fall(u_lines: U8Array, x: int, peak: int, width: float) -> float:
     return 0.5 * (before + after) - float(here)
 
 
-@kernel
+@borrowing_kernel
 def _measure_runs(
     lines: U8Array,
     background: U8Array,

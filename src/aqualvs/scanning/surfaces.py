@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.net_pattern import describe_pattern
@@ -145,7 +145,7 @@ def _find_surface(
     )
 
 
-@kernel
+@borrowing_kernel
 def _collect(
     table: FloatArray,
     rows: IntArray,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel, inline_kernel, kernel
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 
@@ -88,7 +88,7 @@ class Triangulator:
         return Triangulation(points, sensitivity, valid)
 
 
-@kernel
+@borrowing_kernel
 def _place_rays(
     pixels: FloatArray,
     along_x: IntArray,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.scanning.contrast import U8Array
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis
@@ -97,7 +97,7 @@ class _Plane:
         return image[:, :width].view(np.uint16)
 
 
-@kernel
+@borrowing_kernel
 def _average_rows(image: U8Array, rows: U8Array) -> None:
     """Average rows two by two, rounding up; a last odd one stands for itself."""
     for i in range(rows.shape[0]):
@@ -107,7 +107,7 @@ def _average_rows(image: U8Array, rows: U8Array) -> None:
             rows[i, x] = np.uint8(total >> np.uint16(1))
 
 
-@kernel
+@borrowing_kernel
 def _average_columns(pairs: NDArray[np.uint16], columns: U8Array) -> None:
     """Average columns two by two, rounding up; a pair is one 16-bit word, whichever byte leads."""
     for v in range(columns.shape[0]):

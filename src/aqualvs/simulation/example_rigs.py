@@ -11,11 +11,9 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.simulation.vectors import Vec
 
-# Columns are where x, y and z of `cam` point in `dome` (docs/conventions.md).
-_DOME_FROM_CAM_NOMINAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _N_FRESH_WATER = 1.3333
 
 
@@ -63,4 +61,4 @@ def bluerov2_rig() -> Rig:
 
 def _pose(rotation_deg: Vec, lens_mm: Vec) -> SE3:
     turn = rotation_from_rotvec(np.deg2rad(rotation_deg))
-    return SE3(turn @ _DOME_FROM_CAM_NOMINAL, np.array(lens_mm) / 1e3)
+    return SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(lens_mm) / 1e3)

@@ -8,8 +8,8 @@ import numpy as np
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.optics.rig import Laser, Rig
-from aqualvs.simulation.ray_kernels import inline_ray_kernel, ray_kernel
 from aqualvs.simulation.vectors import Vec, dot, minus, row3
 
 # Columns of the sheet table.
@@ -137,7 +137,7 @@ def fan_rays(sheets: Sheets, i: int) -> tuple[FloatArray, FloatArray]:
     return np.tile(row[SOURCE : SOURCE + 3], (N_FAN, 1)), directions
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def sheet_coordinates(p: Vec, table: FloatArray, i: int) -> tuple[float, float, float, float]:
     """Return distance off the sheet, distance from the source, place in the fan, sigma.
 
@@ -154,7 +154,7 @@ def sheet_coordinates(p: Vec, table: FloatArray, i: int) -> tuple[float, float, 
     return off, distance, place, table[i, SIGMA] + table[i, DIVERGENCE] * distance
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def peak_irradiance(
     distance: float, sigma: float, place: float, attenuation: float, sheets: Sheets, i: int
 ) -> float:
@@ -175,7 +175,7 @@ def light_on_points(points: FloatArray, sheets: Sheets, attenuation: float) -> F
     return light
 
 
-@ray_kernel
+@borrowing_kernel
 def _light_on_points(
     points: FloatArray, sheets: Sheets, attenuation: float, out: FloatArray
 ) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.simulation.lasers import LaserSource, Sheets, fan_rays, pack_sheets
-from aqualvs.simulation.ray_kernels import ray_kernel
 from aqualvs.simulation.scene import Label
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 from aqualvs.simulation.vectors import row3
@@ -119,7 +119,7 @@ def cast(origins: FloatArray, directions: FloatArray, surfaces: Surfaces) -> Rea
     return reach
 
 
-@ray_kernel
+@borrowing_kernel
 def _cast_all(
     origins: FloatArray,
     directions: FloatArray,

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel
 from aqualvs.geometry.transforms import SE3
-from aqualvs.simulation.ray_kernels import inline_ray_kernel
 from aqualvs.simulation.scene import Net
 from aqualvs.simulation.textures import Tiles, sample, white_at
 from aqualvs.simulation.vectors import Vec, combine, dot, minus, row3, scaled, unit
@@ -87,7 +87,7 @@ def _families(net: Net) -> tuple[list[float], float]:
     return [net.roll + i * np.pi / 3.0 for i in range(3)], net.bar * np.sqrt(3.0)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int) -> tuple[float, float, float]:
     """Return the distance at which a ray crosses the net's surface, and (u, v) there."""
     rel = minus(o, row3(nets, i, ORIGIN))
@@ -107,7 +107,7 @@ def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int) -> tuple[float, float, f
     return t, u0 + t * du, v0 + t * dv
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _in_a_hole(u: float, v: float, holes: FloatArray, i: int) -> bool:
     for k in range(holes.shape[0]):
         if holes[k, 0] == i:
@@ -117,7 +117,7 @@ def _in_a_hole(u: float, v: float, holes: FloatArray, i: int) -> bool:
     return False
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _hexagon_centre(u: float, v: float, nets: FloatArray, i: int) -> tuple[float, float]:
     """Return the centre of the honeycomb cell around (u, v): the nearest lattice point."""
     p = nets[i, SPACING]
@@ -139,7 +139,7 @@ def _hexagon_centre(u: float, v: float, nets: FloatArray, i: int) -> tuple[float
     )
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _nearest_axis(
     u: float, v: float, nets: FloatArray, i: int, k: int, cell: tuple[float, float]
 ) -> tuple[float, float, float, int, int]:
@@ -168,7 +168,7 @@ def _nearest_axis(
     return w - line * spacing, place, knot, int(line), int(np.floor(across))
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _profile(
     place: float, knot: float, u: float, v: float, nets: FloatArray, i: int, tiles: Tiles
 ) -> tuple[float, float]:
@@ -189,7 +189,7 @@ def _profile(
     return radius + r * growth, growth
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _cylinder(w: float, q: float, z: float, r: float) -> float:
     """First root of (w + q tau)² + (z tau)² = r²; infinite where there is none."""
     a = q * q + z * z
@@ -200,7 +200,7 @@ def _cylinder(w: float, q: float, z: float, r: float) -> float:
     return float((-half_b - np.sqrt(disc)) / a)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def meet_net(o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, tiles: Tiles) -> Strand:
     """Return the first strand of net i that a ray meets."""
     nothing = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
@@ -237,7 +237,7 @@ def meet_net(o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, tiles:
     return best
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def strand_albedo(strand: Strand, nets: FloatArray, i: int, tiles: Tiles) -> Vec:
     """Return the diffuse reflectance of the twine: a helix of plies, or growth over it."""
     r = nets[i, RADIUS]

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.optics.rig import Rig
 from aqualvs.simulation.culling import TILE, TileMembers, tile_members
 from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources
 from aqualvs.simulation.lit_points import LitPoints, find_lit_points, light_sheets
-from aqualvs.simulation.ray_kernels import inline_ray_kernel, ray_kernel
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.sensor import expose, spread
 from aqualvs.simulation.shading import Light, Members, pack_light, radiance
@@ -146,7 +146,7 @@ def corner_rays(rig: Rig) -> CornerRays:
     )
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> Vec:
     """Bilinear value between the corners of a pixel, x and y in 0..1."""
     top = combine(
@@ -163,7 +163,7 @@ def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> 
     return combine(top, 1.0 - y, low, y, _ZERO, 0.0)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _members_at(members: TileMembers, row: int, column: int) -> Members:
     i = (row // TILE) * members.n_columns + column // TILE
     return Members(
@@ -176,7 +176,7 @@ def _members_at(members: TileMembers, row: int, column: int) -> Members:
     )
 
 
-@ray_kernel
+@borrowing_kernel
 def _render(
     band: tuple[int, int],
     rays: CornerRays,

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel
 from aqualvs.simulation.lasers import (
     CUT,
     NORMAL,
@@ -14,7 +15,6 @@ from aqualvs.simulation.lasers import (
     peak_irradiance,
     sheet_coordinates,
 )
-from aqualvs.simulation.ray_kernels import inline_ray_kernel
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.surfaces import (
     NONE,
@@ -82,7 +82,7 @@ class Members(NamedTuple):
     last_bubble: int
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def radiance(
     o: Vec, d: Vec, s: Surfaces, near: Members, everything: IntArray, sheets: Sheets, light: Light
 ) -> Vec:
@@ -113,14 +113,14 @@ def radiance(
     return seen
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _through(source: float, channel: int, path: float, veil: float, light: Light) -> float:
     """Dim by the water on the way and add the veil that it scatters in."""
     left = np.exp(-light.colours[0, channel] * path)
     return float(source * left + light.colours[1, channel] * veil * (1.0 - left))
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _veil(d: Vec, light: Light) -> float:
     """Brightness of the veil by direction: lighter above, and the sun's glare."""
     veil = 1.0 + 0.55 * d[2] + 0.12 * d[0]
@@ -131,7 +131,7 @@ def _veil(d: Vec, light: Light) -> float:
     return veil
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _daylight(p: Vec, normal: Vec, light: Light, tiles: Tiles) -> float:
     """Diffuse light from above, with the moving network that waves focus."""
     sun = 0.55 + 0.45 * max(dot(normal, _UP), 0.0) * 1.6
@@ -144,7 +144,7 @@ def _daylight(p: Vec, normal: Vec, light: Light, tiles: Tiles) -> float:
     return sun
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _laser_light(
     p: Vec, normal: Vec, s: Surfaces, everything: IntArray, sheets: Sheets, light: Light
 ) -> float:
@@ -163,7 +163,7 @@ def _laser_light(
     return total
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _from_source(p: Vec, off: float, sigma: float, sheets: Sheets, i: int) -> tuple[Vec, float]:
     """Direction and length of the light's way; it leaves the source as far off in its thickness."""
     start = along(
@@ -176,14 +176,14 @@ def _from_source(p: Vec, off: float, sigma: float, sheets: Sheets, i: int) -> tu
     return scaled(way, 1.0 / length), length
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _shadowed(p: Vec, from_source: Vec, length: float, s: Surfaces, everything: IntArray) -> bool:
     start = along(p, from_source, -length)
     blocker = first_hit(start, from_source, s, everything, 0, everything.shape[0])
     return blocker.t < length - _SHADOW_MARGIN
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> float:
     """Light that the water in the sheets scatters into the ray, before it ends at `reach`."""
     glow = 0.0
@@ -202,7 +202,7 @@ def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> f
     return glow
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _over_bubble(
     behind: Vec,
     o: Vec,
@@ -231,7 +231,7 @@ def _over_bubble(
     )
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _layer(
     behind: float,
     channel: int,

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.simulation.net import N_COLUMNS as NET_COLUMNS
 from aqualvs.simulation.net import meet_net, pack_net, strand_albedo
-from aqualvs.simulation.ray_kernels import inline_ray_kernel
 from aqualvs.simulation.scene import Box, Fish, Scene, Wall
 from aqualvs.simulation.textures import Tiles, noise_tiles, sample
 from aqualvs.simulation.vectors import Vec, along, combine, dot, minus, row3, scaled, unit
@@ -142,7 +142,7 @@ def _pack_box(box: Box, pose: SE3) -> FloatArray:
     return np.concatenate([pose.apply(box.centre), axes.T.ravel(), half, box.albedo])
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def meet_wall(o: Vec, d: Vec, walls: FloatArray, i: int) -> float:
     """Return the distance to a wall; infinite behind the ray's origin."""
     normal = row3(walls, i, _NORMAL)
@@ -150,7 +150,7 @@ def meet_wall(o: Vec, d: Vec, walls: FloatArray, i: int) -> float:
     return t if 0.0 < t < _FAR else np.inf
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _to_local(v: Vec, table: FloatArray, i: int) -> Vec:
     """Turn a vector by the three rows that start in column 3."""
     return (
@@ -160,7 +160,7 @@ def _to_local(v: Vec, table: FloatArray, i: int) -> Vec:
     )
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def meet_ellipsoid(o: Vec, d: Vec, ellipsoids: FloatArray, i: int) -> float:
     """Return the distance to an ellipsoid seen from outside, else infinity."""
     p = _to_local(minus(o, row3(ellipsoids, i, _CENTRE)), ellipsoids, i)
@@ -173,7 +173,7 @@ def meet_ellipsoid(o: Vec, d: Vec, ellipsoids: FloatArray, i: int) -> float:
     return t if t > 0.0 else np.inf
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def meet_box(o: Vec, d: Vec, boxes: FloatArray, i: int) -> tuple[float, Vec]:
     """Return the distance to a box seen from outside, and its normal there (slab method)."""
     p = _to_local(minus(o, row3(boxes, i, _CENTRE)), boxes, i)
@@ -193,7 +193,7 @@ def meet_box(o: Vec, d: Vec, boxes: FloatArray, i: int) -> tuple[float, Vec]:
     return near, scaled(row3(boxes, i, _ROWS + 3 * face), sign)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: int) -> Hit:
     """Return the first opaque surface on a ray; of the ellipsoids try members[first:last]."""
     t, kind, index, normal = np.inf, NONE, 0, (0.0, 0.0, 0.0)
@@ -217,7 +217,7 @@ def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: 
     return Hit(t, kind, index, normal)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def meet_bubbles(
     o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: int
 ) -> tuple[float, int]:
@@ -233,7 +233,7 @@ def meet_bubbles(
     return nearest, row
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def normal_and_albedo(o: Vec, d: Vec, hit: Hit, s: Surfaces) -> tuple[Vec, Vec]:
     """Return the unit normal towards the camera and the diffuse reflectance at a hit."""
     if hit.kind == WALL:
@@ -250,7 +250,7 @@ def normal_and_albedo(o: Vec, d: Vec, hit: Hit, s: Surfaces) -> tuple[Vec, Vec]:
     return hit.normal, scaled(row3(s.boxes, hit.row, _BOX_ALBEDO), 0.85 + 0.3 * grain)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _wall_albedo(p: Vec, walls: FloatArray, i: int, tiles: Tiles) -> Vec:
     """Stains of three sizes, and the joints of tiles."""
     rel = minus(p, row3(walls, i, _ORIGIN))
@@ -271,7 +271,7 @@ def _wall_albedo(p: Vec, walls: FloatArray, i: int, tiles: Tiles) -> Vec:
     return base[0] * shade * (1.0 + warmth), base[1] * shade, base[2] * shade * (1.0 - warmth)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def _fish_skin(p: Vec, ellipsoids: FloatArray, i: int, tiles: Tiles) -> tuple[Vec, Vec]:
     """Return normal and skin: dark back, pale belly, scales; a dark eye; a striped tail."""
     q = _to_local(minus(p, row3(ellipsoids, i, _CENTRE)), ellipsoids, i)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.simulation.ray_kernels import inline_ray_kernel
+from aqualvs.geometry.compiled import inline_borrowing_kernel
 
 TILE_SIZE = 512
 _MASK = TILE_SIZE - 1
@@ -62,7 +62,7 @@ def _uniform(field: NDArray[np.float64]) -> NDArray[np.float64]:
     return ranks.reshape(field.shape) / field.size
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def sample(tile: NDArray[np.float32], x: float, y: float) -> float:
     """Bilinear value of a 512-square tile at (x, y) in texels, repeated without end."""
     fx, fy = np.floor(x), np.floor(y)
@@ -74,7 +74,7 @@ def sample(tile: NDArray[np.float32], x: float, y: float) -> float:
     return float(top * (1.0 - ay) + bottom * ay)
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def white_at(white: NDArray[np.float32], i: int, j: int) -> float:
     """Return the uniform value that belongs to a pair of whole numbers."""
     return float(white[i & _WHITE_MASK, j & _WHITE_MASK])

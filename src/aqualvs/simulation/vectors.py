@@ -5,24 +5,24 @@ from typing import TypeAlias
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.simulation.ray_kernels import inline_ray_kernel
+from aqualvs.geometry.compiled import inline_borrowing_kernel
 
 Vec: TypeAlias = tuple[float, float, float]
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def dot(a: Vec, b: Vec) -> float:
     """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def minus(a: Vec, b: Vec) -> Vec:
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def along(origin: Vec, direction: Vec, t: float) -> Vec:
     """Return origin + t * direction."""
     return (
@@ -32,20 +32,20 @@ def along(origin: Vec, direction: Vec, t: float) -> Vec:
     )
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def scaled(a: Vec, factor: float) -> Vec:
     """Return factor * a."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def unit(a: Vec) -> Vec:
     """Return a with length 1."""
     inverse = 1.0 / np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     return a[0] * inverse, a[1] * inverse, a[2] * inverse
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def combine(a: Vec, x: float, b: Vec, y: float, c: Vec, z: float) -> Vec:
     """Return x a + y b + z c."""
     return (
@@ -55,7 +55,7 @@ def combine(a: Vec, x: float, b: Vec, y: float, c: Vec, z: float) -> Vec:
     )
 
 
-@inline_ray_kernel
+@inline_borrowing_kernel
 def row3(values: FloatArray, i: int, j: int) -> Vec:
     """Return values[i, j:j+3] as a tuple."""
     return values[i, j], values[i, j + 1], values[i, j + 2]
