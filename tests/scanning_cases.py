@@ -1,4 +1,4 @@
-"""Exact returns of laser stripes on made-up targets, for the tests of what comes after detection."""
+"""Exact returns of laser stripes on made-up targets, to test what comes after detection."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeAlias

@@ -21,8 +21,12 @@ _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
 # share of the spread, because a strand's light may be cut off on one side by a knot or the border.
 _CHUNK_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
-# Search lines whose voice a whole stretch has at most when surfaces are sought.
-_LOUDEST_STRETCH = 48.0
+# A stretch has at most this many times the typical voice when surfaces are sought, but a voice of
+# at least so many search lines.
+_LOUDEST_SHARE = 2.0
+_LOUD_ENOUGH = 16.0
+# Shorter stretches are specks; they do not say what is typical.
+_SPECK_LINES = 3.0
 
 FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 """The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
@@ -311,9 +315,12 @@ def _chunk_facts(
         facts[0, c] += 1
         facts[2, c] = line[i]
         lines_of_stretch[stretch[i]] += 1.0
+    stretches = lines_of_stretch[lines_of_stretch >= _SPECK_LINES]
+    typical = np.median(stretches) if stretches.shape[0] else 0.0
+    loudest = max(_LOUDEST_SHARE * typical, _LOUD_ENOUGH)
     for i in range(index.shape[0]):
         n_lines = float(facts[0, index[i]])
-        voice[index[i]] = n_lines * min(1.0, _LOUDEST_STRETCH / lines_of_stretch[stretch[i]])
+        voice[index[i]] = n_lines * min(1.0, loudest / lines_of_stretch[stretch[i]])
 
 
 @kernel
