@@ -1,6 +1,6 @@
 """Array types and the checks that public functions make at their border."""
 
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.int64]
-AnyArray: TypeAlias = NDArray[Any]
 
 
 def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:

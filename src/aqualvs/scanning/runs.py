@@ -15,7 +15,76 @@ _HIGH_BITS = np.uint64(0x8080808080808080)
 _ONE = np.uint64(1)
 
 
-def cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray:
+class RunFinder:
+    """Finds runs in search images of one shape; allocates once.
+
+    Parameters
+    ----------
+    length : int
+        Positions on a search line.
+    lowest, highest : int array, shape (n_lines,)
+        First and last position of interest on each line (an empty interval skips the line).
+    capacity : int
+        Runs kept; what exceeds it is dropped.
+
+    Attributes
+    ----------
+    in_band : bool array, shape (n_blocks, n_words)
+        Cells that a line's interval reaches.
+    capacity : int
+        As given.
+    """
+
+    def __init__(self, length: int, lowest: IntArray, highest: IntArray, capacity: int) -> None:
+        self.in_band = _cells_in_band(length, lowest, highest)
+        self.capacity = capacity
+        self._lowest, self._highest = lowest, highest
+        n_words = self.in_band.shape[1]
+        self._marks: U8Array = np.zeros((BLOCK + 1, 8 * n_words), np.uint8)
+        self._open_start = np.empty(8 * n_words, np.int64)
+        self._runs = np.empty((capacity, 3), np.int64)
+        self._ordered = np.empty_like(self._runs)
+        self._line_start = np.empty(len(lowest) + 1, np.int64)
+
+    def find(
+        self, image: U8Array, background: U8Array, min_contrast: int, cells: BoolArray
+    ) -> IntArray:
+        """Find the runs that stand above the background.
+
+        Parameters
+        ----------
+        image : uint8 array, shape (length, n_lines)
+            Search lines are columns.
+        background : uint8 array, shape (n_blocks, n_lines)
+            Of the image.
+        min_contrast : int
+            Least height above it, in grey levels.
+        cells : bool array, shape (n_blocks, n_words)
+            Where to look.
+
+        Returns
+        -------
+        int array, shape (n, 3)
+            (line, first, last), ordered by line, then by position. A view: overwritten by the next
+            call.
+        """
+        n = _find_runs(
+            image,
+            background,
+            np.uint8(min_contrast),
+            cells,
+            self._lowest,
+            self._highest,
+            self._marks,
+            self._marks.view(np.uint64),
+            self._open_start,
+            self._runs,
+        )
+        _sort_by_line(self._runs[:n], self._line_start, self._ordered)
+        return self._ordered[:n]
+
+
+def _cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray:
     """Mark the cells of `BLOCK` positions by 8 lines that any line's interval reaches."""
     n_blocks, n_words = -(-length // BLOCK), -(-len(lowest) // 8)
     blocks = np.arange(n_blocks)[:, None]
@@ -65,7 +134,7 @@ def cells_near_green(in_band: BoolArray, green: NDArray[np.uint32], cells: BoolA
 
 
 @borrowing_kernel
-def find_runs(
+def _find_runs(
     image: U8Array,
     background: U8Array,
     least: np.uint8,
@@ -164,7 +233,7 @@ def _close_runs(
 
 
 @borrowing_kernel
-def sort_by_line(runs: IntArray, line_start: IntArray, ordered: IntArray) -> None:
+def _sort_by_line(runs: IntArray, line_start: IntArray, ordered: IntArray) -> None:
     """Sort runs by line, counting; those of one line arrive in order of position and keep it."""
     for x in range(line_start.shape[0]):
         line_start[x] = 0

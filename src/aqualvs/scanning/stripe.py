@@ -8,13 +8,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.scanning.contrast import BLOCK, BackgroundWorkspace, U8Array, flank_background
-from aqualvs.scanning.runs import (
-    cells_in_band,
-    cells_near_green,
-    find_runs,
-    mark_green,
-    sort_by_line,
-)
+from aqualvs.scanning.runs import RunFinder, cells_near_green, mark_green
 from aqualvs.scanning.view import SearchView
 
 # A valley below this many tenths of the lower of two peaks separates two returns.
@@ -120,21 +114,15 @@ class StripeDetector:
         options: StripeOptions,
     ) -> None:
         self._options = options
-        self._lowest, self._highest = lowest, highest
         self._reach_px = reach_px
+        self._finder = RunFinder(length, lowest, highest, options.max_returns)
         self._workspace = BackgroundWorkspace(length, n_lines, reach_px)
         half_length, half_lines = -(-length // 2), -(-n_lines // 2)
         self._u_workspace = BackgroundWorkspace(half_length, half_lines, -(-reach_px // 2))
         self._inverted_u: U8Array = np.empty((half_length, half_lines), np.uint8)
-        self._in_band = cells_in_band(length, lowest, highest)
-        self._cells = np.empty_like(self._in_band)
-        n_blocks, n_words = self._in_band.shape
+        self._cells = np.empty_like(self._finder.in_band)
+        n_blocks, n_words = self._cells.shape
         self._green: U8Array = np.zeros((n_blocks, 4 * n_words), np.uint8)
-        self._marks: U8Array = np.zeros((BLOCK + 1, 8 * n_words), np.uint8)
-        self._open_start = np.empty(8 * n_words, np.int64)
-        self._runs = np.empty((options.max_returns, 3), np.int64)
-        self._sorted = np.empty_like(self._runs)
-        self._line_start = np.empty(n_lines + 1, np.int64)
         self._line = np.empty(options.max_returns, np.int64)
         self._measures = np.empty((4, options.max_returns))
 
@@ -150,28 +138,16 @@ class StripeDetector:
         cells = self._cells_of_interest(view.u)
         min_contrast = self._options.min_contrast
         while True:
-            n_runs = find_runs(
-                view.luma,
-                background,
-                np.uint8(min_contrast),
-                cells,
-                self._lowest,
-                self._highest,
-                self._marks,
-                self._marks.view(np.uint64),
-                self._open_start,
-                self._runs,
-            )
-            if n_runs < len(self._runs) or min_contrast > _HIGHEST_CONTRAST:
+            runs = self._finder.find(view.luma, background, min_contrast, cells)
+            if len(runs) < self._finder.capacity or min_contrast > _HIGHEST_CONTRAST:
                 break
             # So many runs are noise; stripes stand higher than noise.
             min_contrast *= 2
-        sort_by_line(self._runs[:n_runs], self._line_start, self._sorted)
         n = _measure_runs(
             view.lines,
             background,
             view.u_lines if view.u_lines is not None else _NO_CHROMA,
-            self._sorted[:n_runs],
+            runs,
             self._reach_px,
             self._options.min_green_fall,
             self._line,
@@ -184,12 +160,12 @@ class StripeDetector:
     def _cells_of_interest(self, u_plane: U8Array | None) -> BoolArray:
         """Mark the cells that a band reaches and where something is green."""
         if u_plane is None:
-            return self._in_band
+            return self._finder.in_band
         np.subtract(255, u_plane, out=self._inverted_u)
         background = flank_background(self._inverted_u, self._u_workspace)
         least = np.uint8(max(1, int(self._options.min_green_fall)))
         mark_green(self._inverted_u, background, least, self._green)
-        cells_near_green(self._in_band, self._green.view(np.uint32), self._cells)
+        cells_near_green(self._finder.in_band, self._green.view(np.uint32), self._cells)
         return self._cells
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.contrast import BLOCK, U8Array
-from aqualvs.scanning.runs import cells_in_band, find_runs, sort_by_line
+from aqualvs.scanning.contrast import U8Array
+from aqualvs.scanning.runs import RunFinder
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.view import SearchView
 
@@ -58,34 +58,15 @@ class ThresholdDetector:
         highest: IntArray,
         options: ThresholdOptions,
     ) -> None:
-        self._options = options
-        self._lowest, self._highest = lowest, highest
-        self._cells = cells_in_band(length, lowest, highest)
+        self._finder = RunFinder(length, lowest, highest, options.max_returns)
         # One grey level below the threshold everywhere: what stands above it by one is bright.
-        self._background: U8Array = np.full(
-            (len(self._cells), n_lines), options.level - 1, np.uint8
-        )
-        self._marks: U8Array = np.zeros((BLOCK + 1, 8 * self._cells.shape[1]), np.uint8)
-        self._open_start = np.empty(8 * self._cells.shape[1], np.int64)
-        self._runs = np.empty((options.max_returns, 3), np.int64)
-        self._line_start = np.empty(n_lines + 1, np.int64)
+        n_blocks = len(self._finder.in_band)
+        self._background: U8Array = np.full((n_blocks, n_lines), options.level - 1, np.uint8)
 
     def detect(self, view: SearchView) -> Returns:
         """Find the returns of one frame; colour is not looked at."""
-        n = find_runs(
-            view.luma,
-            self._background,
-            np.uint8(1),
-            self._cells,
-            self._lowest,
-            self._highest,
-            self._marks,
-            self._marks.view(np.uint64),
-            self._open_start,
-            self._runs,
-        )
-        runs = np.empty((n, 3), np.int64)
-        sort_by_line(self._runs[:n], self._line_start, runs)
+        runs = self._finder.find(view.luma, self._background, 1, self._finder.in_band)
+        n = len(runs)
         return Returns(
             line=runs[:, 0].copy(),
             position=0.5 * (runs[:, 1] + runs[:, 2]).astype(np.float64),
