@@ -6,20 +6,29 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.rays import Rays
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario
 from aqualvs.simulation.scene import Label, Net, Scene, Wall, WaterOptics
 from aqualvs.simulation.trajectory import dome_from_target
+from windowed_cases import windowed
 
 # Laser light alone: nothing else can pull a stripe's centre.
 _DARK = WaterOptics(ambient=(0.0, 0.0, 0.0), veil=(0.0, 0.0, 0.0), sheet_scatter=0.0)
 _HALF_WINDOW = 16
 
 
-@pytest.fixture(scope="module", params=[example_rig, bluerov2_rig], ids=["example", "bluerov2"])
+_RIGS = {
+    "example": example_rig,
+    "bluerov2": bluerov2_rig,
+    "windowed": lambda: windowed(example_rig()),
+}
+
+
+@pytest.fixture(scope="module", params=list(_RIGS))
 def renderer(request):
-    return Renderer(request.param())
+    return Renderer(_RIGS[request.param]())
 
 
 def _wall(distance, pitch_deg, yaw_deg):
@@ -70,8 +79,8 @@ def test_truth_points_lie_on_sheet_and_wall_and_project_to_their_pixels(renderer
     rig = renderer.rig
     # Rounding only.
     assert np.abs(scene.target_plane().signed_distance(lit.points_in_dome)).max() < 1e-12
-    for i, laser in enumerate(rig.lasers):
-        off = laser.plane.signed_distance(lit.points_in_dome[lit.laser == i])
+    for i, sheet in enumerate(sheets_of(rig)):
+        off = sheet.signed_distance(lit.points_in_dome[lit.laser == i])
         assert np.abs(off).max() < 1e-12
     rays = rig.camera().rays(lit.pixels)
     back, valid = scene.target_plane().intersect(rays)

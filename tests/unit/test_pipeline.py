@@ -10,6 +10,7 @@ import pytest
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.measure import FitMethod
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
@@ -18,6 +19,7 @@ from aqualvs.scanning.scan import Frame, Label, Scan
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from windowed_cases import windowed
 
 Lit: TypeAlias = Callable[[FloatArray], BoolArray]
 BACKGROUND = 40.0
@@ -59,7 +61,7 @@ def light_on(rig: Rig, targets: Sequence[tuple[Plane, Lit]], lasers: Sequence[in
         open_ &= ~here
         px_per_m = max(rig.lens.fx, rig.lens.fy) / np.linalg.norm(points[here], axis=-1)
         for i in lasers:
-            off = rig.lasers[i].plane.signed_distance(points[here]) * px_per_m
+            off = sheets_of(rig)[i].signed_distance(points[here]) * px_per_m
             light[here] += 130.0 * np.exp(-0.5 * (off / SIGMA_PX) ** 2)
     return light
 
@@ -156,18 +158,25 @@ def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> Non
     assert np.mean(found.points.label[on_net & ~on_wall] == Label.TARGET) > 0.3
 
 
-def test_crossings_are_ambiguous_and_the_rest_is_target() -> None:
-    target = plane(0.5, 3.0, -4.0)
-    rig = example_rig()
-    points = scan([(target, everywhere)]).points
+@pytest.mark.parametrize(
+    ("rig", "distance"),
+    [(example_rig(), 0.5), (windowed(example_rig()), 0.5), (windowed(example_rig()), 0.9)],
+    ids=["planes", "bent", "bent, far"],
+)
+def test_crossings_are_ambiguous_and_the_rest_is_target(rig: Rig, distance: float) -> None:
+    target = plane(distance, 3.0, -4.0)
+    points = scan([(target, everywhere)], rig=rig).points
     near = np.zeros(len(points), np.bool_)
-    for i, laser in enumerate(rig.lasers):
-        off = np.abs(laser.plane.signed_distance(points.points_in_dome))
-        near |= (points.laser != i) & (off * 878.0 / 0.5 < SIGMA_PX)
+    for i, sheet in enumerate(sheets_of(rig)):
+        off = np.abs(sheet.signed_distance(points.points_in_dome))
+        near |= (points.laser != i) & (off * 878.0 / distance < SIGMA_PX)
     on_it = np.abs(target.signed_distance(points.points_in_dome)) < 0.003
     assert np.count_nonzero(near & on_it) > 3
     assert np.all(points.label[near & on_it] == Label.AMBIGUOUS)
-    assert np.mean(points.label[on_it & ~near] == Label.TARGET) > 0.9
+    clear = points.label[on_it & ~near]
+    # Crossing zones are wider than what is counted as near here; bent stripes cross more flatly.
+    assert np.mean(clear == Label.TARGET) > 0.88
+    assert np.mean((clear == Label.TARGET) | (clear == Label.AMBIGUOUS)) > 0.98
 
 
 def test_every_point_has_its_pixel_laser_and_label() -> None:
@@ -332,12 +341,13 @@ def test_the_paper_s_own_methods(options: ScannerOptions, share: float, deg: flo
     assert_posture(found.posture, target, share=share, deg=deg)
 
 
-def test_the_paper_s_mesh_filter_takes_a_wall_away_and_leaves_a_net() -> None:
+@pytest.mark.parametrize("rig", [example_rig(), windowed(example_rig())], ids=["planes", "bent"])
+def test_the_paper_s_mesh_filter_takes_a_wall_away_and_leaves_a_net(rig: Rig) -> None:
     options = ScannerOptions(mesh_filter=MeshFilterOptions())
-    wall = scan([(plane(0.5), everywhere)], options=options)
-    without = scan([(plane(0.5), everywhere)])
+    wall = scan([(plane(0.5), everywhere)], rig=rig, options=options)
+    without = scan([(plane(0.5), everywhere)], rig=rig)
     assert len(wall.points) < 0.5 * len(without.points)
-    upright = scan([(plane(0.45), upright_strands)], options=options, lasers=(0, 2))
+    upright = scan([(plane(0.45), upright_strands)], rig=rig, options=options, lasers=(0, 2))
     assert len(upright.points) > 60
 
 

@@ -24,7 +24,9 @@ from aqualvs.optics.rigschema import (
     LaserPart,
     RigFile,
     WaterPart,
+    WindowPart,
 )
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.water import seawater_index_vacuum
 
 HAND_WRITTEN = """\
@@ -406,10 +408,95 @@ def test_the_example_of_the_documentation(tmp_path: Path) -> None:
     assert rig.working_range == (0.3, 1.0)
 
 
+def test_the_documentations_example_of_a_window() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "rig.md").read_text(encoding="utf-8")
+    lasers = yaml.safe_load(page.split("```yaml\n")[2].split("```")[0])
+    rig = rig_from_mapping(hand_written() | lasers, source_name="x")
+    window = rig.lasers[0].window
+    assert window is not None
+    # As drawn: the face 20 mm before the source, tilted by 15 degrees.
+    assert window.face.signed_distance(window.source) == pytest.approx(-0.02, abs=1e-5)
+    assert window.face.normal @ rig.lasers[0].plane.normal == pytest.approx(
+        np.sin(np.deg2rad(15.0)), abs=1e-4
+    )
+
+
+WINDOW = {"normal": [0.28, 0.96, 0.0], "offset_mm": 30.0, "source_mm": [-140.0, 20.0, 5.0]}
+BEHIND_WINDOW = {"name": "left", "normal": [1.0, 0.0, 0.0], "offset_mm": -140.0, "window": WINDOW}
+
+
+def behind_window(**changes: Any) -> dict[str, Any]:
+    """Return the file above with a laser behind a window, some of whose keys are changed."""
+    window = {key: value for key, value in (WINDOW | changes).items() if value is not ...}
+    return hand_written(lasers=[BEHIND_WINDOW | {"window": window}])
+
+
+def test_a_window_becomes_si_and_comes_back(tmp_path: Path) -> None:
+    path, copy = tmp_path / "rig.yaml", tmp_path / "copy.yaml"
+    rig = rig_from_mapping(behind_window(), source_name="x")
+    window = rig.lasers[0].window
+    assert window is not None
+    np.testing.assert_array_equal(window.face.normal, [0.28, 0.96, 0.0])
+    assert window.face.offset == 0.03
+    np.testing.assert_array_equal(window.source, [-0.14, 0.02, 0.005])
+    save_rig(rig, path)
+    assert yaml.safe_load(path.read_text())["lasers"] == [BEHIND_WINDOW]
+    save_rig(load_rig(path), copy)
+    assert path.read_bytes() == copy.read_bytes()
+    assert rig_from_mapping(hand_written(), source_name="x").lasers[0].window is None
+    plain = rig_to_mapping(rig_from_mapping(hand_written(), source_name="x"))
+    assert all("window" not in laser for laser in plain["lasers"])
+
+
+def test_a_windows_normal_may_have_any_length_and_way_round() -> None:
+    for scale in (3.0, -2.0):
+        normal = [scale * value for value in WINDOW["normal"]]
+        content = behind_window(normal=normal, offset_mm=np.sign(scale) * 30.0)
+        window = rig_from_mapping(content, source_name="x").lasers[0].window
+        assert window is not None
+        np.testing.assert_allclose(
+            window.face.normal, np.sign(scale) * np.array([0.28, 0.96, 0.0]), rtol=1e-15
+        )
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"normal": ...}, ("lasers[0].window.normal is missing", "normal: [1.0")),
+        ({"source_mm": ...}, ("lasers[0].window.source_mm is missing", "source_mm: [-140")),
+        ({"source": [1, 2, 3]}, ("lasers[0].window.source is not a key", "'source_mm'")),
+        ({"offset_mm": "far"}, ("lasers[0].window.offset_mm is 'far'", "plain number")),
+        ({"normal": [0, 0, 0]}, ("lasers[0].window.normal is [0", "normal of the window")),
+        (
+            {"source_mm": [-134.0, 20.0, 5.0]},
+            ("lasers[0].window.source_mm is [-134.0, 20.0, 5.0]", "6.0 mm off", "correct"),
+        ),
+        (
+            {"source_mm": [-140.0, 120.0, 5.0]},
+            ("lasers[0].window.source_mm is [-140.0, 120.0", "not behind", "correct source_mm"),
+        ),
+        ({"offset_mm": -20.0}, ("lasers[0].window.source_mm", "not behind", "outer face")),
+        ({"normal": [0.96, 0.28, 0.0]}, ("lasers[0].window.normal", "16 degrees", "window")),
+    ],
+)
+def test_windows_that_cannot_be_are_refused(changes: dict[str, Any], said: tuple[str, ...]) -> None:
+    message = fault(behind_window(**changes))
+    for words in said:
+        assert words in message
+
+
+def test_a_source_measured_with_a_ruler_is_accepted() -> None:
+    rig = rig_from_mapping(behind_window(source_mm=[-137.0, 20.0, 5.0]), source_name="x")
+    assert rig.lasers[0].window is not None
+    # What is off the plane is left to the sheet to project: the file comes back as it was.
+    assert rig.lasers[0].window.source[0] == -0.137
+    np.testing.assert_allclose(sheets_of(rig)[0].source, [-0.14, 0.02, 0.005], atol=1e-17)
+
+
 def test_the_documentation_names_every_key() -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "rig.md").read_text(encoding="utf-8")
     keys = set(RigFile.model_fields)
-    for part in (ImagePart, CameraPart, DomePart, WaterPart, LaserPart):
+    for part in (ImagePart, CameraPart, DomePart, WaterPart, LaserPart, WindowPart):
         keys |= set(part.model_fields)
     table = page.split("## Keys")[1].split("## In Python")[0]
     # `fy_px` and its like stand behind their part's first key; `n` is `water.n`.

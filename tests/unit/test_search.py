@@ -9,8 +9,11 @@ import pytest
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch, plan_searches
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.lasers import default_sources
+from windowed_cases import windowed
 
 RIGS = [example_rig, bluerov2_rig]
 N_TARGETS = 60
@@ -71,6 +74,40 @@ def test_bands_hold_every_stripe_within_the_working_range(make_rig: Callable[[],
             missed = pixels[~inside]
             assert len(missed) == 0, f"{rig.lasers[i].name}, {target}: {missed[:3]}"
             seen[i] += len(pixels)
+    assert np.all(seen > 5000)
+
+
+def bent_stripe_pixels(rig: Rig, i: int, target: Plane) -> FloatArray:
+    """Exact projections (N, 2) of light through a laser's window onto a target, in the picture."""
+    sheet, source = sheets_of(rig)[i], default_sources(rig)[i]
+    angle = np.linspace(-0.9, 0.9, 6001)[:, None]
+    side = np.cross(sheet.plane.normal, source.direction)
+    rays, _ = sheet.shine(np.cos(angle) * source.direction + np.sin(angle) * side)
+    points, lit = target.intersect(rays)
+    camera = rig.camera()
+    pixels, valid = camera.project(points)
+    near_enough = np.linalg.norm(points, axis=1) <= 1.5 * rig.working_range[1]
+    return pixels[lit & valid & camera.inside_image(pixels) & near_enough]
+
+
+@pytest.mark.parametrize("make_rig", RIGS)
+def test_bands_and_slopes_hold_bent_stripes(make_rig: Callable[[], Rig]) -> None:
+    rig = windowed(make_rig())
+    searches = plan_searches(rig, rig.camera())
+    seen = np.zeros(len(searches), np.int64)
+    for target in random_targets(rig, np.random.default_rng(3)):
+        for i, search in enumerate(searches):
+            position, line = across_and_line(search, bent_stripe_pixels(rig, i, target))
+            length = rig.size_px[0] if search.axis is SearchAxis.ALONG_X else rig.size_px[1]
+            assert in_band(search, position.clip(0.0, length - 1.0), line).all()
+            seen[i] += len(line)
+            step = np.diff(line)
+            usable = (np.abs(step) > 1e-6) & (np.hypot(step, np.diff(position)) < 8.0)
+            slope = (np.diff(position)[usable] / step[usable]).clip(-5.0, 5.0)
+            row = position[:-1][usable].astype(np.int64) // SLOPE_CELL
+            column = line[:-1][usable].astype(np.int64) // SLOPE_CELL
+            assert np.all(slope >= search.slope_low[row, column] - 0.15)
+            assert np.all(slope <= search.slope_high[row, column] + 0.15)
     assert np.all(seen > 5000)
 
 

@@ -73,9 +73,9 @@ def test_without_lasers_there_is_no_stripe(renderer):
 def test_power_is_stated_half_a_metre_from_the_source():
     rig = example_rig()
     sources = default_sources(rig)
-    sheets = pack_sheets(rig.lasers, sources)
+    sheets = pack_sheets(rig, sources)
     for i, source in enumerate(sources):
-        sheets_of_one = pack_sheets(rig.lasers[i : i + 1], [source])
+        sheets_of_one = pack_sheets(replace(rig, lasers=rig.lasers[i : i + 1]), [source])
         at = source.position + np.outer([0.5, 1.0], source.direction)
         light = light_on_points(at, sheets_of_one, 0.0)
         assert light[0] == pytest.approx(source.power, rel=1e-3)
@@ -92,7 +92,7 @@ def test_power_is_stated_half_a_metre_from_the_source():
         [laser.plane.normal for laser in rig.lasers], [laser.plane.offset for laser in rig.lasers]
     )[None]
     alone = [
-        light_on_points(cross, pack_sheets([laser], [source]), 0.3)[0]
+        light_on_points(cross, pack_sheets(replace(rig, lasers=(laser,)), [source]), 0.3)[0]
         for laser, source in zip(rig.lasers, sources, strict=True)
     ]
     assert light_on_points(cross, sheets, 0.3)[0] == pytest.approx(sum(alone))

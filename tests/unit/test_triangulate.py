@@ -10,8 +10,11 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.triangulate import Triangulation, Triangulator
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.lasers import default_sources
+from windowed_cases import windowed
 
 RIGS = [example_rig, bluerov2_rig]
 
@@ -88,6 +91,67 @@ def test_the_sensitivity_stays_on_the_sheet() -> None:
     off = np.abs(np.sum(found.sensitivity * normals, axis=1))[found.valid]
     along = np.linalg.norm(found.sensitivity, axis=1)[found.valid]
     assert np.all(off < 1e-9 * np.maximum(along, 1.0))
+
+
+def bent_sheet_points(rig: Rig, camera: Camera, n: int = 3000) -> tuple[FloatArray, IntArray]:
+    """Points on the rig's bent sheets that the camera sees, and their lasers, stripe by stripe."""
+    rng = np.random.default_rng(5)
+    parts = []
+    for sheet, source in zip(sheets_of(rig), default_sources(rig), strict=True):
+        angle = np.sort(rng.uniform(-0.5, 0.5, n))[:, None]
+        side = np.cross(sheet.plane.normal, source.direction)
+        rays, _ = sheet.shine(np.cos(angle) * source.direction + np.sin(angle) * side)
+        points = rays.points_at(0.6 + 0.1 * np.sin(9.0 * angle[:, 0]))
+        pixels, valid = camera.project(points)
+        parts.append(points[valid & camera.inside_image(pixels)])
+    laser = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return np.concatenate(parts), laser
+
+
+@pytest.mark.parametrize("make_rig", RIGS)
+@pytest.mark.parametrize("grouped", [False, True])
+def test_bent_sheets(make_rig: Callable[[], Rig], grouped: bool) -> None:
+    rig = windowed(make_rig())
+    camera = rig.camera()
+    points, laser = bent_sheet_points(rig, camera)
+    assert np.all(np.bincount(laser) > 500)
+    pixels, _ = camera.project(points)
+    along_x = (laser == 1).astype(np.int64)
+    group = 1000 * laser + np.arange(len(laser)) // 16 if grouped else None
+    triangulator = Triangulator(rig, camera)
+    found = triangulator.triangulate(pixels, along_x, laser, group)
+    assert found.valid.all()
+    np.testing.assert_allclose(found.points_in_dome, points, rtol=0.0, atol=1e-9)
+    step = 1e-3 * np.stack([along_x, 1 - along_x], axis=-1)
+    after = triangulator.triangulate(pixels + step, along_x, laser).points_in_dome
+    before = triangulator.triangulate(pixels - step, along_x, laser).points_in_dome
+    expected = (after - before) / 2e-3
+    size = np.linalg.norm(expected, axis=1)
+    error = np.linalg.norm(found.sensitivity - expected, axis=1)[size < 5e-3]
+    # One-sided differences of a quarter of a pixel; neighbours share that of the first.
+    assert np.median(error / size[size < 5e-3]) < 0.01
+    assert np.max(error / size[size < 5e-3]) < 0.05
+
+
+def test_windows_of_some_lasers_leave_the_others_alone() -> None:
+    plain = example_rig()
+    bent = windowed(plain)
+    mixed = replace(plain, lasers=(plain.lasers[0], bent.lasers[1], plain.lasers[2]))
+    camera = plain.camera()
+    pixels = np.random.default_rng(0).uniform([0, 0], plain.size_px, (900, 2))
+    laser, along_x = np.repeat([0, 1, 2], 300), np.zeros(900, np.int64)
+    found, planes, windows = (
+        Triangulator(rig, camera).triangulate(pixels, along_x, laser)
+        for rig in (mixed, plain, bent)
+    )
+    mine = laser == 1
+    for one, other in ((found, planes), (found, windows)):
+        same = mine if other is windows else ~mine
+        np.testing.assert_array_equal(one.points_in_dome[same], other.points_in_dome[same])
+        np.testing.assert_array_equal(one.sensitivity[same], other.sensitivity[same])
+        np.testing.assert_array_equal(one.valid[same], other.valid[same])
+    assert not found.valid.all()
+    assert found.valid[mine].sum() > 50
 
 
 def test_rays_that_miss_the_sheet_are_not_valid() -> None:

@@ -27,9 +27,9 @@ def asset(name: str) -> str:
     return files("aqualvs.app").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def page(parts: Mapping[str, str]) -> str:
-    """Fill the template; `parts` must be HTML already."""
-    return Template(asset("report.html")).substitute(parts)
+def page(parts: Mapping[str, str], template: str = "report.html") -> str:
+    """Fill a template that comes with the package; `parts` must be HTML already."""
+    return Template(asset(template)).substitute(parts)
 
 
 def embedded_json(data: object) -> str:
@@ -73,12 +73,15 @@ def posture_lead(track: Track, truth: FloatArray | None) -> str:
     return words
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> str:
-    """Return a table; the first `texts` columns are text, the others numbers (to the right).
+def table(
+    head: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, tail: int = 0
+) -> str:
+    """Return a table of numbers (to the right) between text columns.
 
-    Cells are escaped, except those that are `Raw`.
+    The first `texts` and the last `tail` columns are text. Cells are escaped, except those that
+    are `Raw`.
     """
-    kinds = ["" if i < texts else ' class="n"' for i in range(len(head))]
+    kinds = ["" if i < texts or i >= len(head) - tail else ' class="n"' for i in range(len(head))]
     top = "".join(f"<th{kind}>{escape(cell)}</th>" for kind, cell in zip(kinds, head, strict=True))
     body = "".join(
         "<tr>"
@@ -209,7 +212,7 @@ def picture_view(
 
 def laser_legend(names: list[str]) -> str:
     """Return the lasers' names beside their colours."""
-    items = "".join(f"<li>{_swatch(i)}{escape(name)}</li>" for i, name in enumerate(names))
+    items = "".join(f"<li>{swatch(i)}{escape(name)}</li>" for i, name in enumerate(names))
     return f'<ul class="legend">{items}</ul>'
 
 
@@ -277,7 +280,7 @@ def rig_view(run: Mapping[str, Any], lasers: list[LaserFacts]) -> str:
     ):
         content = run.get(key)
         if isinstance(content, dict) and content:
-            blocks.append(f"<div><h3>{title}</h3>{_fact_table(facts(content, skip))}</div>")
+            blocks.append(f"<div><h3>{title}</h3>{fact_table(facts(content, skip))}</div>")
     if not lasers and not blocks:
         return '<p class="note">run.yaml does not say.</p>'
     columns = "\n".join(blocks)
@@ -293,7 +296,8 @@ def _cell(cell: str) -> str:
     return cell if isinstance(cell, Raw) else escape(cell)
 
 
-def _swatch(index: int) -> str:
+def swatch(index: int) -> str:
+    """Return a patch in the colour of laser `index`."""
     return f'<span class="swatch" style="background:{laser_colour(index)}"></span>'
 
 
@@ -319,7 +323,7 @@ def _image(picture: Picture | None, missing: str, heading: str) -> str:
 def _laser_counts(points: PointSummary, names: list[str]) -> str:
     head = ("laser", *(LABEL_WORDS[label] for label in Label))
     rows = [
-        (Raw(_swatch(index) + escape(name)), *(f"{count:,}" for count in points.labels[index]))
+        (Raw(swatch(index) + escape(name)), *(f"{count:,}" for count in points.labels[index]))
         for index, name in enumerate(names)
     ]
     return table(head, rows)
@@ -335,13 +339,15 @@ def _both_errors(dome: FloatArray, bare: FloatArray, truth: FloatArray) -> str:
 
 
 def _laser_row(index: int, laser: LaserFacts) -> tuple[str, ...]:
-    name = Raw(_swatch(index) + escape(laser.name))
+    bent = " (bent sheet; the plane that fits it)" if laser.bent else ""
+    name = Raw(swatch(index) + escape(laser.name + bent))
     if not np.isfinite(laser.offset):
         return name, "–", "–", "–", "–"
     return name, *(signed(f"{v:+.5f}") for v in laser.normal), signed(f"{1e3 * laser.offset:.2f}")
 
 
-def _fact_table(rows: list[tuple[str, str]]) -> str:
+def fact_table(rows: Iterable[tuple[str, str]]) -> str:
+    """Return names and values as a table."""
     body = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>\n" for k, v in rows)
     return f'<div class="scroll"><table class="facts">{body}</table></div>'
 

@@ -1,13 +1,20 @@
-"""The rig as `run.yaml` holds it: lasers' planes, their own frames, and facts for the table."""
+"""The rig as `run.yaml` holds it: lasers' planes, their own frames, and facts for the table.
+
+A laser behind a window has a bent sheet; it is shown in the plane that fits the sheet best where
+the camera sees it.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from aqualvs.app.report_run import number
+from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rigfile import rig_from_mapping
+from aqualvs.optics.sheet import sheets_of
 
 # Lasers whose plane is square to the forward axis have no projection of it to use as y.
 _SQUARE = 1e-6
@@ -24,11 +31,14 @@ class LaserFacts:
         Unit normal in `dome`; NaN where the file has none.
     offset : float
         Metres.
+    bent : bool
+        Whether the plane only fits a bent sheet.
     """
 
     name: str
     normal: FloatArray
     offset: float
+    bent: bool = False
 
     @classmethod
     def unknown(cls, index: int) -> "LaserFacts":
@@ -57,7 +67,23 @@ def lasers_of(rig: Mapping[str, Any]) -> list[LaserFacts]:
     entries = rig.get("lasers")
     if not isinstance(entries, list):
         return []
-    return [_laser(entry, i) for i, entry in enumerate(entries) if isinstance(entry, dict)]
+    lasers = [_laser(entry, i) for i, entry in enumerate(entries) if isinstance(entry, dict)]
+    return _fitted(lasers, rig) if any(laser.bent for laser in lasers) else lasers
+
+
+def _fitted(lasers: list[LaserFacts], rig: Mapping[str, Any]) -> list[LaserFacts]:
+    """Give the lasers behind windows the planes of their sheets, NaN if the rig does not tell."""
+    try:
+        known = rig_from_mapping(rig, source_name="run.yaml")
+    except RigError:
+        nothing = np.full(3, np.nan)
+        return [replace(one, normal=nothing, offset=np.nan) if one.bent else one for one in lasers]
+    camera = known.camera()
+    planes = [sheet.best_plane(camera, known.working_range) for sheet in sheets_of(known)]
+    return [
+        replace(one, normal=plane.normal, offset=plane.offset) if one.bent else one
+        for one, plane in zip(lasers, planes, strict=True)
+    ]
 
 
 def working_range_m(rig: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -109,4 +135,5 @@ def _laser(entry: Mapping[str, Any], index: int) -> LaserFacts:
     if not length > 0.0:
         return LaserFacts(name, unknown.normal, unknown.offset)
     # As in rig files, the offset belongs to the unit normal.
-    return LaserFacts(name, normal / length, 1e-3 * number(entry.get("offset_mm")))
+    bent = entry.get("window") is not None
+    return LaserFacts(name, normal / length, 1e-3 * number(entry.get("offset_mm")), bent)

@@ -18,8 +18,8 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
-from aqualvs.optics.rigschema import VERSION, RigFile, WaterPart, parse_rig
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
+from aqualvs.optics.rigschema import VERSION, LaserPart, RigFile, WaterPart, parse_rig
 from aqualvs.optics.rigtext import read_yaml, rig_text
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
 
@@ -29,6 +29,11 @@ _MM = 1e3
 _ROTATION_DECIMALS = 12
 # Normals this close to unit length are kept as they are, so that loading and saving settle.
 _UNIT = 1e-14
+# A source measured with a ruler is as near as this to its laser's plane, in metres.
+_OFF_SHEET = 5e-3
+_LEAST_BEHIND = 1e-4
+# Cosine between the normals of sheet and window; nearer ones mean that no light could cross.
+_MOST_ACROSS = math.cos(math.radians(30.0))
 
 
 def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
@@ -145,10 +150,7 @@ def _rig(file: RigFile) -> Rig:
         else Dome(dome.inner_radius_mm / _MM, dome.thickness_mm / _MM, dome.n_acrylic),
         n_air=file.n_air,
         n_water=_water_index(file.water, file.n_air),
-        lasers=tuple(
-            Laser(part.name, _plane(i, part.normal, part.offset_mm))
-            for i, part in enumerate(file.lasers)
-        ),
+        lasers=tuple(_laser(f"lasers[{i}]", part) for i, part in enumerate(file.lasers)),
         working_range=(file.working_range_mm[0] / _MM, file.working_range_mm[1] / _MM),
         solved_from=dict(file.solved_from),
     )
@@ -190,14 +192,52 @@ def _water_index(water: WaterPart, n_air: float) -> float:
     return float(n)
 
 
-def _plane(i_laser: int, normal: Sequence[float], offset_mm: float) -> Plane:
+def _laser(place: str, part: LaserPart) -> Laser:
+    plane = _plane(place, part.normal, part.offset_mm)
+    if part.window is None:
+        return Laser(part.name, plane)
+    place, face = f"{place}.window", part.window
+    window = Window(
+        _plane(place, face.normal, face.offset_mm), np.array(face.source_mm, np.float64) / _MM
+    )
+    _check_window(place, face.source_mm, plane, window)
+    return Laser(part.name, plane, window)
+
+
+def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Window) -> None:
+    """Refuse a source off its sheet or not behind the window, and a window no light crosses."""
+    off = float(sheet.signed_distance(window.source))
+    if abs(off) > _OFF_SHEET:
+        raise RigError(
+            f"{place}.source_mm is {source_mm}, {abs(off) * _MM:.1f} mm off the laser's plane; the "
+            "light comes from a point in it: correct source_mm, or the laser's normal and offset_mm"
+        )
+    across = abs(float(sheet.normal @ window.face.normal))
+    if across > _MOST_ACROSS:
+        raise RigError(
+            f"{place}.normal is {math.degrees(math.acos(min(across, 1.0))):.0f} degrees from the "
+            "laser's normal, so its light would run along the glass; give the normal of the "
+            "window, which lies rather in the laser's plane"
+        )
+    source = window.source - off * sheet.normal
+    ahead = np.array([0.0, 1.0, 0.0]) - sheet.normal[1] * sheet.normal
+    behind = -float(window.face.signed_distance(source))
+    # Light that goes forward must meet the face after it has left the source.
+    if abs(behind) < _LEAST_BEHIND or behind * float(window.face.normal @ ahead) < 0.0:
+        raise RigError(
+            f"{place}.source_mm is {source_mm}, which is not behind the window as a target ahead "
+            "sees it; correct source_mm, or the window's offset_mm, which is that of its outer face"
+        )
+
+
+def _plane(place: str, normal: Sequence[float], offset_mm: float) -> Plane:
     """Plane with the direction of `normal`; the offset belongs to the unit normal."""
     vector: FloatArray = np.array(normal, dtype=np.float64)
     length = math.hypot(*normal)
     if length == 0.0:
         raise RigError(
-            f"lasers[{i_laser}].normal is {list(normal)}, which has no direction; give the "
-            "normal of the laser's plane"
+            f"{place}.normal is {list(normal)}, which has no direction; give the normal of the "
+            f"{'window' if place.endswith('window') else 'laser'}'s plane"
         )
     if abs(length - 1.0) > _UNIT:
         vector = vector / length
@@ -249,10 +289,17 @@ def _camera_mapping(rig: Rig) -> dict[str, Any]:
 
 
 def _laser_mapping(laser: Laser) -> dict[str, Any]:
+    content = {"name": laser.name, **_plane_mapping(laser.plane)}
+    if laser.window is not None:
+        face, source = laser.window.face, laser.window.source
+        content["window"] = {**_plane_mapping(face), "source_mm": _all_to_mm(source)}
+    return content
+
+
+def _plane_mapping(plane: Plane) -> dict[str, Any]:
     return {
-        "name": laser.name,
-        "normal": [float(value) for value in laser.plane.normal],
-        "offset_mm": _to_mm(laser.plane.offset),
+        "normal": [float(value) for value in plane.normal],
+        "offset_mm": _to_mm(plane.offset),
     }
 
 

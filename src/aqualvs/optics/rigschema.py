@@ -67,12 +67,21 @@ class WaterPart(_Part):
     wavelength_nm: Number | None = None
 
 
+class WindowPart(_Part):
+    """`window` of a laser: its outer face in `dome`, and where the light comes from."""
+
+    normal: Triple
+    offset_mm: Number
+    source_mm: Triple
+
+
 class LaserPart(_Part):
     """One of `lasers`: a plane in `dome`; `offset_mm` belongs to the unit normal."""
 
     name: Name
     normal: Triple
     offset_mm: Number
+    window: WindowPart | None = None
 
 
 class RigFile(_Part):
@@ -203,6 +212,8 @@ _EXAMPLES: dict[str, str] = {
     "name": "name: left",
     "normal": "normal: [1.0, 0.0, 0.0]",
     "offset_mm": "offset_mm: -140.0",
+    "window": "window: {normal: [0, 1, 0], offset_mm: 40, source_mm: [-140, 20, 0]}",
+    "source_mm": "source_mm: [-140, 20, 0]",
     "working_range_mm": "working_range_mm: [250, 1300]",
     "solved_from": "solved_from: {views: 14}",
 }
@@ -237,6 +248,7 @@ _PARTS: dict[str, type[BaseModel]] = {
     "dome": DomePart,
     "water": WaterPart,
     "lasers": LaserPart,
+    "window": WindowPart,
 }
 
 

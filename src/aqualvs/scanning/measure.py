@@ -7,8 +7,10 @@ from enum import StrEnum
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.optics.sheet_kernels import COLUMNS, START, WINDOWED, sheet_distance
 from aqualvs.scanning.plane_fit import (
     MESH_ERROR,
     SOLID_ERROR,
@@ -75,7 +77,10 @@ class PostureMeter:
         self._fit_method = fit
         self._n_lines = np.array([len(search.lowest) for search in searches])
         self._working_range = rig.working_range
-        self._planes = np.array([[*one.plane.normal, one.plane.offset] for one in rig.lasers])
+        sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
+        self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
+        # A kernel that is given None is compiled without the way to bent sheets.
+        self._bent = sheets if sheets[:, WINDOWED].any() else None
         self._focal_px = rig.focal_px
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
@@ -103,6 +108,7 @@ class PostureMeter:
             _SHORTEST_STRAND if target.is_mesh else 1,
             target.members[chunk_index],
             self._planes,
+            self._bent,
             self._focal_px,
             group,
         )
@@ -163,6 +169,7 @@ def _select(
     min_lines: int,
     on_target: BoolArray,
     planes: FloatArray,
+    bent: FloatArray | None,
     focal_px: float,
     group: IntArray,
 ) -> tuple[int, int]:
@@ -188,7 +195,7 @@ def _select(
     for i in range(n):
         group[i] = -1
         p = piece[i]
-        if number[p] == -1 or _in_crossing(points, i, laser[i], planes, mean_width, focal_px):
+        if number[p] == -1 or _in_crossing(points, i, laser[i], planes, bent, mean_width, focal_px):
             continue
         if number[p] == -2:
             number[p] = n_groups
@@ -213,12 +220,13 @@ def _mean_widths(
     return total
 
 
-@kernel
+@borrowing_kernel
 def _in_crossing(
     points: FloatArray,
     i: int,
     own: int,
     planes: FloatArray,
+    bent: FloatArray | None,
     mean_width: FloatArray,
     focal_px: float,
 ) -> bool:
@@ -228,8 +236,10 @@ def _in_crossing(
     for b in range(planes.shape[0]):
         if b == own or mean_width[b] < 0.0:
             continue
-        gap = abs(planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3])
+        gap = planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3]
+        if bent is not None:
+            gap = sheet_distance(bent[b], x, y, z)
         wide = max(mean_width[b], mean_width[own])
-        if gap * px_per_m < _CROSSING_WIDTHS * wide + _CROSSING_PX:
+        if abs(gap) * px_per_m < _CROSSING_WIDTHS * wide + _CROSSING_PX:
             return True
     return False

@@ -6,6 +6,7 @@ import numpy as np
 
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
@@ -65,6 +66,7 @@ class Scanner:
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
+        self._planes = [one.best_plane(camera, rig.working_range) for one in sheets_of(rig)]
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -111,11 +113,11 @@ class Scanner:
         if self.options.mesh_filter is None or not len(readings):
             return readings
         kept = np.zeros(len(readings), np.bool_)
-        for i, laser in enumerate(self.rig.lasers):
+        for i, plane in enumerate(self._planes):
             mine = readings.laser == i
             kept[mine] = mesh_filter(
                 readings.points[mine],
-                laser.plane,
+                plane,
                 self.options.mesh_filter,
                 working_range=self.rig.working_range,
             )

@@ -10,10 +10,10 @@ from enum import Enum
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import Sheet, sheets_of
 
 SLOPE_CELL = 8
 """Positions, and search lines, per cell of the slope tables and of the grid bands come from."""
@@ -89,18 +89,18 @@ def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
     tuple of StripeSearch
         In the order of `rig.lasers`.
     """
-    return tuple(_plan_search(laser.plane, rig.working_range, camera) for laser in rig.lasers)
+    return tuple(_plan_search(sheet, rig.working_range, camera) for sheet in sheets_of(rig))
 
 
-def _plan_search(plane: Plane, working_range: tuple[float, float], camera: Camera) -> StripeSearch:
-    points, in_band = _points_on_grid(plane, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
+def _plan_search(sheet: Sheet, working_range: tuple[float, float], camera: Camera) -> StripeSearch:
+    points, in_band = _points_on_grid(sheet, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
     rise, run = _stripe_directions(points)
     axis = _search_axis(rise[0], run[0], in_band)
     line_px = 2 if camera.size_px[0] >= _PIXELS_PER_LINE_FROM else 1
     along_x = axis is SearchAxis.ALONG_X
     wide = SLOPE_CELL * line_px
     steps = (SLOPE_CELL, wide) if along_x else (wide, SLOPE_CELL)
-    points, in_band = _points_on_grid(plane, working_range, camera, steps)
+    points, in_band = _points_on_grid(sheet, working_range, camera, steps)
     if along_x:
         points, in_band = points.swapaxes(0, 1), in_band.T
     # Seen with search lines as columns, the change along a line is the rise.
@@ -111,7 +111,7 @@ def _plan_search(plane: Plane, working_range: tuple[float, float], camera: Camer
 
 
 def _points_on_grid(
-    plane: Plane,
+    sheet: Sheet,
     working_range: tuple[float, float],
     camera: Camera,
     steps: tuple[int, int],
@@ -120,7 +120,7 @@ def _points_on_grid(
     width, height = camera.size_px
     x = np.arange(0, width + steps[0], steps[0], dtype=np.float64)
     y = np.arange(0, height + steps[1], steps[1], dtype=np.float64)
-    points, valid = plane.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
+    points, valid = sheet.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
     distance = np.linalg.norm(points, axis=-1)
     near, far = searched_range(working_range)
     # A plane at range d has no point nearer than d, so the near bound is exact.

@@ -8,6 +8,8 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_kernel, kernel
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import packed_sheets
+from aqualvs.optics.sheet_kernels import START, WINDOWED, meet_sheet
 
 # Step of the one-sided difference, in pixels; the second derivative of a point by the pixel is
 # about 1e-2 of the first, so the error stays below 1 % of a sensitivity.
@@ -36,21 +38,21 @@ class Triangulation:
 
 
 class Triangulator:
-    """Triangulates pixels with a rig's laser planes (paper, Eq. 17-21).
+    """Triangulates pixels with a rig's laser sheets (paper, Eq. 17-21, where they are planes).
 
     Parameters
     ----------
     rig : Rig
-        Laser planes.
+        Lasers, with the indices of air and water for those behind windows.
     camera : Camera
         Of the rig, behind its dome or bare.
     """
 
     def __init__(self, rig: Rig, camera: Camera) -> None:
         self._camera = camera
-        self._planes = np.array(
-            [[*laser.plane.normal, laser.plane.offset] for laser in rig.lasers]
-        ).reshape(-1, 4)
+        self._sheets = packed_sheets(rig, camera)
+        self._planes = np.ascontiguousarray(self._sheets[:, START : START + 4])
+        self._bent = bool(self._sheets[:, WINDOWED].any())
 
     def triangulate(
         self,
@@ -82,9 +84,13 @@ class Triangulator:
         seen = np.empty(n_rays, np.bool_)
         self._camera.rays_into(rays_px[:n_rays], origins, directions, seen)
         points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-        _intersect_sheets(
+        _intersect_planes(
             self._planes, laser, owner, origins, directions, seen, points, sensitivity, valid
         )
+        if self._bent:
+            _intersect_bent_sheets(
+                self._sheets, laser, owner, origins, directions, seen, points, sensitivity, valid
+            )
         return Triangulation(points, sensitivity, valid)
 
 
@@ -114,7 +120,7 @@ def _place_rays(
 
 
 @kernel
-def _intersect_sheets(
+def _intersect_planes(
     planes: FloatArray,
     laser: IntArray,
     owner: IntArray,
@@ -153,3 +159,51 @@ def _distance_to_sheet(
 ) -> float:
     approach = nx * direction[0] + ny * direction[1] + nz * direction[2]
     return float((offset - nx * origin[0] - ny * origin[1] - nz * origin[2]) / approach)
+
+
+@borrowing_kernel
+def _intersect_bent_sheets(
+    sheets: FloatArray,
+    laser: IntArray,
+    owner: IntArray,
+    origins: FloatArray,
+    directions: FloatArray,
+    seen: BoolArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Move the points of bent sheets from the planes near them onto them.
+
+    A sheet's tangent plane at a point stands for it where the moved ray passes, and nearly where
+    the next ray of the group does.
+    """
+    sx, sy, sz = np.nan, np.nan, np.nan
+    near = np.nan
+    for i in range(points.shape[0]):
+        sheet = sheets[laser[i]]
+        if sheet[WINDOWED] == 0.0:
+            continue
+        ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        j = owner[i]
+        first = i == 0 or j != owner[i - 1]
+        if first or near != near:
+            nx, ny, nz, offset = sheet[0], sheet[1], sheet[2], sheet[3]
+        near = (offset - nx * ox - ny * oy - nz * oz) / (nx * dx + ny * dy + nz * dz)
+        near, nx, ny, nz = meet_sheet(sheet, ox, oy, oz, dx, dy, dz, near)
+        x, y, z = ox + near * dx, oy + near * dy, oz + near * dz
+        offset = nx * x + ny * y + nz * z
+        if first:
+            ox, oy, oz = origins[j, 0], origins[j, 1], origins[j, 2]
+            dx, dy, dz = directions[j, 0], directions[j, 1], directions[j, 2]
+            moved = (offset - nx * ox - ny * oy - nz * oz) / (nx * dx + ny * dy + nz * dz)
+            moved = moved if seen[j] and 0.0 < moved < np.inf else np.nan
+            sx = (ox + moved * dx - x) / _DIFFERENCE_PX
+            sy = (oy + moved * dy - y) / _DIFFERENCE_PX
+            sz = (oz + moved * dz - z) / _DIFFERENCE_PX
+        valid[i] = seen[i] and near == near and sx == sx
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
+        sensitivity[i, 0], sensitivity[i, 1], sensitivity[i, 2] = sx, sy, sz
+        if not valid[i]:
+            points[i, 0], points[i, 1], points[i, 2] = np.nan, np.nan, np.nan

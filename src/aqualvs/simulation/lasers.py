@@ -10,6 +10,8 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.sheet import Sheet, packed_sheets, sheet_in, sheets_of
+from aqualvs.optics.sheet_kernels import START, WINDOWED, crossing
 from aqualvs.simulation.vectors import Vec, dot, minus, row3
 
 # Columns of the sheet table.
@@ -23,6 +25,8 @@ N_FAN = 3001
 # The fan's edge rolls off over this angle.
 _EDGE = np.deg2rad(0.8)
 _ON_PLANE = 1e-6
+# The light's way to a point is at most so many times as long as the straight line.
+_BENT_WAY = 1.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,15 +36,16 @@ class LaserSource:
     Attributes
     ----------
     position : array, shape (3,)
-        The fan's origin in `dome`, on the laser's plane, in metres.
+        The fan's origin in `dome`, on the laser's plane, in metres. Behind a window it is the
+        window's source.
     direction : array, shape (3,)
-        Unit vector of the fan's middle in `dome`, in the laser's plane.
+        Unit vector of the fan's middle in `dome`, in the laser's plane (in air, behind a window).
     half_angle : float
-        Half the fan's opening in radians.
+        Half the fan's opening in radians (in air, behind a window).
     sigma : float
         Standard deviation of the sheet's thickness at the source, in metres.
     divergence : float
-        Growth of that standard deviation with distance, in radians.
+        Growth of that standard deviation with distance (in the water), in radians.
     power : float
         Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the
         source, in clear water.
@@ -65,20 +70,30 @@ class Sheets(NamedTuple):
         Relative power over the tangent of the fan angle, from -reach to reach.
     first : array, shape (n, N_FAN)
         Distance from the source at which the sheet's middle meets a surface; infinite where none.
+    optics : array, shape (n, COLUMNS)
+        The sheets as kernels of `aqualvs.optics.sheet_kernels` take them.
+    stray : array, shape (n, 2)
+        How far at most a bent sheet lies off the plane near it: metres at the window, and metres
+        for every metre from the source.
     """
 
     table: FloatArray
     fan: FloatArray
     first: FloatArray
+    optics: FloatArray
+    stray: FloatArray
 
 
 def default_sources(rig: Rig) -> tuple[LaserSource, ...]:
     """Return a source for every laser of a rig: beside the dome, aimed forward in its plane."""
-    return tuple(_source_on(laser) for laser in rig.lasers)
+    return tuple(_source_on(laser, rig) for laser in rig.lasers)
 
 
-def _source_on(laser: Laser) -> LaserSource:
-    """Lead from the plane's point nearest to the dome back to 10 mm before the dome's centre."""
+def _source_on(laser: Laser, rig: Rig) -> LaserSource:
+    """Lead from the plane's point nearest to the dome back to 10 mm before the dome's centre.
+
+    Behind a window the source is where the rig says.
+    """
     normal = laser.plane.normal
     forward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     length = float(np.linalg.norm(forward))
@@ -88,32 +103,46 @@ def _source_on(laser: Laser) -> LaserSource:
             "appear; check the plane's normal in the rig"
         )
     forward /= length
+    if laser.window is not None:
+        source = sheet_in(laser, rig.n_air, rig.n_water).source
+        return LaserSource(position=source, direction=forward)
     foot = normal * laser.plane.offset
     back = (foot[1] - 0.01) / forward[1]
     return LaserSource(position=foot - back * forward, direction=forward)
 
 
-def pack_sheets(lasers: Sequence[Laser], sources: Sequence[LaserSource]) -> Sheets:
-    """Return the tables of laser sheets that nothing shadows yet.
+def pack_sheets(rig: Rig, sources: Sequence[LaserSource]) -> Sheets:
+    """Return the tables of a rig's laser sheets that nothing shadows yet.
 
     Raises
     ------
     RigError
-        If there is not one source for every laser, or a source is off its laser's plane.
+        If there is not one source for every laser, or a source is off its laser's plane or not
+        where its laser's window says.
     """
+    lasers, sheets = rig.lasers, sheets_of(rig)
     if len(sources) != len(lasers):
         raise RigError(f"{len(lasers)} lasers but {len(sources)} sources; give one for each laser")
     table = np.zeros((len(lasers), _COLUMNS))
     fan = np.zeros((len(lasers), N_FAN))
     for i, (laser, source) in enumerate(zip(lasers, sources, strict=True)):
-        table[i] = _pack_sheet(laser, source)
+        table[i] = _pack_sheet(laser, sheets[i], source)
         tangents = np.linspace(-table[i, REACH], table[i, REACH], N_FAN)
         past_edge = (np.abs(np.arctan(tangents)) - source.half_angle) / _EDGE
         fan[i] = 1.0 / (1.0 + np.exp(np.clip(8.0 * past_edge, -60.0, 60.0)))
-    return Sheets(table, fan, np.full_like(fan, np.inf))
+    optics = packed_sheets(rig, rig.camera())
+    stray = np.zeros((len(lasers), 2))
+    packed = Sheets(table, fan, np.full_like(fan, np.inf), optics, stray)
+    for i, sheet in enumerate(sheets):
+        if not sheet.is_plane:
+            rays, _ = sheet.shine(_fan_directions(packed, i))
+            plane = optics[i, START : START + 4]
+            off = np.abs(rays.origins @ plane[:3] - plane[3]), np.abs(rays.directions @ plane[:3])
+            stray[i] = [np.max(one[rays.valid], initial=0.0) for one in off]
+    return packed
 
 
-def _pack_sheet(laser: Laser, source: LaserSource) -> FloatArray:
+def _pack_sheet(laser: Laser, sheet: Sheet, source: LaserSource) -> FloatArray:
     normal = laser.plane.normal
     off = float(laser.plane.signed_distance(source.position))
     tilt = float(normal @ source.direction)
@@ -122,36 +151,94 @@ def _pack_sheet(laser: Laser, source: LaserSource) -> FloatArray:
             f"laser {laser.name}: its source is {1e3 * off:.3f} mm off its plane or aims "
             f"{np.rad2deg(tilt):.3f} deg out of it; put both in the plane"
         )
+    apart = 0.0 if sheet.is_plane else float(np.linalg.norm(source.position - sheet.source))
+    if apart > _ON_PLANE:
+        raise RigError(
+            f"laser {laser.name}: its source is {1e3 * apart:.3f} mm from where its window's "
+            "source_mm has it; put both in one place"
+        )
     side = np.cross(normal, source.direction)
     shape = [source.sigma, source.divergence, source.power]
     reach = np.tan(min(source.half_angle + 2.0 * _EDGE, np.deg2rad(85.0)))
     return np.concatenate([source.position, normal, source.direction, side, shape, [reach]])
 
 
-def fan_rays(sheets: Sheets, i: int) -> tuple[FloatArray, FloatArray]:
-    """Return origins and unit directions, shape (N_FAN, 3), of the rays in a sheet's middle."""
+class FanRays(NamedTuple):
+    """The rays in a sheet's middle, as they are in the water.
+
+    Attributes
+    ----------
+    origins, directions : array, shape (N_FAN, 3)
+        Where they enter the water, or leave the source where there is no window; unit directions.
+    way : array, shape (N_FAN,)
+        Length of the light's way from the source to there.
+    """
+
+    origins: FloatArray
+    directions: FloatArray
+    way: FloatArray
+
+
+def fan_rays(rig: Rig, sheets: Sheets, i: int) -> FanRays:
+    """Return the rays in a sheet's middle; NaN where light does not pass the window."""
+    directions = _fan_directions(sheets, i)
+    sheet = sheet_in(rig.lasers[i], rig.n_air, rig.n_water)
+    if sheet.is_plane:
+        origins = np.tile(sheets.table[i, SOURCE : SOURCE + 3], (N_FAN, 1))
+        return FanRays(origins, directions, np.zeros(N_FAN))
+    bent, way = sheet.shine(directions)
+    return FanRays(bent.origins, bent.directions, way)
+
+
+def _fan_directions(sheets: Sheets, i: int) -> FloatArray:
+    """Return unit directions (N_FAN, 3) in which a sheet's middle leaves its source."""
     row = sheets.table[i]
     tangents = np.linspace(-row[REACH], row[REACH], N_FAN)[:, None]
-    directions = row[CENTRE : CENTRE + 3] + tangents * row[SIDE : SIDE + 3]
+    directions: FloatArray = row[CENTRE : CENTRE + 3] + tangents * row[SIDE : SIDE + 3]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.tile(row[SOURCE : SOURCE + 3], (N_FAN, 1)), directions
+    return directions
 
 
 @inline_borrowing_kernel
-def sheet_coordinates(p: Vec, table: FloatArray, i: int) -> tuple[float, float, float, float]:
-    """Return distance off the sheet, distance from the source, place in the fan, sigma.
+def sheet_coordinates(p: Vec, sheets: Sheets, i: int) -> tuple[float, float, float, float]:
+    """Return distance off the sheet, length of the light's way, place in the fan, sigma.
 
     The place in the fan is a fractional index of `Sheets.fan`, negative outside the fan.
     """
+    table = sheets.table
     rel = minus(p, row3(table, i, SOURCE))
-    off = dot(rel, row3(table, i, NORMAL))
+    off, distance = dot(rel, row3(table, i, NORMAL)), 0.0
+    bent = sheets.optics[i, WINDOWED] != 0.0
+    if bent:
+        reach = np.sqrt(dot(rel, rel))
+        wide = CUT * (table[i, SIGMA] + table[i, DIVERGENCE] * reach)
+        wide += sheets.stray[i, 0] + _BENT_WAY * sheets.stray[i, 1] * reach
+        start = row3(sheets.optics, i, START)
+        # Few points are near a sheet, and a dot product says so sooner than Snell's law.
+        if abs(dot(p, start) - sheets.optics[i, START + 3]) > wide:
+            return off, 0.0, -1.0, 1.0
+        off, rel, above = through_window(p, sheets, i)
+        if not above > 0.0:
+            return off, 0.0, -1.0, 1.0
+        after = minus(minus(p, row3(table, i, SOURCE)), rel)
+        distance = np.sqrt(dot(after, after))
     forward, lateral = dot(rel, row3(table, i, CENTRE)), dot(rel, row3(table, i, SIDE))
     reach = table[i, REACH]
     if forward <= 0.0 or abs(lateral) >= reach * forward:
         return off, 0.0, -1.0, 1.0
     place = (lateral / (forward * reach) + 1.0) * 0.5 * (N_FAN - 1)
-    distance = np.sqrt(forward * forward + lateral * lateral)
+    distance += np.sqrt(forward * forward + lateral * lateral)
     return off, distance, place, table[i, SIGMA] + table[i, DIVERGENCE] * distance
+
+
+@inline_borrowing_kernel
+def through_window(p: Vec, sheets: Sheets, i: int) -> tuple[float, Vec, float]:
+    """Return distance off a bent sheet, the way from the source to its window, height above that.
+
+    The way is that of the light which reaches the point; it exists where the height is positive.
+    """
+    off, x, y, z, above = crossing(sheets.optics[i], p[0], p[1], p[2])
+    return off, (x, y, z), above
 
 
 @inline_borrowing_kernel
@@ -182,7 +269,7 @@ def _light_on_points(
     for k in range(points.shape[0]):
         p = row3(points, k, 0)
         for i in range(sheets.table.shape[0]):
-            off, distance, place, sigma = sheet_coordinates(p, sheets.table, i)
+            off, distance, place, sigma = sheet_coordinates(p, sheets, i)
             if place < 0.0 or distance > sheets.first[i, int(place + 0.5)]:
                 continue
             peak = peak_irradiance(distance, sigma, place, attenuation, sheets, i)

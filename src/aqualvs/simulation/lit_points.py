@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel
-from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.rig import Rig
 from aqualvs.simulation.lasers import LaserSource, Sheets, fan_rays, pack_sheets
 from aqualvs.simulation.scene import Label
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
@@ -48,19 +48,18 @@ class LitPoints:
         return len(self.laser)
 
 
-def light_sheets(
-    lasers: Sequence[Laser], sources: Sequence[LaserSource], surfaces: Surfaces
-) -> Sheets:
+def light_sheets(rig: Rig, sources: Sequence[LaserSource], surfaces: Surfaces) -> Sheets:
     """Return the tables of laser sheets with the distances at which surfaces end them."""
-    sheets = pack_sheets(lasers, sources)
-    for i in range(len(lasers)):
-        sheets.first[i] = cast(*fan_rays(sheets, i), surfaces).solid
+    sheets = pack_sheets(rig, sources)
+    for i in range(len(rig.lasers)):
+        origins, directions, way = fan_rays(rig, sheets, i)
+        sheets.first[i] = way + cast(origins, directions, surfaces).solid
     return sheets
 
 
 def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
     """Trace every sheet's middle from its source, project what it meets, drop what is hidden."""
-    found = [_lit_by(i, surfaces, sheets) for i in range(len(sheets.table))]
+    found = [_lit_by(i, rig, surfaces, sheets) for i in range(len(sheets.table))]
     points = np.concatenate([np.empty((0, 3)), *(p for p, _ in found)])
     label = np.concatenate([np.empty(0, dtype=np.int32), *(kind for _, kind in found)])
     laser = np.repeat(np.arange(len(found), dtype=np.int32), [len(p) for p, _ in found])
@@ -74,11 +73,13 @@ def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
     return LitPoints(points[seen], pixels[seen], laser[seen], label[seen].astype(np.int32))
 
 
-def _lit_by(i: int, surfaces: Surfaces, sheets: Sheets) -> tuple[FloatArray, NDArray[np.int32]]:
+def _lit_by(
+    i: int, rig: Rig, surfaces: Surfaces, sheets: Sheets
+) -> tuple[FloatArray, NDArray[np.int32]]:
     """Points and labels that sheet i lights; bubbles cast no shadow, so both may be on one ray."""
-    origins, directions = fan_rays(sheets, i)
+    origins, directions, way = fan_rays(rig, sheets, i)
     reach, kind, bubble = cast(origins, directions, surfaces)
-    strong = sheets.fan[i] > _FAN_FLOOR
+    strong = (sheets.fan[i] > _FAN_FLOOR) & np.isfinite(way)
     solid, clear = strong & np.isfinite(reach), strong & (bubble < reach)
     points = np.concatenate(
         [

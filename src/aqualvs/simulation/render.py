@@ -7,7 +7,7 @@ so any number of them costs no further refraction.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ class Renderer:
     Attributes
     ----------
     rig : Rig
-        Camera, housing, water and laser planes.
+        Camera, housing, water and lasers.
     sources : sequence of LaserSource
         One for each laser; by default they follow from the rig (`default_sources`).
     samples : int
@@ -104,9 +104,9 @@ class Renderer:
 
     def _pack(self, scene: Scene, t: float) -> tuple[Surfaces, Sheets]:
         surfaces = pack_surfaces(scene, t)
-        on = scene.lasers_on
-        lasers, sources = (self.rig.lasers, self.sources) if on else ((), ())
-        return surfaces, light_sheets(lasers, sources, surfaces)
+        if not scene.lasers_on:
+            return surfaces, light_sheets(replace(self.rig, lasers=()), (), surfaces)
+        return surfaces, light_sheets(self.rig, self.sources, surfaces)
 
     def _radiance(
         self, scene: Scene, t: float, surfaces: Surfaces, sheets: Sheets

@@ -1,0 +1,366 @@
+"""Sheets of laser light as they are in the water: planes, or bent at a flat window.
+
+A laser behind a window that is tilted to its beam lights no plane: the sheet leaves the window as
+another plane would, then strays from it by millimetres within the working range, and moves with the
+water's index. A `Sheet` answers for both kinds; `aqualvs.optics.sheet_kernels` has the mathematics.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.rays import Rays
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.refraction import refract
+from aqualvs.optics.rig import Laser, Rig, Window
+from aqualvs.optics.sheet_kernels import (
+    COLUMNS,
+    DEPTH,
+    FACE,
+    NORMAL,
+    OFFSET,
+    RATIO,
+    SLANT,
+    SOURCE,
+    START,
+    WINDOWED,
+    differentials,
+    distances,
+    meet_rays,
+    tangents,
+)
+from aqualvs.optics.uncertainty import (
+    LASER_PARAMETERS,
+    LASER_WINDOW_PARAMETERS,
+    moved_plane,
+    tangent_basis,
+)
+
+WINDOW_PARAMETERS = (*LASER_WINDOW_PARAMETERS, "n_water")
+"""Columns that follow `LASER_PARAMETERS` where there is a window.
+
+Only the ratio of the indices matters: the derivative by `n_air` is that by `n_water` times
+-n_water / n_air.
+"""
+
+# How far beyond the window the sheet's tangent plane stands for all of it, in metres.
+_USUAL_REACH = 0.6
+# Rays to each side on which a plane is fitted to a sheet.
+_GRID = (33, 25)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sheet:
+    """The light of one laser in the water, in `dome`.
+
+    Attributes
+    ----------
+    plane : Plane
+        As `Laser.plane`: in air, where there is a window.
+    window : Window or None
+        As `Laser.window`.
+    n_air, n_water : float
+        Refractive indices behind the window and in front of it.
+    """
+
+    plane: Plane
+    window: Window | None = None
+    n_air: float = 1.0
+    n_water: float = 1.0
+    _row: FloatArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_row", self._pack())
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether the sheet in the water is `plane` itself, because there is no window."""
+        return self.window is None
+
+    @property
+    def source(self) -> FloatArray:
+        """Where the light fans out from, exactly in the plane, shape (3,).
+
+        Raises
+        ------
+        ValueError
+            If there is no window: then nobody needs to know.
+        """
+        if self.window is None:
+            raise ValueError("a sheet without a window has no source")
+        at = self.window.source
+        return at - float(self.plane.signed_distance(at)) * self.plane.normal
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """What `signed_distance_with_parameter_jacobian` and `moved_by` call parameters."""
+        return LASER_PARAMETERS + (() if self.window is None else WINDOW_PARAMETERS)
+
+    def laser(self, name: str) -> Laser:
+        """Return the laser of this sheet, for a rig."""
+        return Laser(name, self.plane, self.window)
+
+    def signed_distance(self, points: ArrayLike) -> FloatArray:
+        """Return the signed distance (...) of points (..., 3) from the sheet, in metres.
+
+        Exact for planes. Behind a window it is exactly zero on the sheet and grows by a metre a
+        metre to 1 %, half a metre from a source that is 20 mm behind a window tilted by 25 degrees
+        to the sheet (5 % if it is tilted along the sheet by as much again); less tilt, a nearer
+        source or more distance make it better. What lies behind the window's face is measured from
+        the plane in air. The sign is that of `plane`.
+        """
+        p = as_vectors(points, 3, "points")
+        if self.window is None:
+            return self.plane.signed_distance(p)
+        found = np.empty(p.shape[:-1])
+        distances(self._row, p.reshape(-1, 3), found.reshape(-1))
+        return found
+
+    def gradient(self, points: ArrayLike) -> FloatArray:
+        """Return the gradient (..., 3) of `signed_distance` at points (..., 3)."""
+        return self._tangents(as_vectors(points, 3, "points"))[..., 1:]
+
+    def tangent_plane(self, point: ArrayLike) -> Plane:
+        """Return the plane that touches the sheet beside a point (3,) near it."""
+        p = as_vectors(point, 3, "point")
+        if self.window is None:
+            return self.plane
+        f, *gradient = self._tangents(p)
+        return Plane.from_normal(gradient, float(np.dot(gradient, p) - f))
+
+    def intersect(self, rays: Rays) -> tuple[FloatArray, BoolArray]:
+        """Intersect rays with the sheet, as `Plane.intersect` does with a plane.
+
+        Returns
+        -------
+        points : array, shape (..., 3)
+            NaN where there is none ahead, or none in front of the window's face.
+        valid : bool array, shape (...)
+
+        Notes
+        -----
+        Newton's method from the sheet's tangent plane, to 1e-12 m. A ray that grazes the sheet can
+        meet it twice; one of the two is found.
+        """
+        if self.window is None:
+            return self.plane.intersect(rays)
+        distance = np.empty(rays.valid.shape)
+        meet_rays(
+            self._row,
+            np.ascontiguousarray(rays.origins).reshape(-1, 3),
+            np.ascontiguousarray(rays.directions).reshape(-1, 3),
+            np.ascontiguousarray(rays.valid).reshape(-1),
+            distance.reshape(-1),
+        )
+        return rays.points_at(distance), np.isfinite(distance)
+
+    def best_plane(self, camera: Camera, working_range: tuple[float, float]) -> Plane:
+        """Return the plane that fits the sheet best where the camera sees it.
+
+        For whatever needs no more than roughly a plane: frames of drawings, the mesh filter, first
+        guesses. Without a window it is `plane`.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera that sees the sheet.
+        working_range : (float, float)
+            Points at these distances from the dome's centre count, in metres.
+        """
+        if self.window is None:
+            return self.plane
+        width, height = camera.size_px
+        x, y = np.meshgrid(
+            np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1])
+        )
+        points, valid = self.intersect(camera.rays(np.stack([x, y], axis=-1)))
+        points = points[valid]
+        distance = np.linalg.norm(points, axis=-1)
+        near, far = working_range
+        return self._fitted(points[(distance >= near) & (distance <= far)])
+
+    def shine(self, directions: ArrayLike) -> tuple[Rays, FloatArray]:
+        """Send light from the source through the window.
+
+        Parameters
+        ----------
+        directions : array, shape (..., 3)
+            Unit directions in air; those in the laser's plane are the sheet.
+
+        Returns
+        -------
+        rays : Rays
+            In the water, from the window's face on; not valid where the light misses the window or
+            is reflected back.
+        way : array, shape (...)
+            Length of the light's way to the face, in metres.
+
+        Raises
+        ------
+        ValueError
+            If there is no window.
+        """
+        if self.window is None:
+            raise ValueError("a sheet without a window has no source")
+        d, face = as_vectors(directions, 3, "directions"), self._row[FACE : FACE + 3]
+        ahead = d @ face
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = np.where(ahead > 0.0, self._row[DEPTH] / ahead, np.nan)
+        bent, through = refract(d, -face, n_in=self.n_air, n_out=self.n_water)
+        valid = through & np.isfinite(way)
+        bent = np.where(valid[..., None], bent, np.nan)
+        return Rays(self.source + way[..., None] * d, bent, valid), way
+
+    def signed_distance_with_parameter_jacobian(
+        self, points: ArrayLike
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the signed distances of points (N, 3) and their derivatives.
+
+        Returns
+        -------
+        distance : array, shape (N,)
+        by_point : array, shape (N, 3)
+        by_parameter : array, shape (N, P)
+            By `parameter_names`, at the step zero of `moved_by`.
+        """
+        p = as_vectors(points, 3, "points").reshape(-1, 3)
+        parts = np.empty((len(p), 12))
+        differentials(self._row, p, parts)
+        f, (by_v, by_slant, by_height, by_h, by_s, by_rho, by_k) = parts[:, 0], parts[:, 1:8].T
+        height, beside = parts[:, 8], parts[:, 9:]
+        normal, face, slant = self._row[NORMAL:OFFSET], self._row[FACE:SOURCE], self._row[SLANT]
+        by_point = (
+            by_v[:, None] * normal
+            + (by_height + by_h)[:, None] * face
+            + 2 * by_rho[:, None] * beside
+        )
+        # The source stays in the plane: as the plane moves along its normal, so does the source.
+        by_source_along_normal = -slant * (by_height + by_s) - 2.0 * by_rho * (beside @ normal)
+        columns = []
+        for tangent in tangent_basis(normal):
+            lag = float(tangent @ self._row[SOURCE:DEPTH])
+            turned = by_v * (p @ tangent) + by_slant * (tangent @ face)
+            columns.append(turned - lag * by_source_along_normal)
+        columns.append(by_source_along_normal - by_v)
+        if self.window is not None:
+            toward_water = self._toward_water(self.window)
+            for tangent in toward_water * tangent_basis(self.window.face.normal):
+                before = (p - self._row[SOURCE:DEPTH]) @ tangent
+                columns.append(
+                    by_slant * (tangent @ normal)
+                    + (by_height - 2.0 * height * by_rho) * before
+                    + by_h * (p @ tangent)
+                    - by_s * (tangent @ self._row[SOURCE:DEPTH])
+                )
+            columns.append(toward_water * (by_s - by_h))
+            for tangent in tangent_basis(normal):
+                columns.append(
+                    -(by_height + by_s) * (tangent @ face) - 2.0 * by_rho * (beside @ tangent)
+                )
+            columns.append(-by_k * self._row[RATIO] / self.n_water)
+        return f, by_point, np.stack(columns, axis=-1)
+
+    def moved_by(self, step: ArrayLike) -> "Sheet":
+        """Return the sheet with `step` (P,) added to the parameters `parameter_names`.
+
+        The source keeps to the plane. SI units and radians.
+        """
+        values = as_vectors(step, len(self.parameter_names), "step").tolist()
+        plane = moved_plane(self.plane, *values[:3])
+        if self.window is None:
+            return replace(self, plane=plane)
+        shift = np.array(values[6:8]) @ tangent_basis(self.plane.normal)
+        window = Window(moved_plane(self.window.face, *values[3:6]), self.source + shift)
+        moved = replace(self, plane=plane, window=window, n_water=self.n_water + values[8])
+        return replace(moved, window=replace(window, source=moved.source))
+
+    def packed(self, start: Plane | None = None) -> FloatArray:
+        """Return the sheet as kernels take it, shape (COLUMNS,).
+
+        Parameters
+        ----------
+        start : Plane, optional
+            Where searches along rays begin, such as `best_plane`; a tangent plane if left out.
+        """
+        row = self._row.copy()
+        if start is not None and self.window is not None:
+            row[START : START + 3], row[START + 3] = start.normal, start.offset
+        return row
+
+    def _tangents(self, points: FloatArray) -> FloatArray:
+        found = np.empty((*points.shape[:-1], 4))
+        tangents(self._row, points.reshape(-1, 3), found.reshape(-1, 4))
+        return found
+
+    def _toward_water(self, window: Window) -> float:
+        """1 if the face's normal points away from the source, else -1."""
+        return 1.0 if window.face.signed_distance(self.source) <= 0.0 else -1.0
+
+    def _pack(self) -> FloatArray:
+        row = np.zeros(COLUMNS)
+        for first in (START, NORMAL):
+            row[first : first + 3], row[first + 3] = self.plane.normal, self.plane.offset
+        # Any point of the plane is as good a source as another where nothing bends the light.
+        row[SOURCE:DEPTH], row[RATIO] = self.plane.normal * self.plane.offset, 1.0
+        if self.window is None:
+            return row
+        source = self.source
+        face = self._toward_water(self.window) * self.window.face.normal
+        row[FACE:SOURCE], row[SOURCE:DEPTH] = face, source
+        row[DEPTH] = abs(float(self.window.face.signed_distance(source)))
+        row[RATIO], row[SLANT] = self.n_air / self.n_water, float(self.plane.normal @ face)
+        row[WINDOWED] = 1.0
+        start = self._plane_beyond(row, source, face)
+        row[START : START + 3], row[START + 3] = start.normal, start.offset
+        return row
+
+    def _plane_beyond(self, row: FloatArray, source: FloatArray, face: FloatArray) -> Plane:
+        """Tangent plane where the light that is squarest to the window is `_USUAL_REACH` away."""
+        inward = face - row[SLANT] * self.plane.normal
+        length = float(np.linalg.norm(inward))
+        if length < 1e-6:
+            return self.plane
+        inward /= length
+        bent, _ = refract(inward, -face, n_in=self.n_air, n_out=self.n_water)
+        at = source + row[DEPTH] / float(inward @ face) * inward + _USUAL_REACH * bent
+        tangent = np.empty((1, 4))
+        tangents(row, at[None], tangent)
+        gradient = tangent[0, 1:]
+        return Plane.from_normal(gradient, float(gradient @ at - tangent[0, 0]))
+
+    def _fitted(self, points: FloatArray) -> Plane:
+        """Plane through points on the sheet, by least squares; the tangent plane if too few."""
+        start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
+        if len(points) < 3:
+            return start
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+        normal = normal if normal @ start.normal > 0.0 else -normal
+        return Plane.from_normal(normal, float(normal @ middle))
+
+
+def sheet_in(laser: Laser, n_air: float, n_water: float) -> Sheet:
+    """Return the sheet of a laser with air behind its window and water in front of it."""
+    return Sheet(plane=laser.plane, window=laser.window, n_air=n_air, n_water=n_water)
+
+
+def sheets_of(rig: Rig) -> tuple[Sheet, ...]:
+    """Return the sheets of a rig's lasers in its water, in the order of `rig.lasers`."""
+    return tuple(sheet_in(laser, rig.n_air, rig.n_water) for laser in rig.lasers)
+
+
+def packed_sheets(rig: Rig, camera: Camera) -> FloatArray:
+    """Return a rig's sheets as kernels take them, shape (n, COLUMNS).
+
+    Parameters
+    ----------
+    rig : Rig
+        Lasers, indices and working range.
+    camera : Camera
+        Searches along its rays begin at the planes that fit best where it sees the sheets.
+    """
+    rows = [s.packed(s.best_plane(camera, rig.working_range)) for s in sheets_of(rig)]
+    return np.array(rows).reshape(-1, COLUMNS)
