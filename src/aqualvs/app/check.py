@@ -3,48 +3,33 @@
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from aqualvs.app.check_accuracy import N_POINTS, SIGMA_PX, Accuracy, expect, index_sigma
-from aqualvs.app.check_stripes import StripeView, blind_fraction, field_of_view, see_stripe
+from aqualvs.app.check_accuracy import (
+    check_errors,
+    error_table,
+    expected_errors,
+    index_sigma,
+    sensitivity_table,
+)
+from aqualvs.app.check_finding import Finding, Severity, count_words, findings_table
+from aqualvs.app.check_solved import check_solved
+from aqualvs.app.check_view import blind_fraction, field_of_view
+from aqualvs.errors import RigError
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.sheet import sheet_in
+from aqualvs.optics.solved import rig_uncertainty, solved_steps
+from aqualvs.optics.stripe_view import StripeView, see_stripe
 
 EXIT_SANE, EXIT_BAD = 0, 2
 
-_USUAL_RANGES = (0.3, 0.6, 1.0)
 _N_RANGES = 43
-
-
-class Severity(StrEnum):
-    """How much a finding matters."""
-
-    OK = "ok"
-    WARN = "warn"
-    BAD = "bad"
-    """Makes the rig useless as it is."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing found about a rig.
-
-    Attributes
-    ----------
-    severity : Severity
-    sentence : str
-        What was found, with the value, and the remedy where one is needed.
-    """
-
-    severity: Severity
-    sentence: str
 
 
 def run_check(path: Path, console: Console | None = None) -> int:
@@ -62,19 +47,38 @@ def run_check(path: Path, console: Console | None = None) -> int:
     """
     rig = load_rig(path, need_lasers=False)
     console = console or Console()
-    findings = check_rig(rig)
+    try:
+        findings = check_rig(rig)
+    except RigError as error:
+        raise RigError(f"{path}: {error}") from None
     console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
-    console.print(_findings_table(findings))
-    if rig.lasers:
-        console.print(_accuracy_table(rig))
+    console.print(findings_table(findings))
+    uncertainty = rig_uncertainty(rig)
+    errors = expected_errors(rig, uncertainty)
+    if errors:
+        console.print(sensitivity_table(rig, errors))
+        console.print(error_table(errors, bool(uncertainty.names)))
     bad = any(finding.severity is Severity.BAD for finding in findings)
     console.print(_verdict(findings), style="bold red" if bad else "bold", highlight=False)
     return EXIT_BAD if bad else EXIT_SANE
 
 
-def check_rig(rig: Rig) -> list[Finding]:
-    """Return everything worth saying about a rig, in the order in which light passes it."""
-    camera = rig.camera()
+def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
+    """Return everything worth saying about a rig, in the order in which light passes it.
+
+    Parameters
+    ----------
+    rig : Rig
+    now : datetime, optional
+        With a time zone; calibrations are as old as it makes them. The computer's clock if left
+        out.
+
+    Raises
+    ------
+    RigError
+        If what calibrations have noted down in the rig cannot be understood.
+    """
+    camera, uncertainty = rig.camera(), rig_uncertainty(rig)
     return [
         *_check_lens(rig),
         *_check_view(rig, camera),
@@ -82,7 +86,8 @@ def check_rig(rig: Rig) -> list[Finding]:
         _check_index(rig),
         *_check_lasers(rig, camera),
         *(_check_pair(a, b) for a, b in itertools.combinations(rig.lasers, 2)),
-        *(_check_accuracy(accuracy) for accuracy in _accuracies(rig)),
+        *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
+        *check_errors(expected_errors(rig, uncertainty), bool(uncertainty.names)),
     ]
 
 
@@ -207,7 +212,8 @@ def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
 def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     near, far = rig.working_range
     walls = np.geomspace(near, far, _N_RANGES)
-    views = [see_stripe(camera, laser.plane, float(wall)) for wall in walls]
+    sheet = sheet_in(laser, rig.n_air, rig.n_water)
+    views = [see_stripe(camera, sheet, float(wall)) for wall in walls]
     seen = np.array([view.visible for view in views])
     if not seen.any():
         return Finding(
@@ -250,80 +256,11 @@ def _check_pair(a: Laser, b: Laser) -> Finding:
     return Finding(Severity.OK, f"{pair} meet at {angle:.0f} degrees.")
 
 
-def _accuracies(rig: Rig) -> list[Accuracy]:
-    near, far = rig.working_range
-    inside = [wall for wall in _USUAL_RANGES if near <= wall <= far]
-    return [expect(rig, wall) for wall in inside or [near, far]] if len(rig.lasers) > 1 else []
-
-
-def _check_accuracy(accuracy: Accuracy) -> Finding:
-    place = f"At {accuracy.wall_range * 1e3:.0f} mm"
-    if not accuracy.valid:
-        return Finding(
-            Severity.WARN, f"{place} the stripes in the picture do not determine a plane."
-        )
-    range_mm = accuracy.sigma_range * 1e3
-    pitch, yaw = math.degrees(accuracy.sigma_pitch), math.degrees(accuracy.sigma_yaw)
-    sentence = (
-        f"{place} noise of {SIGMA_PX} px alone gives a standard deviation of {range_mm:.2g} mm in "
-        f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw"
-    )
-    if range_mm > 0.01e3 * accuracy.wall_range or max(pitch, yaw) > 1.0:
-        return Finding(
-            Severity.WARN, f"{sentence}; put the lasers farther from the camera or across."
-        )
-    return Finding(Severity.OK, f"{sentence}.")
-
-
-def _findings_table(findings: Sequence[Finding]) -> Table:
-    style = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}
-    table = Table(box=None, show_header=False, padding=(0, 1))
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    for finding in findings:
-        mark = style[finding.severity]
-        table.add_row(f"[{mark}]{finding.severity.value}[/]", _escaped(finding.sentence))
-    return table
-
-
-def _accuracy_table(rig: Rig) -> Table:
-    table = Table(
-        title=f"A wall ahead, {SIGMA_PX} px on {N_POINTS} points a laser",
-        title_justify="left",
-        box=None,
-    )
-    table.add_column("range mm", justify="right")
-    for laser in rig.lasers:
-        table.add_column(f"{_escaped(laser.name)} mm/px", justify="right")
-    for name in ("sigma range mm", "sigma pitch deg", "sigma yaw deg"):
-        table.add_column(name, justify="right")
-    for accuracy in _accuracies(rig):
-        sigmas = (
-            accuracy.sigma_range * 1e3,
-            math.degrees(accuracy.sigma_pitch),
-            math.degrees(accuracy.sigma_yaw),
-        )
-        cells = [value * 1e3 for value in accuracy.per_pixel] + list(sigmas)
-        table.add_row(f"{accuracy.wall_range * 1e3:.0f}", *map(_shown, cells))
-    return table
-
-
-def _shown(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3g}"
-
-
-def _escaped(text: str) -> str:
-    return text.replace("[", r"\[")
-
-
 def _verdict(findings: Sequence[Finding]) -> str:
     count = {s: sum(finding.severity is s for finding in findings) for s in Severity}
     if count[Severity.BAD]:
-        return f"This rig cannot measure as it is: mend {_number(count[Severity.BAD])}."
+        faults = count_words(count[Severity.BAD], "fault")
+        return f"This rig cannot measure as it is: mend {faults}."
     if count[Severity.WARN]:
-        return f"This rig is sane, with {_number(count[Severity.WARN], 'warning')}."
+        return f"This rig is sane, with {count_words(count[Severity.WARN], 'warning')}."
     return "This rig is sane."
-
-
-def _number(n: int, word: str = "fault") -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"

@@ -1,90 +1,110 @@
-"""What a rig can measure: millimetres a pixel, and the uncertainty of posture and water index."""
+"""What a rig can measure, in words and tables: errors of posture, and of the water's index."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from rich.table import Table
 
-from aqualvs.app.check_stripes import StripeView, point_per_pixel, see_stripe
+from aqualvs.app.check_finding import Finding, Severity, escaped
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.expected_error import (
+    N_POINTS,
+    SIGMA_PX,
+    USUAL_RANGES,
+    ExpectedError,
+    expected_posture_errors,
+)
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.uncertainty import RigUncertainty
 
-SIGMA_PX = 0.1
-"""Standard deviation of a stripe point across the stripe, in pixels."""
-N_POINTS = 100
-"""Points on every stripe."""
 _INDEX_STEP = 1e-4
-# Points on one line leave one direction of m·X = 1 to rounding.
-_SINGULAR = 1e-10
+# Systematic errors that a user should know of before the dive.
+_LARGE_SHARE, _LARGE_ANGLE_DEG = 0.005, 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Accuracy:
-    """What to expect on a wall square to the forward axis.
-
-    Attributes
-    ----------
-    wall_range : float
-        Metres.
-    per_pixel : tuple of float
-        Range error for one pixel across the stripe, for every laser, in m/px; NaN where its
-        stripe is out of the picture.
-    sigma_range, sigma_pitch, sigma_yaw : float
-        Standard deviations in metres and radians; NaN where the stripes determine no plane.
-    """
-
-    wall_range: float
-    per_pixel: tuple[float, ...]
-    sigma_range: float
-    sigma_pitch: float
-    sigma_yaw: float
-
-    @property
-    def valid(self) -> bool:
-        """Whether there is a posture at this range."""
-        return bool(np.isfinite(self.sigma_range))
+def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedError, ...]:
+    """Return what to expect at the usual ranges that lie in the working range, if any do."""
+    if len(rig.lasers) < 2:
+        return ()
+    near, far = rig.working_range
+    inside = [wall for wall in USUAL_RANGES if near <= wall <= far]
+    return expected_posture_errors(rig, uncertainty, inside or [near, far])
 
 
-def expect(rig: Rig, wall_range: float) -> Accuracy:
-    """Propagate `SIGMA_PX` on `N_POINTS` points a laser to range, pitch and yaw.
+def check_errors(errors: Sequence[ExpectedError], known: bool) -> Iterator[Finding]:
+    """Say what to expect at each range, from noise and, where it is `known`, from calibration."""
+    for expected in errors:
+        place = f"At {expected.wall_range * 1e3:.0f} mm"
+        if not expected.valid:
+            yield Finding(
+                Severity.WARN, f"{place} the stripes in the picture do not determine a plane."
+            )
+            continue
+        yield _noise_finding(expected, place)
+        if known:
+            yield _calibration_finding(expected, place)
 
-    The plane m·X = 1 is fitted by least squares (paper, Eq. 23-26) at the wall m = (0, 1/range, 0),
-    each point weighed by what its pixel error makes of m·X.
-    """
-    camera = rig.camera()
-    stripes = [see_stripe(camera, laser.plane, wall_range) for laser in rig.lasers]
-    seen = [stripe.thinned(N_POINTS) if stripe.visible else None for stripe in stripes]
-    slopes = [None if stripe is None else point_per_pixel(camera, stripe) for stripe in seen]
-    per_pixel = tuple(
-        np.nan if slope is None else float(np.nanmedian(np.abs(slope[:, 1]))) for slope in slopes
+
+def _noise_finding(expected: ExpectedError, place: str) -> Finding:
+    range_mm, pitch, yaw = _shown_units(expected.sigma_noise)
+    sentence = (
+        f"{place} noise of {SIGMA_PX} px alone gives a standard deviation of {range_mm:.2g} mm in "
+        f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw"
     )
-    sigmas = _posture_sigmas(
-        [stripe for stripe in seen if stripe is not None],
-        [slope for slope in slopes if slope is not None],
-        wall_range,
-    )
-    return Accuracy(wall_range, per_pixel, *sigmas)
+    if range_mm > 0.01e3 * expected.wall_range or max(pitch, yaw) > 1.0:
+        return Finding(
+            Severity.WARN, f"{sentence}; put the lasers farther from the camera or across."
+        )
+    return Finding(Severity.OK, f"{sentence}.")
 
 
-def _posture_sigmas(
-    stripes: list[StripeView], slopes: list[FloatArray], wall_range: float
-) -> tuple[float, float, float]:
-    if not stripes:
-        return np.nan, np.nan, np.nan
-    points = np.concatenate([stripe.points_in_dome for stripe in stripes])
-    # With m = (0, 1/range, 0) an error of the point changes m·X by its y part over the range.
-    sigma = np.abs(np.concatenate(slopes)[:, 1]) * SIGMA_PX / wall_range
-    good = np.isfinite(sigma) & (sigma > 0.0)
-    weighted = points[good] / sigma[good, None]
-    singular = np.linalg.svd(weighted / wall_range, compute_uv=False)
-    if len(singular) < 3 or singular[-1] <= _SINGULAR * singular[0]:
-        return np.nan, np.nan, np.nan
-    covariance = np.linalg.inv(weighted.T @ weighted)
-    yaw, range_, pitch = np.sqrt(np.diag(covariance))
-    return (
-        float(range_) * wall_range**2,
-        float(pitch) * wall_range,
-        float(yaw) * wall_range,
+def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
+    range_mm, pitch, yaw = _shown_units(expected.sigma_calibration)
+    share = 1e-3 * range_mm / expected.wall_range
+    sentence = (
+        f"{place} the calibration leaves a systematic error of {range_mm:.2g} mm ({share:.2%}) in "
+        f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw (one sigma)"
     )
+    if share > _LARGE_SHARE or max(pitch, yaw) > _LARGE_ANGLE_DEG:
+        return Finding(
+            Severity.WARN,
+            f"{sentence}, more than {_LARGE_SHARE:.1%} or {_LARGE_ANGLE_DEG} degrees; calibrate "
+            "again with more pictures, nearer and farther ones.",
+        )
+    return Finding(Severity.OK, f"{sentence}.")
+
+
+def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
+    """Return what a pixel across each laser's stripe is worth."""
+    table = Table(title="Range error for a pixel", title_justify="left", box=None)
+    table.add_column("range mm", justify="right")
+    for laser in rig.lasers:
+        table.add_column(f"{escaped(laser.name)} mm/px", justify="right")
+    for expected in errors:
+        cells = (_shown(value * 1e3) for value in expected.per_pixel)
+        table.add_row(f"{expected.wall_range * 1e3:.0f}", *cells)
+    return table
+
+
+def error_table(errors: Sequence[ExpectedError], known: bool) -> Table:
+    """Return the standard deviations of posture to a wall ahead, by where they come from."""
+    title = f"Expected error, one sigma: a wall ahead, {SIGMA_PX} px on {N_POINTS} points a laser"
+    table = Table(title=title, title_justify="left", box=None)
+    table.add_column("range mm", justify="right")
+    table.add_column("from")
+    for name in ("range mm", "range %", "pitch deg", "yaw deg"):
+        table.add_column(name, justify="right")
+    for expected in errors:
+        rows = {"pixel noise": expected.sigma_noise}
+        if known:
+            rows = {"calibration": expected.sigma_calibration, **rows, "both": expected.sigma}
+        for i, (name, sigmas) in enumerate(rows.items()):
+            range_mm, pitch, yaw = _shown_units(sigmas)
+            share = 0.1 * range_mm / expected.wall_range
+            place = "" if i else f"{expected.wall_range * 1e3:.0f}"
+            table.add_row(place, name, *map(_shown, (range_mm, share, pitch, yaw)))
+    return table
 
 
 def index_sigma(rig: Rig) -> float:
@@ -102,3 +122,13 @@ def index_sigma(rig: Rig) -> float:
     slope = (more - here)[seen & seen_more] / _INDEX_STEP
     information = float(np.sum(slope**2)) / SIGMA_PX**2
     return 1.0 / np.sqrt(information) if information > 0.0 else np.inf
+
+
+def _shown_units(sigmas: FloatArray) -> tuple[float, float, float]:
+    """Millimetres and degrees of (range, pitch, yaw)."""
+    range_m, pitch, yaw = sigmas.tolist()
+    return range_m * 1e3, math.degrees(pitch), math.degrees(yaw)
+
+
+def _shown(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"

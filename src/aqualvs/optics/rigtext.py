@@ -1,6 +1,6 @@
 """The text of a rig file: strict reading of YAML, tidy writing."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,20 @@ class _StrictLoader(yaml.SafeLoader):
                     problem=f"key '{key}' appears twice", problem_mark=node.value[i][0].start_mark
                 )
         return super().construct_mapping(node, deep)
+
+
+class TidyDumper(yaml.SafeDumper):
+    """Writes mappings in the style asked for, and lists of plain values always on one line."""
+
+
+def _tidy_list(dumper: yaml.SafeDumper, values: Sequence[Any]) -> yaml.SequenceNode:
+    """Represent a list; one that holds lists or mappings gets a line for each of them."""
+    flat = not any(isinstance(value, list | dict) for value in values)
+    flow = True if flat else None
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=flow)
+
+
+TidyDumper.add_representer(list, _tidy_list)
 
 
 def read_yaml(path: Path) -> Any:
@@ -69,8 +83,9 @@ def _block(key: str, value: object) -> str:
     # YAML wraps a lone scalar in braces unless told to use the block style; what a calibration
     # notes down reads better below one another.
     flow = None if isinstance(value, list | dict) and key != "solved_from" else False
-    text: str = yaml.safe_dump(
+    text: str = yaml.dump(
         {key: value},
+        Dumper=TidyDumper,
         sort_keys=False,
         allow_unicode=True,
         width=_WIDTH,

@@ -1,0 +1,198 @@
+"""What a rig can measure: errors of the posture to a wall, from its calibration and from noise.
+
+The plane m·X = 1 is fitted by least squares (paper, Eq. 23-26) at a wall square ahead,
+m = (0, 1/range, 0), each point weighed by what its pixel error makes of m·X. Errors of the pixels
+differ from point to point and from frame to frame; those of the calibration are the same in all
+frames of a dive, and no averaging removes them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.optics.stripe_view import StripeView, point_per_pixel, see_stripe
+from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
+
+SIGMA_PX = 0.1
+"""Standard deviation of a stripe point across the stripe, in pixels."""
+N_POINTS = 100
+"""Points on every stripe."""
+USUAL_RANGES = (0.3, 0.6, 1.0)
+"""Where errors are told, in metres."""
+
+# Points on one line leave one direction of m·X = 1 to rounding.
+_SINGULAR = 1e-10
+# Central differences: this share of a sigma, and no more than this in any unit.
+_STEP_SHARE, _LARGEST_STEP = 0.1, 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedError:
+    """What to expect on a wall square to the forward axis.
+
+    Attributes
+    ----------
+    wall_range : float
+        Metres.
+    per_pixel : tuple of float
+        Range error for one pixel across the stripe, for every laser, in m/px; NaN where its
+        stripe is out of the picture.
+    noise, calibration : array, shape (3, 3)
+        Covariance of (range, pitch, yaw), in m and rad, from pixel noise in one frame and from the
+        uncertainty of the rig; NaN where the stripes determine no plane.
+    """
+
+    wall_range: float
+    per_pixel: tuple[float, ...]
+    noise: FloatArray
+    calibration: FloatArray
+
+    @property
+    def valid(self) -> bool:
+        """Whether there is a posture at this range."""
+        return bool(np.isfinite(self.noise).all() and np.isfinite(self.calibration).all())
+
+    @property
+    def sigma_noise(self) -> FloatArray:
+        """Standard deviations (range, pitch, yaw) of one frame's noise alone."""
+        return _sigmas(self.noise)
+
+    @property
+    def sigma_calibration(self) -> FloatArray:
+        """Standard deviations (range, pitch, yaw) of the systematic part."""
+        return _sigmas(self.calibration)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations (range, pitch, yaw) of both together."""
+        return _sigmas(self.noise + self.calibration)
+
+
+def expected_posture_errors(
+    rig: Rig, uncertainty: RigUncertainty, ranges: Sequence[float] = USUAL_RANGES
+) -> tuple[ExpectedError, ...]:
+    """Propagate a rig's uncertainty, and noise of the pixels, to range, pitch and yaw.
+
+    Parameters
+    ----------
+    rig : Rig
+        With lasers.
+    uncertainty : RigUncertainty
+        Joint covariance of camera, dome, water and lasers; numbers not in it are taken as exact.
+    ranges : sequence of float
+        Walls square to the forward axis, metres.
+    """
+    walls = [WallView.ahead(rig, wall_range) for wall_range in ranges]
+    slopes = [np.zeros((3, len(uncertainty.names))) for _ in walls]
+    for i, (name, sigma) in enumerate(uncertainty.sigmas.items()):
+        step = min(_STEP_SHARE * sigma, _LARGEST_STEP)
+        if step > 0.0:
+            rigs = [rig_moved_by(rig, [name], np.array([h])) for h in (step, -step)]
+            for wall, slope in zip(walls, slopes, strict=True):
+                ahead, behind = (wall.read_by(moved) for moved in rigs)
+                slope[:, i] = (ahead - behind) / (2.0 * step)
+    return tuple(
+        ExpectedError(
+            wall_range=wall.wall_range,
+            per_pixel=wall.per_pixel,
+            noise=wall.noise(),
+            calibration=slope @ uncertainty.covariance @ slope.T,
+        )
+        for wall, slope in zip(walls, slopes, strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WallView:
+    """The stripes that a rig sees on a wall square ahead, and what they say about it.
+
+    Attributes
+    ----------
+    wall_range : float
+        Metres.
+    stripes : tuple of StripeView
+        For every laser; `N_POINTS` each, none where the stripe is out of the picture.
+    slopes : tuple of array, shape (N,)
+        For every laser, the change of its points' distance ahead by a pixel across the stripe,
+        in m/px.
+    """
+
+    wall_range: float
+    stripes: tuple[StripeView, ...]
+    slopes: tuple[FloatArray, ...]
+    determined: bool = field(init=False)
+    """Whether the stripes determine a plane."""
+
+    def __post_init__(self) -> None:
+        points, _ = self._weighed(self._points())
+        singular = np.linalg.svd(points, compute_uv=False)
+        found = len(singular) == 3 and singular[-1] > _SINGULAR * singular[0]
+        object.__setattr__(self, "determined", bool(found))
+
+    @classmethod
+    def ahead(cls, rig: Rig, wall_range: float) -> "WallView":
+        """Return what a rig sees on the wall y = `wall_range` (metres)."""
+        camera = rig.camera()
+        seen = (see_stripe(camera, sheet, wall_range) for sheet in sheets_of(rig))
+        stripes = tuple(one.thinned(N_POINTS) if one.visible else one for one in seen)
+        slopes = tuple(
+            point_per_pixel(camera, one)[:, 1] if one.visible else np.empty(0) for one in stripes
+        )
+        return cls(wall_range, stripes, slopes)
+
+    @property
+    def per_pixel(self) -> tuple[float, ...]:
+        """As in `ExpectedError`."""
+        return tuple(float(np.nanmedian(np.abs(s))) if len(s) else np.nan for s in self.slopes)
+
+    def read_by(self, rig: Rig) -> FloatArray:
+        """Return range, pitch and yaw (3,) that a rig makes of the same pixels; NaN where none.
+
+        The rig has the same lasers in the same order.
+        """
+        if not self.determined:
+            return np.full(3, np.nan)
+        camera, sheets = rig.camera(), sheets_of(rig)
+        read = [
+            sheet.intersect(camera.rays(stripe.pixels))[0]
+            for sheet, stripe in zip(sheets, self.stripes, strict=True)
+            if stripe.visible
+        ]
+        points, weights = self._weighed(np.concatenate(read))
+        if len(points) < 3:
+            return np.full(3, np.nan)
+        x, y, z = np.linalg.lstsq(points, weights)[0].tolist()
+        return np.array([1.0 / np.hypot(np.hypot(x, y), z), np.arctan2(z, y), np.arctan2(x, y)])
+
+    def noise(self) -> FloatArray:
+        """Return the covariance (3, 3) of range, pitch and yaw by `SIGMA_PX`; NaN where none."""
+        if not self.determined:
+            return np.full((3, 3), np.nan)
+        points, _ = self._weighed(self._points())
+        # Range, pitch and yaw by m = (x, y, z) at (0, 1/range, 0).
+        far = self.wall_range
+        by_m = np.array([[0.0, -(far**2), 0.0], [0.0, 0.0, far], [far, 0.0, 0.0]])
+        covariance: FloatArray = by_m @ np.linalg.inv(points.T @ points) @ by_m.T
+        return covariance
+
+    def _points(self) -> FloatArray:
+        seen = [stripe.points_in_dome for stripe in self.stripes if stripe.visible]
+        return np.concatenate([np.empty((0, 3)), *seen])
+
+    def _weighed(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the points (N, 3) that are seen, times their weights (N,), and the weights."""
+        # With m = (0, 1/range, 0) an error of a point changes m·X by its y part over the range.
+        sigma = np.abs(np.concatenate([np.empty(0), *self.slopes])) * SIGMA_PX / self.wall_range
+        good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)
+        weights = 1.0 / sigma[good]
+        return points[good] * weights[:, None], weights
+
+
+def _sigmas(covariance: FloatArray) -> FloatArray:
+    # What cancels leaves rounding, which may be negative.
+    sigmas: FloatArray = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return sigmas

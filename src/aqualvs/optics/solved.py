@@ -1,0 +1,284 @@
+"""What calibrations note down in a rig: when and from what it was solved, and how well.
+
+It stands in `Rig.solved_from`, and so in the rig file, in millimetres and degrees (docs/rig.md)::
+
+    solved_from:
+      dome: {date: '2026-05-04T09:30:00Z', pictures: 14, points: 3040, rms_px: 0.09}
+      uncertainty:
+        parameters: [lens_x_mm, rotation_x_deg, n_acrylic, fx_px, k1, 'left:tilt_1_deg', ...]
+        sigma: [0.012, 0.0031, ...]
+        correlation:            # below the diagonal: of the second with the first, and so on
+        - [0.93]
+        - [-0.2, 0.1]
+"""
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import Any, Self
+
+import numpy as np
+
+from aqualvs.errors import RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.uncertainty import RigUncertainty, combined, merged, rig_parameter_names
+
+__all__ = [
+    "STEPS",
+    "SolvedStep",
+    "combined",
+    "file_parameter_name",
+    "merged",
+    "rig_uncertainty",
+    "solved_steps",
+    "with_step",
+    "with_uncertainty",
+]
+
+STEPS = ("camera", "dome", "lasers", "water")
+"""Keys of `solved_from` under which calibrations leave a `SolvedStep`."""
+
+_UNCERTAINTY = "uncertainty"
+_PLACE = f"solved_from.{_UNCERTAINTY}"
+_KEYS = ("parameters", "sigma", "correlation")
+_DEG = 180.0 / math.pi
+_MM = ("lens_x", "lens_y", "lens_z", "inner_radius", "thickness", "offset", "window_offset")
+_UNIT_OF = {
+    **dict.fromkeys((*_MM, "source_1", "source_2"), ("mm", 1e3)),
+    **dict.fromkeys(("rotation_x", "rotation_y", "rotation_z"), ("deg", _DEG)),
+    **dict.fromkeys(("tilt_1", "tilt_2", "window_tilt_1", "window_tilt_2"), ("deg", _DEG)),
+    **dict.fromkeys(("fx", "fy", "cx", "cy"), ("px", 1.0)),
+}
+# Enough digits that the variance of every combination of numbers, however nearly their errors
+# cancel, comes back within this share.
+_DIGITS = (5, 7, 9, 11, 13, 15)
+_LOST_SHARE = 1e-3
+# Rounding in a file written by hand or by others; what is more negative is no covariance.
+_NOT_NEGATIVE = -1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolvedStep:
+    """From what a calibration solved its part of a rig.
+
+    Attributes
+    ----------
+    date : datetime
+        With a time zone.
+    pictures, points : int
+        That were used; points are corners or stripe points.
+    rms_px : float
+        Root mean square residual of a coordinate, in pixels.
+    extras : mapping
+        Anything else worth keeping: numbers, words, lists of them.
+    """
+
+    date: datetime = field(default_factory=lambda: datetime.now(UTC))
+    pictures: int
+    points: int
+    rms_px: float
+    extras: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.date.tzinfo is None:
+            raise ValueError(f"{self.date=} has no time zone")
+        taken = {"date", "pictures", "points", "rms_px"} & set(self.extras)
+        if taken:
+            raise ValueError(f"extras hold {sorted(taken)}, which have fields of their own")
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the step as it stands in a rig file; the date to the second, in UTC."""
+        utc = self.date.astimezone(UTC)
+        return {
+            "date": utc.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "pictures": int(self.pictures),
+            "points": int(self.points),
+            "rms_px": float(f"{self.rms_px:.4g}"),
+            **self.extras,
+        }
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any], place: str) -> Self:
+        """Read a step from a rig file.
+
+        Raises
+        ------
+        RigError
+            One line that names the place, the value and the remedy.
+        """
+        rest = dict(mapping)
+        date = _date(rest.pop("date", None), f"{place}.date")
+        pictures, points, rms_px = (
+            _number(rest.pop(key, 0), f"{place}.{key}") for key in ("pictures", "points", "rms_px")
+        )
+        return cls(
+            date=date, pictures=int(pictures), points=int(points), rms_px=rms_px, extras=rest
+        )
+
+
+def with_step(rig: Rig, name: str, step: SolvedStep) -> Rig:
+    """Return the rig with a note of what one of `STEPS` was solved from; an older one goes."""
+    if name not in STEPS:
+        raise ValueError(f"{name!r} is none of {STEPS}")
+    return _noting(rig, {name: step.to_mapping()})
+
+
+def solved_steps(rig: Rig) -> dict[str, SolvedStep]:
+    """Return what calibrations have noted down, by the names in `STEPS`, in that order.
+
+    A note of the user under one of these names that carries no date is none of theirs.
+
+    Raises
+    ------
+    RigError
+        One line, if a note cannot be understood.
+    """
+    notes = ((name, rig.solved_from.get(name)) for name in STEPS)
+    return {
+        name: SolvedStep.from_mapping(note, f"solved_from.{name}")
+        for name, note in notes
+        if isinstance(note, Mapping) and "date" in note
+    }
+
+
+def with_uncertainty(rig: Rig, uncertainty: RigUncertainty) -> Rig:
+    """Return the rig with its uncertainty written down in place of any older one.
+
+    Numbers that the rig does not have, such as those of a laser that was taken off, are left out.
+    """
+    kept = uncertainty.only(rig_parameter_names(rig))
+    return _noting(rig, {_UNCERTAINTY: _to_mapping(kept) if kept.names else None})
+
+
+def rig_uncertainty(rig: Rig) -> RigUncertainty:
+    """Return the uncertainty that is written down in a rig, or none.
+
+    Raises
+    ------
+    RigError
+        One line, if it is malformed, no covariance, or of numbers that the rig does not have.
+    """
+    content = rig.solved_from.get(_UNCERTAINTY)
+    if content is None:
+        return RigUncertainty.none()
+    if not isinstance(content, Mapping) or set(content) != set(_KEYS):
+        raise RigError(
+            f"{_PLACE} does not have the keys {', '.join(_KEYS)}; take it out, or calibrate again"
+        )
+    names = _names(content["parameters"], rig)
+    sigma = _sigmas(content["sigma"], len(names)) / [_unit(name)[1] for name in names]
+    correlation = _correlation(content["correlation"], len(names))
+    return RigUncertainty(names, correlation * np.outer(sigma, sigma))
+
+
+def _noting(rig: Rig, notes: Mapping[str, Any]) -> Rig:
+    """Return the rig with notes added or replaced; the uncertainty, which is long, comes last."""
+    merged_notes = {**rig.solved_from, **notes}
+    uncertainty = merged_notes.pop(_UNCERTAINTY, None)
+    if uncertainty is not None:
+        merged_notes[_UNCERTAINTY] = uncertainty
+    return replace(rig, solved_from=merged_notes)
+
+
+def file_parameter_name(name: str) -> str:
+    """Return how a rig file calls a number of the rig: with its unit."""
+    unit, _ = _unit(name)
+    return f"{name}_{unit}" if unit else name
+
+
+def _unit(name: str) -> tuple[str, float]:
+    """Return the unit of a number in a file, and how many of it make up one in SI and radians."""
+    return _UNIT_OF.get(name.rpartition(":")[2], ("", 1.0))
+
+
+def _to_mapping(uncertainty: RigUncertainty) -> dict[str, Any]:
+    sigma = np.sqrt(np.diag(uncertainty.covariance))
+    # What is exact correlates with nothing.
+    inverse = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
+    correlation = uncertainty.covariance * np.outer(inverse, inverse)
+    sigma *= [_unit(name)[1] for name in uncertainty.names]
+    sigma, correlation = _shortened(sigma, correlation)
+    return {
+        "parameters": [file_parameter_name(name) for name in uncertainty.names],
+        "sigma": sigma.tolist(),
+        "correlation": [correlation[i, :i].tolist() for i in range(1, len(sigma))],
+    }
+
+
+def _shortened(sigma: FloatArray, correlation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return both with as few digits as keep every combination's variance."""
+    known = sigma > 0.0
+    exact = correlation[np.ix_(known, known)]
+    if not known.any():
+        return sigma, correlation
+    smallest = float(np.linalg.eigvalsh(exact)[0])
+    for digits in _DIGITS:
+        short_sigma = np.array([float(f"{value:.{digits}g}") for value in sigma])
+        short = np.round(correlation, digits)
+        np.fill_diagonal(short, np.diag(correlation))
+        ratio = short_sigma[known] / sigma[known]
+        lost = short[np.ix_(known, known)] * np.outer(ratio, ratio) - exact
+        if np.linalg.norm(lost, 2) < _LOST_SHARE * smallest:
+            return short_sigma, short + 0.0
+    return sigma, correlation
+
+
+def _names(values: object, rig: Rig) -> tuple[str, ...]:
+    known = {file_parameter_name(name): name for name in rig_parameter_names(rig)}
+    if not isinstance(values, list):
+        raise RigError(f"{_PLACE}.parameters is no list; take {_PLACE} out, or calibrate again")
+    for i, value in enumerate(values):
+        place = f"{_PLACE}.parameters[{i}] is {value!r}"
+        if not isinstance(value, str) or value not in known:
+            close = difflib.get_close_matches(str(value), known, n=1, cutoff=0.5)
+            remedy = f"did you mean {close[0]!r}?" if close else f"take {_PLACE} out"
+            raise RigError(f"{place}, which this rig does not have; {remedy}")
+        if value in values[:i]:
+            raise RigError(f"{place} as another one is; name every number once")
+    return tuple(known[value] for value in values)
+
+
+def _sigmas(values: object, n: int) -> FloatArray:
+    sigma = np.array(_numbers(values, n, f"{_PLACE}.sigma"))
+    if (sigma < 0.0).any():
+        raise RigError(f"{_PLACE}.sigma holds {sigma.min():g}; a standard deviation is at least 0")
+    return sigma
+
+
+def _correlation(rows: object, n: int) -> FloatArray:
+    place = f"{_PLACE}.correlation"
+    if not isinstance(rows, list) or len(rows) != max(n - 1, 0):
+        raise RigError(f"{place} does not have {max(n - 1, 0)} rows; calibrate again")
+    correlation = np.eye(n)
+    for i, row in enumerate(rows, start=1):
+        correlation[i, :i] = correlation[:i, i] = _numbers(row, i, f"{place}[{i - 1}]")
+    if n and not np.linalg.eigvalsh(correlation)[0] >= _NOT_NEGATIVE:
+        raise RigError(f"{place} is not that of any numbers; restore it, or calibrate again")
+    return correlation
+
+
+def _numbers(values: object, n: int, place: str) -> list[float]:
+    if not isinstance(values, list) or len(values) != n:
+        raise RigError(f"{place} does not have {n} numbers; restore it, or calibrate again")
+    return [_number(value, f"{place}[{i}]") for i, value in enumerate(values)]
+
+
+def _number(value: object, place: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise RigError(f"{place} is {value!r}; write a plain number")
+    return float(value)
+
+
+def _date(value: object, place: str) -> datetime:
+    # YAML makes a date of one that stands without quotation marks.
+    text = value.isoformat() if hasattr(value, "isoformat") else value
+    try:
+        date = datetime.fromisoformat(str(text))
+    except ValueError:
+        raise RigError(
+            f"{place} is {value!r}; write date and time as '2026-05-04T09:30:00Z'"
+        ) from None
+    return date if date.tzinfo is not None else date.replace(tzinfo=UTC)

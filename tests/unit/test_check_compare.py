@@ -1,0 +1,141 @@
+"""`aqualvs check --against`: what it says moved, and what that would cost."""
+
+import io
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from aqualvs.app.check_compare import run_compare
+from aqualvs.errors import RigError
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.solved import with_uncertainty
+from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
+from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+
+NAMES = rig_parameter_names(example_rig())
+SIGMAS = np.array([1e-4 if name[:2] in ("fx", "fy", "cx", "cy") else 2e-5 for name in NAMES])
+KNOWN = RigUncertainty(NAMES, np.diag(SIGMAS**2))
+
+
+def estimated(rig: Rig, seed: int) -> Rig:
+    """Return the rig as a calibration would find it."""
+    noise = SIGMAS * np.random.default_rng(seed).normal(size=len(NAMES))
+    return with_uncertainty(rig_moved_by(rig, NAMES, noise), KNOWN)
+
+
+def compared(new: Rig, old: Rig, folder: Path) -> str:
+    save_rig(new, folder / "new.yaml")
+    save_rig(old, folder / "old.yaml")
+    page = io.StringIO()
+    assert run_compare(folder / "new.yaml", folder / "old.yaml", Console(file=page, width=400)) == 0
+    return page.getvalue()
+
+
+def turned(rig: Rig, degrees: float) -> Rig:
+    return rig_moved_by(rig, ("left:tilt_1",), np.array([np.tan(np.deg2rad(degrees))]))
+
+
+def test_the_laser_that_moved_is_named(tmp_path: Path) -> None:
+    page = compared(
+        estimated(turned(example_rig(), 0.42), 1), estimated(example_rig(), 2), tmp_path
+    )
+    assert re.search(r"Laser 'left' moved by 0\.42 deg, [\d.]+ mm at 0\.6 m \(\d+ sigma\);", page)
+    assert re.search(r"the lens stayed \([\d.]+ sigma\)", page)
+    assert re.search(r"laser 'right' stayed \([\d.]+ sigma\)", page)
+    assert "left turned by deg" in page
+
+
+def test_chance_is_not_taken_for_a_move(tmp_path: Path) -> None:
+    page = compared(estimated(example_rig(), 1), estimated(example_rig(), 2), tmp_path)
+    assert "Nothing has moved that matters; the lens stayed (" in page
+
+
+def test_equal_rigs_are_equal(tmp_path: Path) -> None:
+    rig = estimated(example_rig(), 1)
+    page = compared(rig, rig, tmp_path)
+    assert "Nothing has changed: the lens, the camera, the intrinsics, the dome" in page
+    assert "would read" not in page
+
+
+def test_the_consequence_is_what_the_old_rig_reads(tmp_path: Path) -> None:
+    """A bare camera and parallel sheets at offset b: the range is in proportion to b."""
+    rig = replace(example_rig(), dome=None)
+    lengths = np.array(
+        [*rig.dome_from_cam.translation, *(laser.plane.offset for laser in rig.lasers)]
+    )
+    names = ["lens_x", "lens_y", "lens_z", *(f"{laser.name}:offset" for laser in rig.lasers)]
+    longer = rig_moved_by(rig, names, 0.01 * lengths)
+    page = compared(rig, longer, tmp_path)
+    assert "would read 606.0 mm (+1.00%), pitch +0.00 and yaw" in page
+    assert "Laser 'lower' moved by 0 deg, 1.4 mm at 0.6 m" in page
+
+
+def test_without_sigmas_only_what_matters_counts(tmp_path: Path) -> None:
+    page = compared(turned(example_rig(), 0.3), example_rig(), tmp_path)
+    assert "Neither rig says how well it is known" in page
+    assert "Laser 'left' moved by 0.3 deg" in page
+    assert "not changed at all: the lens" in page
+    page = compared(turned(example_rig(), 0.01), example_rig(), tmp_path)
+    assert "Nothing has moved that matters; laser 'left' moved by 0.01 deg" in page
+
+
+def test_one_rig_alone_may_know_its_sigmas(tmp_path: Path) -> None:
+    page = compared(estimated(turned(example_rig(), 0.42), 1), example_rig(), tmp_path)
+    assert "old.yaml does not say how well it is known; sigmas are those of the other rig." in page
+    assert "Laser 'left' moved by 0.42 deg" in page
+
+
+def test_what_is_significant_may_not_matter(tmp_path: Path) -> None:
+    page = compared(
+        estimated(turned(example_rig(), 0.02), 1), estimated(example_rig(), 2), tmp_path
+    )
+    assert re.search(r"Laser 'left' moved by 0\.0\d+ deg.* sigma\), too little to matter", page)
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        (bluerov2_rig(), "The pictures are 1920x1080 px and were 720x576 px"),
+        (replace(example_rig(), dome=None), "Only the old rig has a dome."),
+        (
+            replace(example_rig(), lens=replace(example_rig().lens, distortion=())),
+            "The lens models differ",
+        ),
+        (replace(example_rig(), lasers=example_rig().lasers[:2]), "Laser 'right' is gone."),
+        (
+            replace(
+                example_rig(),
+                lasers=(*example_rig().lasers, replace(bluerov2_rig().lasers[0], name="top")),
+            ),
+            "Laser 'top' is new.",
+        ),
+        (
+            replace(
+                example_rig(),
+                lasers=(replace(example_rig().lasers[0], name="low"), *example_rig().lasers[1:]),
+            ),
+            "Laser 'low' lies where 'lower' lay; if it is the same, give it the same name",
+        ),
+        (
+            replace(example_rig(), lasers=example_rig().lasers[:1], name="one"),
+            "cannot be measured with the lasers that both rigs have",
+        ),
+    ],
+    ids=["size", "dome", "model", "gone", "new", "renamed", "one left"],
+)
+def test_what_cannot_be_compared_is_said(tmp_path: Path, new: Rig, words: str) -> None:
+    old = turned(example_rig(), 0.2) if new.name == "one" else example_rig()
+    if new.name == "one":
+        new = rig_moved_by(new, ("lens_y",), np.array([1e-3]))
+    assert words in compared(new, old, tmp_path)
+
+
+def test_malformed_notes_name_the_file(tmp_path: Path) -> None:
+    bad = replace(example_rig(), solved_from={"uncertainty": 3})
+    with pytest.raises(RigError, match=r"old\.yaml: solved_from\.uncertainty"):
+        compared(example_rig(), bad, tmp_path)
