@@ -65,6 +65,7 @@ def warnings_of(
     """Return what the reader of the report should know, most important first."""
     return [
         *_status_warnings(run, track),
+        *_agreement_warnings(run),
         *_gap_warnings(track),
         *_range_warnings(track, working_range),
         *_precision_warnings(track),
@@ -123,6 +124,14 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
     share = float(track.valid.mean())
     if share < 0.5:
         yield f"Only {100 * share:.0f} % of the frames gave a posture."
+
+
+def _agreement_warnings(run: Mapping[str, Any]) -> Iterator[str]:
+    summary = run.get("summary")
+    found = summary.get("laser_agreement") if isinstance(summary, dict) else None
+    words = found.get("words") if isinstance(found, dict) else None
+    if isinstance(words, str) and words:
+        yield f"{words[0].upper()}{words[1:]}."
 
 
 def _gap_warnings(track: Track) -> Iterator[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
 from aqualvs.app.progress import progress
 from aqualvs.app.report import write_report
+from aqualvs.app.run_agreement import agreement_of
 from aqualvs.app.run_bare_lens import RunBareLens
 from aqualvs.app.run_inputs import (
     FrameWindow,
@@ -135,6 +136,7 @@ def run(
     with open_source(request.source, fps=request.fps) as source:
         check_fits(source, rig)
         scanner = scanner_for(rig, request.scanner)
+        agreement = None if request.no_dome else agreement_of(rig, request.rig)
         frames = _ready(_window(source, request.frames), source, request.frames)
         prepare_folder(request.out, overwrite=request.overwrite)
         started = time.perf_counter()
@@ -146,6 +148,7 @@ def run(
                 StopSignals() as stop,
                 progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
             ):
+                outputs.tally.agreement = agreement
                 for lost, frame in _with_losses(frames, request.frames.first, rig.n_water):
                     for scan in lost:
                         outputs.write(scan)

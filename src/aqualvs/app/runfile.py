@@ -14,7 +14,10 @@ from typing import Any
 import yaml
 
 from aqualvs import __version__
+from aqualvs.optics.rigtext import TidyDumper
 
+# A list stays on one line, however many digits it has.
+_WIDTH = 1000
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "av")
 
 
@@ -75,7 +78,9 @@ class RunFile:
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a mapping as YAML in its own order; the old file stays until the new one is whole."""
     draft = path.with_name(path.name + ".part")
-    text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
+    text = yaml.dump(
+        dict(content), Dumper=TidyDumper, sort_keys=False, allow_unicode=True, width=_WIDTH
+    )
     try:
         draft.write_text(text, encoding="utf-8")
         os.replace(draft, path)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
 
@@ -23,11 +24,14 @@ class Tally:
         Frames without posture, by reason.
     ranges : array of float
         Metres, one for each valid frame.
+    agreement : LaserAgreement or None
+        What watches over the lasers, if anything does.
     """
 
     n_frames: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
+    agreement: LaserAgreement | None = None
 
     @property
     def n_valid(self) -> int:
@@ -37,6 +41,8 @@ class Tally:
     def add(self, scan: Scan) -> None:
         """Count one frame."""
         self.n_frames += 1
+        if self.agreement is not None:
+            self.agreement.add(scan)
         if isinstance(scan.posture, Posture):
             self.ranges.append(scan.posture.range)
         else:
@@ -53,6 +59,8 @@ class Tally:
             found["range_max_m"] = round(max(self.ranges), 6)
         if self.refused:
             found["refused"] = dict(self.refused.most_common())
+        if self.agreement is not None:
+            found["laser_agreement"] = self.agreement.verdict().facts()
         return found
 
     def lines(self) -> list[str]:
@@ -68,7 +76,8 @@ class Tally:
         if self.refused:
             counts = (f"{n} {reason}" for reason, n in self.refused.most_common())
             text.append(f"no posture: {', '.join(counts)}")
-        return text
+        sentence = "" if self.agreement is None else self.agreement.verdict().sentence()
+        return [*text, sentence] if sentence else text
 
 
 def tally_of(posture_csv: Path) -> Tally:

@@ -1,0 +1,122 @@
+"""Render, scan with a rig that is wrong about one laser, and see whether that one is named."""
+
+import importlib.util
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.live.sources import open_source
+from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.uncertainty import rig_moved_by
+from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
+from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanning.scan import Frame
+from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenarios import load_scenario
+
+_TOOL = Path(__file__).resolve().parents[2] / "tools" / "rig_from_sample_truth.py"
+_TIMES = np.linspace(0.1, 3.7, 8)
+_DIVES = ("wall", "wall_yaw", "wall_pitch", "wall_range", "net_diamond", "net_clutter")
+
+
+@cache
+def frames(scenario_name: str) -> tuple[Frame, ...]:
+    renderer, scenario = Renderer(example_rig(), threads=2), load_scenario(scenario_name)
+    found = []
+    for t in _TIMES.tolist():
+        rng = np.random.default_rng([5, round(1000 * t)])
+        picture = renderer.render(scenario.scene_at(t), t, rng)
+        luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+        found.append(Frame(0, t, luma, chroma))
+    return tuple(found)
+
+
+def turned(rig: Rig, laser: int, degrees: float, towards: float) -> Rig:
+    name = rig.lasers[laser].name
+    tilt = np.tan(np.deg2rad(degrees)) * np.array([np.cos(towards), np.sin(towards)])
+    return rig_moved_by(rig, (f"{name}:tilt_1", f"{name}:tilt_2"), tilt)
+
+
+def watched(rig: Rig, scenario_name: str) -> AgreementVerdict:
+    scanner, agreement = Scanner(rig), LaserAgreement(rig)
+    for frame in frames(scenario_name):
+        scan = scanner.process(frame)
+        # A video has several frames of each moment.
+        for _ in range(3):
+            agreement.add(scan)
+    return agreement.verdict()
+
+
+@pytest.mark.parametrize("scenario_name", ["wall_yaw", "wall_range", "net_diamond", "net_hexagon"])
+def test_a_true_rig_raises_no_alarm(scenario_name: str) -> None:
+    verdict = watched(example_rig(), scenario_name)
+    assert verdict.n_frames >= 6
+    assert verdict.sentence() == ""
+
+
+@pytest.mark.parametrize("scenario_name", ["wall_yaw", "wall_range"])
+@pytest.mark.parametrize("laser", [0, 1, 2])
+@pytest.mark.parametrize("towards", [0.0, 1.57])
+def test_a_laser_that_has_turned_is_named(scenario_name: str, laser: int, towards: float) -> None:
+    verdict = watched(turned(example_rig(), laser, 0.4, towards), scenario_name)
+    assert verdict.state is AgreementState.DRIFTED
+    assert verdict.suspects == (laser,)
+    assert np.rad2deg(verdict.angle) == pytest.approx(0.4, abs=0.1)
+
+
+@pytest.mark.parametrize(("laser", "towards"), [(0, 0.0), (1, 0.0), (2, 1.57)])
+@pytest.mark.parametrize("degrees", [0.1, 2.0])
+def test_small_and_large_turns_are_found(laser: int, towards: float, degrees: float) -> None:
+    # Two degrees are a third of the range beyond 0.8 m: the stripe leaves where it is sought.
+    verdict = watched(turned(example_rig(), laser, degrees, towards), "wall_yaw")
+    assert verdict.suspects == (laser,)
+    assert np.rad2deg(verdict.angle) == pytest.approx(degrees, abs=0.1)
+
+
+def test_a_turn_is_found_on_a_net_too() -> None:
+    verdict = watched(turned(example_rig(), 1, 0.4, 0.0), "net_diamond")
+    assert verdict.suspects == (1,)
+    assert np.rad2deg(verdict.angle) == pytest.approx(0.4, abs=0.1)
+
+
+@pytest.fixture(scope="module")
+def sample_rig(samples: Path) -> Rig:
+    spec = importlib.util.spec_from_file_location("rig_from_sample_truth", _TOOL)
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    rig: Rig = tool.load_truth(samples / "lab-paper" / "truth" / "rig_truth.json")
+    return rig
+
+
+def watched_sample(samples: Path, name: str, rig: Rig, every: int) -> AgreementVerdict:
+    scanner, agreement = Scanner(rig), LaserAgreement(rig)
+    with open_source(samples / "lab-paper" / "dives" / f"{name}.mp4") as source:
+        for frame in source:
+            if frame.index % every == 0:
+                scan = scanner.process(frame)
+                for _ in range(3):
+                    agreement.add(scan)
+    return agreement.verdict()
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize("name", _DIVES)
+def test_independent_dives_raise_no_alarm(samples: Path, sample_rig: Rig, name: str) -> None:
+    verdict = watched_sample(samples, name, sample_rig, every=3)
+    assert verdict.n_frames >= 10
+    assert verdict.sentence() == ""
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize("name", ["wall", "net_diamond"])
+def test_a_turn_is_found_in_independent_dives(samples: Path, sample_rig: Rig, name: str) -> None:
+    verdict = watched_sample(samples, name, turned(sample_rig, 1, 0.4, 0.0), every=3)
+    assert verdict.suspects == (1,)
+    assert np.rad2deg(verdict.angle) == pytest.approx(0.4, abs=0.1)
