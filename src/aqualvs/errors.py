@@ -7,6 +7,7 @@
       SourceError               a video or image folder that cannot be read
       OutputError               a folder or file that cannot be written
       OptionError               an option, or a combination of them, that makes no sense
+      CalibrationError          pictures, targets or poses from which nothing can be solved
 
 A refused posture is not an exception but a value, `aqualvs.scanning.posture.Refusal`.
 """
@@ -33,3 +34,7 @@ class OutputError(AqualvsError):
 
 class OptionError(AqualvsError):
     """An option, or a combination of options, that makes no sense."""
+
+
+class CalibrationError(AqualvsError):
+    """Pictures, targets or poses from which nothing can be solved."""

@@ -1,0 +1,102 @@
+"""Made-up pictures of printed targets, with the exact place of every corner."""
+
+import cv2
+import numpy as np
+
+from aqualvs.calibration.printed import board_rectangles, marker_rectangles
+from aqualvs.calibration.targets import Board, BoardKind
+
+# Finer pixels, per pixel each way, that are averaged: leaves 0.01 px of jaggies at most.
+_FINE = 6
+# A square of 8 units with a marker of 6, whose cells are then 1 unit: every edge is a whole number.
+UNITS = 8
+
+
+def charuco(squares=(7, 5), **changes):
+    unit = 0.004
+    options = {
+        "kind": BoardKind.CHARUCO,
+        "squares": squares,
+        "square": UNITS * unit,
+        "marker": 6 * unit,
+        "dictionary": "DICT_4X4_250",
+        "border": 2 * unit,
+    }
+    return Board(**(options | changes))
+
+
+def chessboard(squares=(7, 6)):
+    return Board(kind=BoardKind.CHESSBOARD, squares=squares, square=0.032, border=0.016)
+
+
+def raster(rectangles, unit, size):
+    """Cells of a target (rows, columns), 1 where light, from black rectangles in lengths."""
+    cells = np.ones(size, np.uint8)
+    for x, y, w, h in np.rint(np.asarray(rectangles) / unit).astype(int):
+        cells[y : y + h, x : x + w] = 0
+    return cells
+
+
+def board_cells(board):
+    """Cells of a board with its light border, and the border in cells."""
+    unit = board.square / UNITS
+    border = round(board.border / unit)
+    n_x, n_y = board.squares
+    cells = raster(board_rectangles(board), unit, (UNITS * n_y, UNITS * n_x))
+    return np.pad(cells, border, constant_values=1), border
+
+
+def tag_cells(family, number):
+    """Cells of a marker with a light ring of one cell and a bit."""
+    cells = raster(marker_rectangles(family, number, np.zeros(2), 8.0), 1.0, (8, 8))
+    return np.pad(cells, 2, constant_values=1)
+
+
+def homography(corners_px, size):
+    """Map from cells (x right, y down, from the raster's top left) to pixels."""
+    w, h = size
+    ends = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32)
+    return cv2.getPerspectiveTransform(ends, np.asarray(corners_px, np.float32))
+
+
+def seen(h, points):
+    """Pixels of points (N, 2) in cells."""
+    return cv2.perspectiveTransform(np.asarray(points, np.float64)[None], h)[0]
+
+
+def picture(cells, h, size, *, blur=0.7, gamma=1.25, noise=1.0, seed=0, light=180.0, dark=14.0):
+    """Photograph cells: blurred light, then gamma, noise, whole grey levels.
+
+    `light` and `dark` are grey levels after gamma; what surrounds the target lies between.
+    """
+    width, height = size
+    fine = (np.arange(_FINE * max(size)) + 0.5) / _FINE - 0.5
+    x, y = np.meshgrid(fine[: _FINE * width], fine[: _FINE * height])
+    place = np.linalg.inv(h) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    column, row = np.floor(place[:2] / place[2]).astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < cells.shape[1]) & (row < cells.shape[0])
+    tone = np.full(x.size, 0.4)
+    tone[inside] = cells[row[inside], column[inside]]
+    low, high = (dark / 255.0) ** gamma, (light / 255.0) ** gamma
+    linear = (low + (high - low) * tone).reshape(x.shape)
+    linear = cv2.GaussianBlur(linear, (0, 0), blur * _FINE)
+    coarse = linear.reshape(height, _FINE, width, _FINE).mean(axis=(1, 3))
+    grey = 255.0 * coarse ** (1.0 / gamma)
+    grey += noise * np.random.default_rng(seed).normal(size=grey.shape)
+    return np.rint(np.clip(grey, 0, 255)).astype(np.uint8)
+
+
+def striped(image, start, end, width=2.0):
+    """Lay a bright laser stripe with a faint foot over a picture."""
+    height, columns = image.shape
+    x, y = np.meshgrid(np.arange(columns), np.arange(height))
+    along = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
+    off = (x - start[0]) * -along[1] + (y - start[1]) * along[0]
+    glow = 230.0 * np.exp(-0.5 * (off / width) ** 2) + 12.0 * np.exp(-0.5 * (off / 8.0) ** 2)
+    return np.clip(image + glow, 0, 255).astype(np.uint8)
+
+
+def truth_of_board(board, h):
+    """Pixels of a board's inner corners."""
+    _, border = board_cells(board)
+    return seen(h, board.corner_points()[:, :2] / board.square * UNITS + border)
