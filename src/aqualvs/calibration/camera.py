@@ -1,0 +1,247 @@
+"""`calibrate camera`: intrinsics from views of a board in air, without the dome.
+
+OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) starts it; the robust bundle of
+`calibrate dome` finishes it, which adds the covariance and names what does not fit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState
+from aqualvs.calibration.camera_checks import (
+    check_camera_solution,
+    check_camera_views,
+    coverage,
+    pixel_grid,
+)
+from aqualvs.calibration.camera_problem import direction_sigma_px, fitted_camera
+from aqualvs.calibration.dome_result import ViewFit, rms_px, view_fit
+from aqualvs.calibration.held_back import predicted
+from aqualvs.calibration.least_squares import Solution, solve
+from aqualvs.calibration.view import View
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import IntArray
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.uncertainty import RigUncertainty
+
+# A view is bad if it is this many times noisier than the typical one, and noisier than this.
+_BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
+_MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
+# Every so-many-th view is held back; a camera needs the rest.
+_HELD_BACK_EVERY, _MIN_HELD_BACK, _MIN_POINTS = 4, 8, 12
+_MANY_OUTLIERS = 0.05
+_WEAK_PIXEL_PX = 1.0
+_THIN_COVERAGE = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """Intrinsics, and how far to trust them.
+
+    Attributes
+    ----------
+    lens : Lens
+    size_px : (int, int)
+        Image width and height.
+    uncertainty : RigUncertainty
+        Of the intrinsics, scaled by the residuals.
+    views : tuple of ViewFit
+        Poses are `cam_from_target`.
+    left_out : dict
+        Names of views that were not used, and why.
+    noise_px : float
+        Typical standard deviation of a corner's coordinate.
+    coverage : int array, shape (6, 8)
+        How many corners fell into each cell of the picture.
+    held_back_rms_px : float
+        How well a model from three views in four predicts corners of the fourth; NaN where there
+        are too few views.
+    findings : tuple of str
+        In plain words: what is worth knowing.
+    n_iterations : int
+    """
+
+    lens: Lens
+    size_px: tuple[int, int]
+    uncertainty: RigUncertainty
+    views: tuple[ViewFit, ...]
+    left_out: dict[str, str]
+    noise_px: float
+    coverage: IntArray
+    held_back_rms_px: float
+    findings: tuple[str, ...]
+    n_iterations: int
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of all inliers from their predicted pixels (as OpenCV)."""
+        return rms_px(np.concatenate([v.residuals[v.inliers] for v in self.views]))
+
+    @property
+    def n_points(self) -> int:
+        """Number of corners that were believed."""
+        return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
+
+
+def camera(
+    views: Sequence[View],
+    size_px: tuple[int, int],
+    *,
+    model: LensModel = LensModel.OPENCV,
+    n_coefficients: int | None = None,
+) -> CameraCalibration:
+    """Solve the intrinsics.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of them.
+    size_px : (int, int)
+        Image width and height.
+    model : LensModel
+    n_coefficients : int, optional
+        Number of distortion coefficients; by default as many as the views show to be there.
+
+    Returns
+    -------
+    CameraCalibration
+
+    Raises
+    ------
+    CalibrationError
+        If the views are too few or too much alike to determine the intrinsics, or do not show the
+        board they are said to.
+    """
+    check_camera_views(views, size_px)
+    bundle, solution = fitted_camera(views, size_px, model, n_coefficients)
+    bundle, solution, left_out = _without_bad_views(bundle, solution)
+    check_camera_solution(solution, [target.view for target in bundle.views])
+    result = _result(bundle, solution, left_out)
+    return replace(result, findings=tuple(_findings(result)))
+
+
+def _without_bad_views(
+    bundle: Bundle, solution: Solution[BundleState]
+) -> tuple[Bundle, Solution[BundleState], dict[str, str]]:
+    """Leave out views that fit far worse than the others, and solve again."""
+    typical = CORNER_SIGMA_PX * solution.scales[CORNERS]
+    bad: dict[int, str] = {}
+    for i, target in enumerate(bundle.views):
+        noise = CORNER_SIGMA_PX * solution.block_scales[i]
+        share = float(np.mean(solution.inliers[i]))
+        if noise > max(_BAD_VIEW * typical, _BAD_NOISE_PX):
+            bad[i] = f"its corners are {noise:.2g} px off, those of other views {typical:.2g} px"
+        elif share < _MOSTLY_WRONG:
+            bad[i] = f"only {100.0 * share:.0f} % of its {len(target.view)} corners fit"
+    if not bad or len(bad) > _BAD_SHARE * len(bundle.views):
+        return bundle, solution, {}
+    keep = [i for i in range(len(bundle.views)) if i not in bad]
+    part = _part(bundle, keep)
+    reasons = {
+        bundle.views[i].view.name: f"{why}; blurred, or the board bent?" for i, why in bad.items()
+    }
+    return part, solve(part, _state(solution.state, keep)), reasons
+
+
+def _part(bundle: Bundle, keep: Sequence[int]) -> Bundle:
+    return replace(
+        bundle,
+        views=tuple(bundle.views[i] for i in keep),
+        start=_state(bundle.start, keep),
+    )
+
+
+def _state(state: BundleState, keep: Sequence[int]) -> BundleState:
+    return replace(state, poses=tuple(state.poses[i] for i in keep))
+
+
+def _result(
+    bundle: Bundle, solution: Solution[BundleState], left_out: dict[str, str]
+) -> CameraCalibration:
+    rig, n = solution.state.rig, len(bundle.free)
+    fits = []
+    for i, target in enumerate(bundle.views):
+        columns = bundle.pose_columns(i)
+        fits.append(
+            view_fit(
+                target.view.name,
+                target.view,
+                solution.state.poses[i],
+                solution.covariance[np.ix_(columns, columns)],
+                solution.blocks[i],
+                solution.inliers[i],
+                solution.block_scales[i],
+            )
+        )
+    seen = np.concatenate([fit.view.pixels[fit.inliers] for fit in fits])
+    return CameraCalibration(
+        lens=rig.lens,
+        size_px=rig.size_px,
+        uncertainty=RigUncertainty(bundle.free, solution.covariance[:n, :n]),
+        views=tuple(fits),
+        left_out=left_out,
+        noise_px=CORNER_SIGMA_PX * solution.scales[CORNERS],
+        coverage=coverage(seen, rig.size_px),
+        held_back_rms_px=_held_back(bundle, solution),
+        findings=(),
+        n_iterations=solution.n_iterations,
+    )
+
+
+def _held_back(bundle: Bundle, solution: Solution[BundleState]) -> float:
+    n = len(bundle.views)
+    believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
+    held = [i for i in range(1, n, _HELD_BACK_EVERY) if len(believed[i]) >= _MIN_POINTS]
+    if n < _MIN_HELD_BACK or not held:
+        return float("nan")
+    rest = [i for i in range(n) if i not in held]
+    try:
+        state = solve(_part(bundle, rest), _state(solution.state, rest)).state
+        return rms_px(predicted(state, [0] * len(held), [believed[i] for i in held]))
+    except CalibrationError:
+        return float("nan")
+
+
+def _findings(result: CameraCalibration) -> list[str]:
+    sigmas, lens = result.uncertainty.sigmas, result.lens
+    n = len(lens.distortion)
+    lines = [
+        f"focal lengths: {lens.fx:.2f} ± {sigmas['fx']:.2f} and {lens.fy:.2f} ± "
+        f"{sigmas['fy']:.2f} px; image centre {lens.cx:.2f} ± {sigmas['cx']:.2f}, "
+        f"{lens.cy:.2f} ± {sigmas['cy']:.2f} px",
+        f"distortion: {n} coefficients of the {lens.model} model",
+    ]
+    if np.isfinite(result.held_back_rms_px):
+        lines.append(
+            f"corners of views held back are predicted to {result.held_back_rms_px:.3f} px"
+        )
+    lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
+    for fit in result.views:
+        wrong = int(np.count_nonzero(~fit.inliers))
+        if wrong > _MANY_OUTLIERS * len(fit.view):
+            lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
+    return lines + _weak_places(result)
+
+
+def _weak_places(result: CameraCalibration) -> list[str]:
+    lines = []
+    covered = float(np.mean(result.coverage > 0))
+    if covered < _THIN_COVERAGE:
+        lines.append(
+            f"corners were seen in {100.0 * covered:.0f} % of the picture; show the board in all "
+            "parts of it"
+        )
+    grid = pixel_grid(result.size_px)
+    sigma = direction_sigma_px(result.lens, result.uncertainty.covariance, grid)
+    if not np.isfinite(sigma).all():
+        lines.append("the distortion model does not reach all corners of the picture")
+    worst = int(np.argmax(np.nan_to_num(sigma)))
+    if np.nan_to_num(sigma)[worst] > _WEAK_PIXEL_PX:
+        u, v = grid[worst]
+        lines.append(
+            f"at pixel ({u:.0f}, {v:.0f}) the intrinsics are uncertain by {sigma[worst]:.1f} px; "
+            "show the board there"
+        )
+    return lines

@@ -1,0 +1,218 @@
+"""The problem of `calibrate camera`: where it starts, and how many coefficients the lens takes."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from aqualvs.calibration.blocks import normal_equations
+from aqualvs.calibration.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState, TargetView
+from aqualvs.calibration.least_squares import Solution, inverse, solve
+from aqualvs.calibration.start import start_pose
+from aqualvs.calibration.view import View
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.uncertainty import RigUncertainty
+
+# Fields of view, in radians across the picture, that a lens is tried with where OpenCV finds none.
+_FIELDS = tuple(np.deg2rad([30.0, 50.0, 70.0, 95.0]))
+_FISHEYE_FIELDS = tuple(np.deg2rad([60.0, 100.0, 140.0, 180.0]))
+# A start that leaves less than this needs no rival.
+_GOOD_NOISE_PX = 1.0
+# Share of a coefficient's effect that is its own, below which it adds nothing.
+_REDUNDANT = 1e-7
+# Numbers of coefficients, each with those before it; fisheye lenses have all four or none.
+_STEPS = {LensModel.OPENCV: (4, 5, 8), LensModel.FISHEYE: (4,)}
+
+
+def fitted_camera(
+    views: Sequence[View],
+    size_px: tuple[int, int],
+    model: LensModel,
+    n_coefficients: int | None,
+) -> tuple[Bundle, Solution[BundleState]]:
+    """Solve the camera, with as many distortion coefficients as the views show to be there.
+
+    More coefficients are taken only while they lower the cost by more than the information
+    criterion of Schwarz (1978, doi:10.1214/aos/1176344136) asks for: superfluous ones would spoil
+    the picture's corners, where no board was seen.
+
+    Raises
+    ------
+    CalibrationError
+        If no camera can have taken the views.
+    """
+    steps = _STEPS[model]
+    first = steps[0] if n_coefficients is None else n_coefficients
+    bundle, solution = _first_fit(views, size_px, model, first)
+    if n_coefficients is not None:
+        return bundle, solution
+    if model is LensModel.OPENCV and not _distorts(bundle, solution):
+        return with_coefficients(bundle, solution, 0)
+    for n in steps[1:]:
+        if gain_of_coefficients(bundle, solution, n) < _price(bundle, solution, n):
+            break
+        bundle, solution = with_coefficients(bundle, solution, n)
+    return bundle, solution
+
+
+def with_coefficients(
+    bundle: Bundle, solution: Solution[BundleState], n: int
+) -> tuple[Bundle, Solution[BundleState]]:
+    """Solve again with another number of distortion coefficients."""
+    other, state = _resized(bundle, solution.state, n)
+    return other, solve(other, state)
+
+
+def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:
+    """Return by how much further coefficients would lower the sum of squares, in sigmas squared.
+
+    Rao's score test: from the slopes at the solution, without solving again.
+    """
+    wider, state = _resized(bundle, solution.state, n)
+    blocks = wider.blocks(state)
+    equations = normal_equations(
+        wider.n_parameters, blocks, solution.inliers, solution.block_scales
+    )
+    new = np.arange(len(bundle.free), len(wider.free))
+    old = np.setdiff1d(np.arange(wider.n_parameters), new)
+    information, gradient = equations.information, equations.gradient
+    by_old = information[np.ix_(new, old)] @ inverse(information[np.ix_(old, old)])
+    left = information[np.ix_(new, new)] - by_old @ information[np.ix_(old, new)]
+    slope = gradient[new] - by_old @ gradient[old]
+    size = np.sqrt(np.diag(information)[new])
+    values, vectors = np.linalg.eigh(left / np.outer(size, size))
+    # Combinations that do what others can do already are left to rounding.
+    told = values > _REDUNDANT
+    along = (vectors.T @ (slope / size))[told]
+    return float(np.sum(along**2 / values[told]))
+
+
+def _distorts(bundle: Bundle, solution: Solution[BundleState]) -> bool:
+    lens = solution.state.rig.lens
+    columns = np.arange(4, 4 + len(lens.distortion))
+    values = np.array(lens.distortion)
+    squares = values @ np.linalg.solve(solution.covariance[np.ix_(columns, columns)], values)
+    return bool(squares > _price(bundle, solution, 0))
+
+
+def _price(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:
+    more = abs(n - len(solution.state.rig.lens.distortion))
+    values = sum(2 * int(np.count_nonzero(i)) for i in solution.inliers[: len(bundle.views)])
+    return more * float(np.log(values))
+
+
+def _resized(bundle: Bundle, state: BundleState, n: int) -> tuple[Bundle, BundleState]:
+    lens = state.rig.lens
+    coefficients = (*lens.distortion, *(0.0,) * 8)[:n]
+    rig = replace(state.rig, lens=replace(lens, distortion=coefficients))
+    there = replace(state, rig=rig)
+    return replace(bundle, free=rig.lens.parameter_names, start=there), there
+
+
+def _first_fit(
+    views: Sequence[View], size_px: tuple[int, int], model: LensModel, n_coefficients: int
+) -> tuple[Bundle, Solution[BundleState]]:
+    best: tuple[Bundle, Solution[BundleState]] | None = None
+    for lens in _lenses(views, size_px, model, n_coefficients):
+        try:
+            bundle = _bundle(lens, size_px, views)
+            solution = solve(bundle, bundle.start)
+        except (CalibrationError, RigError):
+            continue
+        if best is None or solution.scales[CORNERS] < best[1].scales[CORNERS]:
+            best = bundle, solution
+        if CORNER_SIGMA_PX * solution.scales[CORNERS] < _GOOD_NOISE_PX:
+            break
+    if best is None:
+        raise CalibrationError(
+            f"no camera can have taken the {len(views)} views; is the board's file that of the "
+            "print, and was the board flat?"
+        )
+    return best
+
+
+def _lenses(
+    views: Sequence[View], size_px: tuple[int, int], model: LensModel, n_coefficients: int
+) -> Iterator[Lens]:
+    if model is LensModel.OPENCV:
+        found = _by_opencv(views, size_px)
+        if found is not None:
+            yield replace(found, distortion=(*found.distortion, *(0.0,) * 4)[:n_coefficients])
+    fisheye = model is LensModel.FISHEYE
+    for field in _FISHEYE_FIELDS if fisheye else _FIELDS:
+        focal = size_px[0] / field if fisheye else 0.5 * size_px[0] / np.tan(0.5 * field)
+        yield Lens(
+            model=model,
+            fx=float(focal),
+            fy=float(focal),
+            cx=0.5 * (size_px[0] - 1),
+            cy=0.5 * (size_px[1] - 1),
+            distortion=(0.0,) * n_coefficients,
+        )
+
+
+def _by_opencv(views: Sequence[View], size_px: tuple[int, int]) -> Lens | None:
+    try:
+        _, matrix, distortion, _, _ = cv2.calibrateCamera(
+            [v.points.astype(np.float32) for v in views],
+            [v.pixels.astype(np.float32) for v in views],
+            size_px,
+            None,
+            None,
+            flags=cv2.CALIB_FIX_K3,
+        )
+        return Lens(
+            fx=float(matrix[0, 0]),
+            fy=float(matrix[1, 1]),
+            cx=float(matrix[0, 2]),
+            cy=float(matrix[1, 2]),
+            distortion=tuple(map(float, np.ravel(distortion)[:4])),
+        )
+    except (cv2.error, RigError):
+        return None
+
+
+def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bundle:
+    """Return the problem of a bare camera at the origin, with poses to start from."""
+    rig = Rig(
+        name="camera",
+        size_px=size_px,
+        lens=lens,
+        dome_from_cam=SE3.identity(),
+        dome=None,
+        n_air=1.0,
+        n_water=1.0,
+        lasers=(),
+        working_range=(0.1, 10.0),
+    )
+    targets = []
+    for view in views:
+        found = start_pose(rig.camera(), view)
+        if isinstance(found, str):
+            raise CalibrationError(found)
+        targets.append(TargetView(view, 0, found.dome_from_target))
+    start = BundleState(rig, np.ones(1), tuple(t.dome_from_target for t in targets))
+    return Bundle(tuple(targets), lens.parameter_names, start, RigUncertainty.none(), np.zeros(1))
+
+
+def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Return how uncertain (N,) the intrinsics leave the pixels of fixed directions, in pixels.
+
+    Parameters
+    ----------
+    lens : Lens
+    covariance : array, shape (P, P)
+        Of its numbers.
+    pixels : array, shape (N, 2)
+        Where; NaN comes back where the lens model does not hold.
+    """
+    directions, _ = lens.directions(pixels)
+    _, _, _, by_number = lens.pixels_with_parameter_jacobian(directions)
+    spread = np.einsum("nip,pq,niq->ni", by_number, covariance, by_number)
+    sigma: FloatArray = np.sqrt(spread.sum(axis=-1))
+    return sigma
