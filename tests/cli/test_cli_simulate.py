@@ -3,6 +3,7 @@
 import pytest
 
 from aqualvs.app.cli import main
+from aqualvs.app.simulate import CALIBRATION
 from aqualvs.simulation.scenarios import list_scenarios
 from shell_cases import rig_file
 
@@ -10,7 +11,7 @@ from shell_cases import rig_file
 def test_the_list_names_every_scenario(capsys):
     assert main(["simulate", "--list"]) == 0
     said = capsys.readouterr().out
-    assert [line.split()[0] for line in said.splitlines()] == list(list_scenarios())
+    assert [line.split()[0] for line in said.splitlines()] == [*list_scenarios(), CALIBRATION]
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,13 @@ def test_an_existing_dive_is_kept(tmp_path, capsys):
     assert main(["simulate", "wall", "-o", str(tmp_path), "--rig", str(rig_file(tmp_path))]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert (tmp_path / "dive.mp4").read_bytes() == b"precious"
+
+
+def test_an_existing_set_of_calibration_pictures_is_kept(tmp_path, capsys):
+    (tmp_path / "box").mkdir()
+    assert main(["simulate", "calibration", "-o", str(tmp_path)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["box"]
 
 
 def test_a_simulated_dive_runs_against_its_truth(tmp_path, capsys):

@@ -1,5 +1,6 @@
-"""`aqualvs simulate`: a dive with known truth, ready for `aqualvs run`."""
+"""`aqualvs simulate`: a dive with known truth, or pictures for a calibration."""
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,11 +8,17 @@ from aqualvs.app.disk import writing
 from aqualvs.app.progress import progress
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.scenarios import list_scenarios, load_scenario
 
+CALIBRATION = "calibration"
+"""What is given in a scenario's place to render pictures for a calibration."""
+
+_ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
 _FILES = ("dive.mp4", "truth.csv", "rig.yaml")
+_CALIBRATION_FILES = ("camera_air", "dome_air", "box", "index", "dive", "truth", "nominal.yaml")
 
 
 def simulate(
@@ -27,7 +34,7 @@ def simulate(
     Parameters
     ----------
     scenario : str or None
-        Built-in name or path of a YAML file.
+        Built-in name or path of a YAML file; `CALIBRATION` for pictures to calibrate from.
     rig_file : Path or None
         None takes the example rig.
     out : Path or None
@@ -35,7 +42,7 @@ def simulate(
     tell : callable
         Takes one line of text.
     overwrite : bool
-        Whether a dive that is already there may be replaced.
+        Whether what is already there may be replaced.
 
     Raises
     ------
@@ -46,9 +53,12 @@ def simulate(
         raise OptionError("SCENARIO: missing; choose one from aqualvs simulate --list")
     if out is None:
         raise OptionError("--out: missing; give the folder to write")
+    if scenario == CALIBRATION:
+        _simulate_calibration(rig_file, out, tell, overwrite=overwrite)
+        return
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
-    _check_free(out, overwrite=overwrite)
+    _check_free(out, _FILES, overwrite=overwrite)
     with writing(out), progress(scenario, course.n_frames) as tick:
         dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1))
         save_rig(rig, out / "rig.yaml")
@@ -59,15 +69,55 @@ def simulate(
     )
 
 
+def _simulate_calibration(
+    rig_file: Path | None, out: Path, tell: Callable[[str], object], *, overwrite: bool
+) -> None:
+    rig = example_rig() if rig_file is None else load_rig(rig_file)
+    _check_free(out, _CALIBRATION_FILES, overwrite=overwrite)
+    with writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
+        files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1))
+    tell(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
+    tell("next:")
+    for command in calibration_commands(files, out, len(rig.lasers)):
+        tell(f"  aqualvs {shlex.join(command)}")
+
+
+def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
+    """Return the arguments of `aqualvs` that calibrate from a simulated set, in turn.
+
+    Parameters
+    ----------
+    files : CalibrationFiles
+        The set.
+    out : Path
+        Folder in which `rig.yaml` and `run` are to be written.
+    n_lasers : int
+        Lasers of the rig.
+    """
+    rig = str(out / "rig.yaml")
+    update = ["--rig", rig, "-o", rig]
+    camera = [str(files.camera), f"--board={files.board}", f"--nominal={files.nominal}", "-o", rig]
+    dome = [str(files.dome), f"--board={files.rail_board}", f"--poses={files.poses}", *update]
+    lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={n_lasers}", *update]
+    water = [str(files.index), f"--target={files.target}", *update]
+    steps = {"camera": camera, "dome": dome, "lasers": lasers, "water": water}
+    commands = [["calibrate", step, *arguments] for step, arguments in steps.items()]
+    commands.append(["check", rig, "--against", str(files.rig)])
+    if files.dive is not None:
+        dive = [str(files.dive), "--rig", rig, "--truth", str(files.dive_truth)]
+        commands.append(["run", *dive, "-o", str(out / "run")])
+    return commands
+
+
 def tell_scenarios(tell: Callable[[str], object]) -> None:
     """Tell the built-in scenarios, one line each."""
-    scenarios = list_scenarios()
+    scenarios = {**list_scenarios(), CALIBRATION: _ABOUT_CALIBRATION}
     width = max(map(len, scenarios))
     for name, about in scenarios.items():
         tell(f"{name:{width}}  {about}")
 
 
-def _check_free(out: Path, *, overwrite: bool) -> None:
-    found = [out / name for name in _FILES if (out / name).exists()]
+def _check_free(out: Path, names: tuple[str, ...], *, overwrite: bool) -> None:
+    found = [out / name for name in names if (out / name).exists()]
     if found and not overwrite:
         raise OutputError(f"{found[0]}: exists; choose another folder or add --overwrite")

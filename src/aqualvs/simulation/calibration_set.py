@@ -1,0 +1,343 @@
+"""Pictures for a whole calibration, in the folders that a user would have made, with the truth."""
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.errors import OptionError, OutputError
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.rigfile import save_rig
+from aqualvs.simulation import calibration_targets as targets
+from aqualvs.simulation import calibration_views as views
+from aqualvs.simulation.dive import simulate_dive
+from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
+from aqualvs.simulation.scenario import Scenario
+from aqualvs.simulation.scenario_file import parse_scenario
+
+_LASER_POWER = 8.0
+_ROOM = RoomLight(level=0.72)
+_DIM = RoomLight(level=0.32)
+_WATER = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028))
+# A square of the rail's board in the farthest picture, in pixels, and its farthest place.
+_FAR_SQUARE_PX, _FARTHEST = 19.0, 1.2
+# The nearest board stands this far before the dome.
+_NEAREST = 0.15
+_PLATE_FAR = 0.35
+_FPS = 25.0
+
+_MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetSize:
+    """How many pictures of each kind.
+
+    Attributes
+    ----------
+    camera, dome, box, index : int
+        Pictures; at least one of each.
+    dive : int
+        Frames of a dive before a wall; 0 leaves it out.
+    """
+
+    camera: int = 12
+    dome: int = 10
+    box: int = 4
+    index: int = 5
+    dive: int = 12
+
+    @property
+    def total(self) -> int:
+        """Number of all pictures and frames."""
+        return self.camera + self.dome + self.box + self.index + self.dive
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFiles:
+    """What `simulate_calibration` wrote.
+
+    Attributes
+    ----------
+    nominal : Path
+        What is known beforehand: name, size of the pictures, dome, number of lasers.
+    camera, dome, box, index : Path
+        Folders of pictures.
+    board, rail_board, poses, box_file, target : Path
+        What describes their targets: two `board.yaml`, `poses.csv`, `box.yaml`, `target.yaml`.
+    dive, dive_truth : Path or None
+        Video of a wall and its truth.
+    rig : Path
+        The true rig.
+    n_pictures : int
+        Pictures and frames.
+    """
+
+    nominal: Path
+    camera: Path
+    dome: Path
+    box: Path
+    index: Path
+    board: Path
+    rail_board: Path
+    poses: Path
+    box_file: Path
+    target: Path
+    dive: Path | None
+    dive_truth: Path | None
+    rig: Path
+    n_pictures: int
+
+
+@dataclass(slots=True)
+class _Job:
+    rig: Rig
+    out: Path
+    size: SetSize
+    seed: int
+    tick: Callable[[int, int], None] | None
+    done: int = 0
+
+    def rng(self, part: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, part])
+
+    def did_one(self) -> None:
+        self.done += 1
+        if self.tick is not None:
+            self.tick(self.done, self.size.total)
+
+    def folder(self, *names: str) -> Path:
+        folder = self.out.joinpath(*names)
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def shoot(
+        self,
+        renderer: PanelRenderer,
+        scenes: Sequence[PanelScene],
+        folder: Path,
+        rng: np.random.Generator,
+        name: str = "view_{:02d}.png",
+    ) -> list[str]:
+        """Render scenes into a folder and return the names of the pictures."""
+        names = [name.format(i) for i in range(len(scenes))]
+        for scene, file in zip(scenes, names, strict=True):
+            _write_picture(folder / file, renderer.render(scene, rng))
+            self.did_one()
+        return names
+
+
+def simulate_calibration(
+    rig: Rig,
+    out: Path,
+    *,
+    size: SetSize | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    seed: int = 0,
+) -> CalibrationFiles:
+    """Render pictures for all steps of a calibration, and the files that go with them.
+
+    `camera_air/` shows a board without the dome, `dome_air/` a larger one through the dome in air
+    (`poses.csv` knows distances only, and half of the boards are not quite square), `box/` an open
+    box of markers in air with all lasers on, the vehicle's pose unknown, and `index/clip_0/` a
+    plate that is fixed on the vehicle, in the rig's water. `dive/` is a wall to measure afterwards.
+    All that a user would not have lies in `truth/`: the rig, and the poses of boards
+    (dome_from_board) and vehicle (box_from_dome).
+
+    Parameters
+    ----------
+    rig : Rig
+        The truth; with a dome and at least one laser.
+    out : Path
+        Made if it is missing; files of an earlier set in it are overwritten.
+    size : SetSize, optional
+        How many pictures.
+    progress : callable, optional
+        Called after every picture with the number of pictures done and of all.
+    seed : int
+        The same rig, size and seed give the same pictures.
+
+    Raises
+    ------
+    OptionError
+        If the rig has no dome or no lasers, or there are too few pictures.
+    OutputError
+        If the folder or a file cannot be written.
+    """
+    size = SetSize() if size is None else size
+    _check(rig, size)
+    job = _Job(rig, out, size, seed, progress)
+    try:
+        return _simulate(job)
+    except OSError as error:
+        raise OutputError(
+            f"{error.filename or out}: {error.strerror}; choose a folder that can be written"
+        ) from None
+
+
+def _check(rig: Rig, size: SetSize) -> None:
+    if rig.dome is None or not rig.lasers:
+        missing = "dome" if rig.dome is None else "lasers"
+        raise OptionError(
+            f"rig {rig.name} has no {missing}; pictures for a whole calibration need a rig with "
+            "dome and lasers"
+        )
+    if min(size.camera, size.dome, size.box, size.index) < 1 or size.dive < 0:
+        raise OptionError(f"{size}: every kind needs one picture at least")
+
+
+def _simulate(job: _Job) -> CalibrationFiles:
+    camera, board = _camera_air(job)
+    dome, rail_board, poses = _dome_air(job)
+    box, box_file = _box(job)
+    index, target = _index(job)
+    dive, dive_truth = _dive(job)
+    nominal, rig = job.out / "nominal.yaml", job.folder("truth") / "rig.yaml"
+    targets.write_yaml(nominal, _nominal_mapping(job.rig))
+    save_rig(job.rig, rig)
+    return CalibrationFiles(
+        nominal=nominal,
+        camera=camera,
+        dome=dome,
+        box=box,
+        index=index,
+        board=board,
+        rail_board=rail_board,
+        poses=poses,
+        box_file=box_file,
+        target=target,
+        dive=dive,
+        dive_truth=dive_truth,
+        rig=rig,
+        n_pictures=job.done,
+    )
+
+
+def _camera_air(job: _Job) -> tuple[Path, Path]:
+    rig, rng, folder = job.rig, job.rng(0), job.folder("camera_air")
+    board = targets.hand_board(rig.size_px[0])
+    poses = views.board_across(rig, targets.squares_size(board), job.size.camera, rng)
+    behind = targets.ground(rig.dome_from_cam @ SE3(np.eye(3), np.array([0.0, 0.0, 2.2])))
+    scenes = [
+        PanelScene(panels=[targets.board_panel(board, pose), behind], light=_ROOM) for pose in poses
+    ]
+    names = job.shoot(PanelRenderer(rig.bare_camera()), scenes, folder, rng)
+    _write_poses(job.folder("truth") / "camera_air_poses.csv", names, poses)
+    targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
+    return folder, folder / "board.yaml"
+
+
+def _dome_air(job: _Job) -> tuple[Path, Path, Path]:
+    rig, rng, folder = job.rig.in_water(job.rig.n_air), job.rng(1), job.folder("dome_air")
+    board = targets.rail_board()
+    near = _NEAREST if rig.dome is None else rig.dome.inner_radius + rig.dome.thickness + _NEAREST
+    far = max(1.5 * near, min(_FARTHEST, board.square * rig.focal_px / _FAR_SQUARE_PX))
+    distances = np.linspace(near, far, job.size.dome)
+    poses, measured = views.board_on_rail(targets.squares_size(board), distances, rng)
+    behind = targets.ground(SE3(DOME_FROM_CAM_NOMINAL, np.array([0.0, 2.2, 0.0])), shift=150)
+    scenes = [
+        PanelScene(panels=[targets.board_panel(board, pose), behind], light=_ROOM) for pose in poses
+    ]
+    names = job.shoot(PanelRenderer(rig.camera()), scenes, folder, rng)
+    _write_poses(job.folder("truth") / "dome_air_poses.csv", names, poses)
+    rows = [(name, targets.to_mm(far)) for name, far in zip(names, measured, strict=True)]
+    _write_table(folder / "poses.csv", ("file", "distance_mm"), rows)
+    targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
+    return folder, folder / "board.yaml", folder / "poses.csv"
+
+
+def _box(job: _Job) -> tuple[Path, Path]:
+    rig, rng, folder = job.rig.in_water(job.rig.n_air), job.rng(2), job.folder("box")
+    walls = targets.marker_box(rig.size_px[0])
+    behind = targets.ground(SE3(DOME_FROM_CAM_NOMINAL, np.array([0.0, 1.9, 0.0])), shift=300)
+    poses = views.vehicle_in_box(job.size.box, rng)
+    scenes = []
+    for pose in poses:
+        inside = [targets.moved(wall, pose.inverse()).panel for wall in walls]
+        scenes.append(PanelScene(panels=[*inside, behind], light=_DIM))
+    renderer = PanelRenderer(rig.camera(), panel_sheets(rig, power=_LASER_POWER))
+    names = job.shoot(renderer, scenes, folder, rng)
+    _write_poses(job.folder("truth") / "box_poses.csv", names, poses)
+    targets.write_yaml(folder / "box.yaml", targets.box_mapping(walls, rig.n_water))
+    return folder, folder / "box.yaml"
+
+
+def _index(job: _Job) -> tuple[Path, Path]:
+    rig, rng, folder = job.rig, job.rng(3), job.folder("index", "clip_0")
+    plate = targets.marker_plate()
+    size = plate.panel.texture.size
+    plate = targets.moved(plate, views.plate_in_view(rig, size, _PLATE_FAR))
+    scenes = []
+    for i in range(job.size.index):
+        wall = SE3.from_rotvec([0.02, 0.0, 0.05], [0.01 * i, 0.80 + 0.004 * i, 0.0])
+        behind = targets.ground(wall @ SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)), cell=2e-3, shift=40)
+        scenes.append(PanelScene(panels=[plate.panel, behind], light=_WATER))
+    renderer = PanelRenderer(rig.camera(), panel_sheets(rig, power=_LASER_POWER))
+    job.shoot(renderer, scenes, folder, rng, "frame_{:03d}.png")
+    target = folder.parent / "target.yaml"
+    targets.write_yaml(target, targets.target_mapping(plate))
+    return folder, target
+
+
+def _dive(job: _Job) -> tuple[Path | None, Path | None]:
+    if not job.size.dive:
+        return None, None
+    files = simulate_dive(
+        _wall_dive(job.size.dive, job.seed),
+        job.rig,
+        job.folder("dive"),
+        progress=lambda _done, _all: job.did_one(),
+    )
+    return files.video, files.truth
+
+
+def _wall_dive(n_frames: int, seed: int) -> Scenario:
+    content: dict[str, Any] = {
+        "duration_s": n_frames / _FPS,
+        "fps": _FPS,
+        "seed": seed,
+        "motion": {"range_mm": [420, 700], "pitch_deg": [-4, 3], "yaw_deg": [6, -5]},
+        "walls": [{}],
+    }
+    return parse_scenario(content, "calibration", "calibration")
+
+
+def _nominal_mapping(rig: Rig) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "name": rig.name,
+        "image": {"width": int(rig.size_px[0]), "height": int(rig.size_px[1])},
+    }
+    if rig.dome is not None:
+        content["dome"] = {
+            "inner_radius_mm": targets.to_mm(rig.dome.inner_radius),
+            "thickness_mm": targets.to_mm(rig.dome.thickness),
+            "n_acrylic": float(rig.dome.n_acrylic),
+        }
+    return {**content, "n_air": float(rig.n_air), "lasers": {"count": len(rig.lasers)}}
+
+
+def _write_picture(path: Path, image: NDArray[np.uint8]) -> None:
+    _, data = cv2.imencode(".png", image[..., ::-1])
+    path.write_bytes(data.tobytes())
+
+
+def _write_poses(path: Path, names: Sequence[str], poses: Sequence[SE3]) -> None:
+    """Write whole poses in the form of a `poses.csv`, translations in millimetres."""
+    rows = []
+    for name, pose in zip(names, poses, strict=True):
+        matrix = np.column_stack([pose.rotation, 1e3 * pose.translation])
+        rows.append((name, *matrix.ravel().tolist()))
+    _write_table(path, ("file", *_MATRIX), rows)
+
+
+def _write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(columns)
+        table.writerows(rows)

@@ -1,0 +1,232 @@
+"""Targets of simulated calibration pictures: what is printed, and the files that describe it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.rigtext import TidyDumper
+from aqualvs.simulation.panel_textures import (
+    PAPER,
+    CharucoPrint,
+    MarkerPrint,
+    Texture,
+    charuco_texture,
+    grid_corners,
+    marker_texture,
+    mottled,
+)
+from aqualvs.simulation.panels import Panel
+
+FAMILY = "DICT_APRILTAG_36h11"
+_FIRST_ON_PLATE = 300
+# Pictures narrower than this get larger prints, whose markers can still be read.
+_NARROW_PX = 600
+_WALL_CELL, _PLATE_CELL = 2e-3, 1e-3
+_ALBEDO, _MOTTLE = 0.55, 0.16
+# Inside of the box: width, depth, height in cells of its walls.
+_WIDE, _DEEP, _HIGH = 200, 350, 190
+
+_CORNER_ORDER = (
+    "as OpenCV reports: top-left, top-right, bottom-right, bottom-left of the upright marker"
+)
+_BOX_FRAME = (
+    "origin at the middle of the open mouth, x right, y forward, z up, mm; plane: normal . X = d"
+)
+_DOME_FRAME = "dome (origin at the dome's centre, x right, y forward, z up), mm"
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """A panel with markers, in a frame of its own.
+
+    Attributes
+    ----------
+    name : str
+        Of its plane.
+    panel : Panel
+        In that frame, not yet in `dome`.
+    prints : MarkerPrint
+        Its markers.
+    """
+
+    name: str
+    panel: Panel
+    prints: MarkerPrint
+
+    def corners(self) -> FloatArray:
+        """Return the corners of its markers (M, 4, 3) in OpenCV's order, in metres."""
+        square = self.prints.side * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        flat = (self.prints.corners[:, None, :] + square) * self.panel.texture.cell
+        depth = np.zeros((*flat.shape[:2], 1))
+        return self.panel.dome_from_panel.apply(np.concatenate([flat, depth], axis=-1))
+
+
+def hand_board(width_px: int) -> CharucoPrint:
+    """Return the board that is held before the bare camera."""
+    return CharucoPrint(
+        squares=(11, 8) if width_px >= _NARROW_PX else (7, 5),
+        square=24e-3,
+        marker=18e-3,
+        border=12e-3,
+        dictionary="DICT_4X4_250",
+    )
+
+
+def rail_board() -> CharucoPrint:
+    """Return the large board that is carried before the dome."""
+    return CharucoPrint(
+        squares=(38, 30), square=28e-3, marker=21e-3, border=14e-3, dictionary="DICT_4X4_1000"
+    )
+
+
+def board_panel(board: CharucoPrint, dome_from_board: SE3) -> Panel:
+    """Return a board, placed by the corner of its squares, as a panel that has a border."""
+    edge = SE3(np.eye(3), np.array([-board.border, -board.border, 0.0]))
+    return Panel(dome_from_board @ edge, charuco_texture(board))
+
+
+def squares_size(board: CharucoPrint) -> tuple[float, float]:
+    """Return width and height of a board's squares, in metres."""
+    return board.squares[0] * board.square, board.squares[1] * board.square
+
+
+def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Panel:
+    """Return a large mottled panel to stand behind everything, placed by its middle.
+
+    Parameters
+    ----------
+    dome_from_ground : SE3
+        x to the right, y down.
+    cell : float
+        Side of its 800 x 600 cells, in metres.
+    shift : int
+        Another place in the noise.
+    """
+    texture = Texture(mottled((600, 800), 0.26, 0.45, scale=1.6, shift=shift), cell)
+    width, height = texture.size
+    corner = SE3(np.eye(3), np.array([-0.5 * width, -0.5 * height, 0.0]))
+    return Panel(dome_from_ground @ corner, texture)
+
+
+def marker_box(width_px: int) -> list[Marked]:
+    """Return the walls of an open box, 400 x 380 x 700 mm inside, in `box`."""
+    side = 24 if width_px >= _NARROW_PX else 32
+    half_wide, half_high = 0.5 * _WIDE * _WALL_CELL, 0.5 * _HIGH * _WALL_CELL
+    depth = _DEEP * _WALL_CELL
+    x, y, z = np.eye(3)
+    # Name, cells across and down, top-left corner, directions across and down as seen from inside.
+    walls = (
+        ("forward", (_WIDE, _HIGH), (-half_wide, depth, half_high), x, -z),
+        ("left", (_DEEP, _HIGH), (-half_wide, 0.0, half_high), y, -z),
+        ("right", (_DEEP, _HIGH), (half_wide, depth, half_high), -y, -z),
+        ("down", (_WIDE, _DEEP), (-half_wide, depth, -half_high), x, -y),
+    )
+    marked, first = [], 0
+    for k, (name, cells, corner, across, down) in enumerate(walls):
+        places = grid_corners(*(_places(n, side) for n in cells))
+        pose = SE3(np.column_stack([across, down, np.cross(across, down)]), np.array(corner))
+        prints = _prints(first, places, side, side // 6)
+        albedo = mottled(cells[::-1], _ALBEDO, _MOTTLE, scale=0.8, shift=97 * k)
+        marked.append(Marked(name, Panel(pose, marker_texture(albedo, _WALL_CELL, prints)), prints))
+        first += len(places)
+    return marked
+
+
+def _places(cells: int, side: int) -> IntArray:
+    """Return where markers begin along one edge of a wall, evenly and in its middle."""
+    pitch = 7 * side // 4
+    count = (cells - side - 2 * (side // 6)) // pitch + 1
+    first = (cells - side - (count - 1) * pitch) // 2
+    return first + pitch * np.arange(count)
+
+
+def marker_plate() -> Marked:
+    """Return a plate of six markers, in a frame of its own."""
+    side, gap = 24, 6
+    places = grid_corners(*(gap + (side + gap) * np.arange(n) for n in (3, 2)))
+    prints = _prints(_FIRST_ON_PLATE, places, side, 0)
+    paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
+    panel = Panel(SE3.identity(), marker_texture(paper, _PLATE_CELL, prints))
+    return Marked("plate", panel, prints)
+
+
+def _prints(first: int, places: IntArray, side: int, ring: int) -> MarkerPrint:
+    ids = first + np.arange(len(places), dtype=np.int64)
+    return MarkerPrint(dictionary=FAMILY, ids=ids, corners=places, side=side, ring=ring)
+
+
+def moved(marked: Marked, dome_from_own: SE3) -> Marked:
+    """Return a marked panel carried into another frame."""
+    panel = Panel(dome_from_own @ marked.panel.dome_from_panel, marked.panel.texture)
+    return Marked(marked.name, panel, marked.prints)
+
+
+def board_mapping(board: CharucoPrint) -> dict[str, Any]:
+    """Return the content of a `board.yaml`."""
+    return {
+        "kind": "charuco",
+        "squares_x": board.squares[0],
+        "squares_y": board.squares[1],
+        "square_mm": to_mm(board.square),
+        "marker_mm": to_mm(board.marker),
+        "dictionary": board.dictionary,
+        "border_mm": to_mm(board.border),
+    }
+
+
+def box_mapping(walls: list[Marked], n_outside: float) -> dict[str, Any]:
+    """Return the content of a `box.yaml`; the panels are in `box`."""
+    planes = {}
+    for wall in walls:
+        # Positive along its axis, as one would write it down.
+        normal = np.abs(wall.panel.dome_from_panel.rotation[:, 2])
+        offset = float(normal @ wall.panel.dome_from_panel.translation)
+        planes[wall.name] = {"normal": normal.tolist(), "d": to_mm(offset)}
+    markers = [part for wall in walls for part in _marker_mappings(wall, {"plane": wall.name})]
+    return {
+        "frame": _BOX_FRAME,
+        "planes": planes,
+        "family": FAMILY,
+        "corner_order": _CORNER_ORDER,
+        "markers": markers,
+        "medium": {"n_outside_nominal": float(n_outside)},
+    }
+
+
+def target_mapping(plate: Marked) -> dict[str, Any]:
+    """Return the content of a `target.yaml`; the panel is in `dome`."""
+    return {
+        "frame": _DOME_FRAME,
+        "family": FAMILY,
+        "corner_order": _CORNER_ORDER,
+        "markers": _marker_mappings(plate, {}),
+    }
+
+
+def _marker_mappings(marked: Marked, more: dict[str, str]) -> list[dict[str, Any]]:
+    size = to_mm(marked.prints.side * marked.panel.texture.cell)
+    return [
+        {
+            "id": int(number),
+            **more,
+            "size_mm": size,
+            "corners": [[to_mm(value) for value in corner] for corner in corners],
+        }
+        for number, corners in zip(marked.prints.ids, marked.corners(), strict=True)
+    ]
+
+
+def write_yaml(path: Path, content: dict[str, Any]) -> None:
+    """Write a mapping, lists of numbers on one line each."""
+    text = yaml.dump(content, Dumper=TidyDumper, sort_keys=False, width=1000)
+    path.write_text(text, encoding="utf-8")
+
+
+def to_mm(metres: float) -> float:
+    """Return millimetres without the noise of the conversion (a picometre)."""
+    return round(1e3 * float(metres), 9) + 0.0

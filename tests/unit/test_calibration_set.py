@@ -1,0 +1,152 @@
+"""Simulated calibration pictures: the files are those that calibrations read, and they are true."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.app.nominal import load_nominal
+from aqualvs.calibration.detection import detect_board, detect_markers
+from aqualvs.calibration.pose_files import load_poses
+from aqualvs.calibration.target_files import load_board, load_box, load_target
+from aqualvs.calibration.view import View
+from aqualvs.errors import OptionError, OutputError
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
+from aqualvs.optics.rigfile import load_rig, rig_to_mapping
+from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
+from panel_cases import small_rig
+
+SIZE = SetSize(camera=2, dome=3, box=2, index=1, dive=1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    ticks = []
+    out = tmp_path_factory.mktemp("set")
+    files = simulate_calibration(
+        small_rig(), out, size=SIZE, seed=5, progress=lambda *tick: ticks.append(tick)
+    )
+    return files, ticks
+
+
+def picture(path):
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+
+
+def true_poses(files, part):
+    poses = load_poses(files.rig.parent / f"{part}_poses.csv")
+    return {pose.name: pose.dome_from_board for pose in poses}
+
+
+def check_close(pixels, expected, valid):
+    """Noise leaves about 0.02 px, a wrong convention 0.5 px; stripes disturb a few corners."""
+    off = np.linalg.norm(pixels - expected, axis=-1)
+    assert valid.all()
+    assert np.median(off) < 0.05
+    assert np.abs(np.median(pixels - expected, axis=0)).max() < 0.02
+
+
+def test_everything_is_there(made):
+    files, ticks = made
+    assert sorted(path.name for path in files.nominal.parent.iterdir()) == [
+        *("box", "camera_air", "dive", "dome_air", "index", "nominal.yaml", "truth")
+    ]
+    assert [len(list(folder.glob("*.png"))) for folder in (files.camera, files.dome)] == [2, 3]
+    assert [len(list(folder.glob("*.png"))) for folder in (files.box, files.index)] == [2, 1]
+    assert files.dive.stat().st_size > 0
+    assert files.dive_truth.read_text().count("\n") == 2
+    assert files.n_pictures == SIZE.total
+    assert ticks == [(i + 1, SIZE.total) for i in range(SIZE.total)]
+
+
+def test_the_truth_and_what_is_known_beforehand_are_those_of_the_rig(made):
+    files, _ = made
+    rig = small_rig()
+    assert rig_to_mapping(load_rig(files.rig)) == rig_to_mapping(rig)
+    nominal = load_nominal(files.nominal)
+    assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("example", (360, 288), 3)
+    assert nominal.dome == rig.dome
+
+
+def test_boards_before_the_bare_camera_are_at_their_true_poses(made):
+    files, _ = made
+    board, camera = load_board(files.board), small_rig().bare_camera()
+    for name, pose in true_poses(files, "camera_air").items():
+        view = detect_board(picture(files.camera / name), board, name)
+        assert isinstance(view, View), view
+        check_close(view.pixels, *camera.project(pose.apply(view.points)))
+
+
+def test_boards_before_the_dome_are_at_their_true_poses_and_distances(made):
+    files, _ = made
+    board, rig = load_board(files.rail_board), small_rig()
+    camera = rig.in_water(rig.n_air).camera()
+    poses, tilts = true_poses(files, "dome_air"), []
+    for measured in load_poses(files.poses):
+        pose = poses[measured.name]
+        normal = pose.rotation[:, 2]
+        assert measured.dome_from_board is None
+        # Nine digits of millimetres are written.
+        assert measured.distance == pytest.approx(normal @ pose.translation / normal[1], abs=1e-12)
+        tilts.append(np.rad2deg(np.arccos(min(normal @ DOME_FROM_CAM_NOMINAL[:, 2], 1.0))))
+        view = detect_board(picture(files.dome / measured.name), board, measured.name)
+        assert isinstance(view, View), view
+        check_close(view.pixels, *camera.project(pose.apply(view.points)))
+    assert tilts[0] == tilts[2] == pytest.approx(0.0, abs=1e-6)
+    assert 0.05 < tilts[1] < 1.5
+
+
+def test_the_markers_of_the_box_are_where_its_file_has_them(made):
+    files, _ = made
+    box, n_outside = load_box(files.box_file)
+    rig = small_rig()
+    camera = rig.in_water(rig.n_air).camera()
+    assert n_outside == rig.n_air
+    assert set(box.planes) == {"forward", "left", "right", "down"}
+    seen_on = set()
+    for name, box_from_dome in true_poses(files, "box").items():
+        view = detect_markers(picture(files.box / name), box, name)
+        assert isinstance(view, View), view
+        seen_on |= {box.plane_names[i // 4] for i in view.ids}
+        check_close(view.pixels, *camera.project(box_from_dome.inverse().apply(view.points)))
+    assert len(seen_on) >= 3
+
+
+def test_the_plate_is_seen_through_the_rigs_water(made):
+    files, _ = made
+    plate, camera = load_target(files.target), small_rig().camera()
+    view = detect_markers(picture(files.index / "frame_000.png"), plate, "frame")
+    assert isinstance(view, View), view
+    assert len(view.ids) >= 20
+    check_close(view.pixels, *camera.project(view.points))
+
+
+def test_the_same_seed_gives_the_same_pictures(made, tmp_path):
+    files, _ = made
+    again = simulate_calibration(small_rig(), tmp_path, size=replace(SIZE, dive=0), seed=5)
+    other = simulate_calibration(
+        small_rig(), tmp_path / "other", size=SetSize(camera=1, dome=1, box=1, index=1, dive=0)
+    )
+    first = (files.box / "view_00.png").read_bytes()
+    assert (again.box / "view_00.png").read_bytes() == first
+    assert (other.box / "view_00.png").read_bytes() != first
+    assert again.dive is None
+
+
+@pytest.mark.parametrize("change", [{"dome": None}, {"lasers": ()}])
+def test_a_rig_that_cannot_be_calibrated_wholly_is_refused(change, tmp_path):
+    with pytest.raises(OptionError, match=next(iter(change))):
+        simulate_calibration(replace(small_rig(), **change), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_pictures_are_refused(tmp_path):
+    with pytest.raises(OptionError, match="one picture"):
+        simulate_calibration(small_rig(), tmp_path, size=SetSize(box=0))
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(OutputError, match="file"):
+        simulate_calibration(small_rig(), tmp_path / "file", size=SIZE)
