@@ -1,0 +1,323 @@
+"""The index of the medium, frame by frame, from a target that is fixed on the vehicle.
+
+Section 2.2 of the paper solves for the index alone. Here a target that is not quite where it is
+said to be, and a camera that is known only so well, count as what they are: see `index_filter`.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aqualvs.calibration.index_filter import (
+    MIN_POINTS,
+    WIDE,
+    Frame,
+    IndexModel,
+    Innovation,
+    Update,
+)
+from aqualvs.calibration.index_prior import IndexPrior
+from aqualvs.calibration.index_reading import (
+    IndexOptions,
+    IndexReading,
+    IndexStep,
+    Knowledge,
+    contradicts,
+)
+from aqualvs.calibration.index_state import IndexState
+from aqualvs.calibration.index_steps import StepTest
+from aqualvs.calibration.view import View
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.uncertainty import RigUncertainty
+
+# Noise of a corner before residuals tell, the least a first frame can tell of it, and the least.
+_NOMINAL_NOISE, _FIRST_NOISE, _LEAST_NOISE = 0.1, 0.03, 0.005
+_NOISE_MEMORY = 100
+_FIRST_ROUNDS = 4
+# A frame that surprises so much waits for the next ones instead of being believed.
+_WAIT = 4.0
+# Frames that can be taken back when a step is found.
+_KEPT = 50
+_MISFIT = 2.0
+# Last frames of a run that tell how far the index has jumped, and the most a frame can cost.
+_TELLING, _GROSS = 5, 16.0
+
+
+@dataclass(slots=True)
+class IndexEstimator:
+    """Recursive estimate of the index of the medium; time comes from the data.
+
+    One estimator serves one target, one rig and one dive. Started in air (`IndexPrior.air`), it
+    learns the target's place better than a ruler tells, and keeps that in the water.
+
+    Attributes
+    ----------
+    rig : Rig
+        Behind a dome.
+    uncertainty : RigUncertainty
+        How well it is known.
+    options : IndexOptions
+        What is assumed of target and medium.
+    prior : IndexPrior or None
+        What is known of the medium that the first frame sees; `set_prior` gives a later one.
+    steps : list of IndexStep
+        All alarms so far.
+
+    Raises
+    ------
+    CalibrationError
+        If the rig has no dome.
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty = field(default_factory=RigUncertainty.none)
+    options: IndexOptions = field(default_factory=IndexOptions)
+    prior: IndexPrior | None = None
+    steps: list[IndexStep] = field(default_factory=list)
+    _model: IndexModel = field(init=False, repr=False)
+    _state: IndexState | None = None
+    _noise: float = _NOMINAL_NOISE
+    _n_frames: int = 0
+    _n_lost: int = 0
+    _contradicted: bool = False
+    _moved: bool = False
+    _last_time: float = -math.inf
+    _since_prior: float = 0.0
+    _sigma_frame: float = math.inf
+    _test: StepTest = field(default_factory=StepTest, repr=False)
+    _recent: deque[tuple[IndexState, Innovation]] = field(
+        default_factory=lambda: deque(maxlen=_KEPT), repr=False
+    )
+
+    def __post_init__(self) -> None:
+        self._model = self._model_about(np.zeros(3))
+
+    def add(self, time: float, view: View) -> IndexReading:
+        """Take a frame and return what is known after it.
+
+        Parameters
+        ----------
+        time : float
+            In seconds; frames that are older than the last one are refused.
+        view : View
+            Points of the target in `dome` (metres) and where they were seen. Corners that are
+            missing, NaN or wrong do no harm while most are right.
+        """
+        known = () if self._state is None else self._state.ids
+        frame = Frame.of(time, view, known)
+        refused = self._refusal(frame)
+        if refused:
+            return self._reading(time, view.name, refused)
+        try:
+            if self._state is None:
+                return self._first(view.name, frame)
+            return self._next(view.name, self._state, frame)
+        except RigError as error:
+            return self._reading(time, view.name, f"no camera sees the target so ({error})")
+
+    def set_prior(self, prior: IndexPrior | None) -> None:
+        """Give what is known of the medium as the last frame saw it, say from a thermometer."""
+        self.prior, self._contradicted, self._since_prior = prior, False, 0.0
+        if self._state is not None:
+            self._state = self._state.anchored()
+
+    @property
+    def state(self) -> IndexState | None:
+        """Joint estimate with the prior, None before the first frame that counts."""
+        state = self._state
+        if state is None or self.prior is None or self._contradicted:
+            return state
+        return state.given_anchor(self.prior.n, self.prior.sigma)
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Numbers of the camera in `state`, after the target's place."""
+        return self._model.camera_names
+
+    def residuals(self, view: View) -> FloatArray:
+        """Return measured less predicted pixels (M, 2) of a view by what is known now.
+
+        Raises
+        ------
+        CalibrationError
+            Before the first frame that counts.
+        """
+        if self.state is None:
+            raise CalibrationError("no picture shows enough of the target yet; add one that does")
+        frame = Frame.of(self.state.time, view, self.state.ids)
+        left: FloatArray = self._model.line(self.state, frame).residuals.reshape(-1, 2)
+        return left
+
+    def _model_about(self, middle: FloatArray) -> IndexModel:
+        options = self.options
+        return IndexModel(
+            self.rig, self.uncertainty, options.pose_sigmas, options.sigma_corner_px, middle
+        )
+
+    def _refusal(self, frame: Frame) -> str:
+        if not math.isfinite(frame.time):
+            return "it has no time"
+        if self._state is not None and frame.time < self._last_time:
+            return (
+                f"its time {frame.time:.3f} s lies before that of an earlier frame, "
+                f"{self._last_time:.3f} s"
+            )
+        if len(frame.ids) < MIN_POINTS:
+            return f"{len(frame.ids)} corners of the target are seen; {MIN_POINTS} are needed"
+        return ""
+
+    def _first(self, name: str, frame: Frame) -> IndexReading:
+        self._model = self._model_about(frame.points.mean(axis=0))
+        start = self.rig.n_water if self.prior is None else self.prior.n
+        state, noise = self._model.first(frame, start), _NOMINAL_NOISE
+        for _ in range(_FIRST_ROUNDS):
+            seen = self._model.innovation(state, frame, noise)
+            if not seen.fits:
+                return self._reading(frame.time, name, _not_there(seen))
+            update = self._model.update(state, seen.frame, noise)
+            noise = max(update.noise, _FIRST_NOISE)
+        self._last_time, self._noise = frame.time, noise
+        return self._believe(name, seen, update, state.n)
+
+    def _next(self, name: str, last: IndexState, frame: Frame) -> IndexReading:
+        state = self._until(last, frame)
+        self._since_prior += self.options.drift**2 * (frame.time - self._last_time)
+        self._last_time = frame.time
+        noise = self._noise * self._test.inflation
+        seen = self._model.innovation(state, frame, noise)
+        if not seen.fits:
+            self._n_lost += 1
+            return self._reading(frame.time, name, _not_there(seen))
+        self._n_lost = 0
+        self._recent.append((last, seen))
+        surprise = seen.shift / seen.sigma
+        began = self._test.add(surprise)
+        if began:
+            return self._jump(name, min(began, len(self._recent)))
+        if abs(surprise) > _WAIT:
+            n = state.n + seen.shift
+            waits = f"alone it gives an index of {n:.4f}; the next frames will tell"
+            return self._reading(frame.time, name, waits, n_frame=n)
+        update = self._model.update(state, seen.frame, noise)
+        return self._believe(name, seen, update, state.n)
+
+    def _believe(self, name: str, seen: Innovation, update: Update, n: float) -> IndexReading:
+        self._state = update.state
+        self._n_frames += 1
+        share = max(1.0 / self._n_frames, 1.0 / _NOISE_MEMORY)
+        square = self._noise**2 + share * (update.noise**2 - self._noise**2)
+        self._noise = max(math.sqrt(square), _FIRST_NOISE if self._n_frames < 2 else _LEAST_NOISE)
+        self._sigma_frame = seen.sigma_frame
+        return self._reading(seen.frame.time, name, n_frame=n + seen.shift, update=update)
+
+    def _jump(self, name: str, began: int) -> IndexReading:
+        """Take the last frames back and believe them again, the index free to have jumped."""
+        since = list(self._recent)[-began:]
+        since = since[_onset(np.array([s.shift / s.sigma for _, s in since])) :]
+        self._recent.clear()
+        try:
+            state, update = self._believe_again(since)
+        except RigError:
+            state, update = self._believe_again(since[-1:])
+        self._state, self._since_prior = state, WIDE**2
+        size, sigma = state.step
+        step = None
+        if abs(size) > max(self.options.smallest_step, 3.0 * sigma):
+            misfit = float(np.median([seen.misfit for _, seen in since]))
+            step = IndexStep(since[0][1].frame.time, size, sigma, misfit < _MISFIT)
+            self.steps.append(step)
+            self._moved = self._moved or not step.by_medium
+        return self._reading(self._last_time, name, n_frame=state.n, update=update, step=step)
+
+    def _believe_again(
+        self, since: Sequence[tuple[IndexState, Innovation]]
+    ) -> tuple[IndexState, Update]:
+        before, seen = since[0]
+        noise = self._noise * self._test.inflation
+        state = self._model.jumped(self._until(before, seen.frame), seen.frame)
+        update = self._model.update(state, seen.frame, noise)
+        for _, later in since[1:]:
+            state = self._until(update.state, later.frame)
+            seen = self._model.innovation(state, later.frame, noise)
+            if seen.fits and abs(seen.shift) < _WAIT * seen.sigma:
+                update = self._model.update(state, seen.frame, noise)
+        return update.state.later(self._last_time, self.options.drift), update
+
+    def _until(self, state: IndexState, frame: Frame) -> IndexState:
+        later = state.later(frame.time, self.options.drift)
+        return later.with_corners(frame.ids, self.options.sigma_corner_px)
+
+    def _reading(
+        self,
+        time: float,
+        name: str,
+        refused: str = "",
+        *,
+        n_frame: float = math.nan,
+        update: Update | None = None,
+        step: IndexStep | None = None,
+    ) -> IndexReading:
+        own, prior = self._state, self.prior
+        if own is not None and prior is not None:
+            self._contradicted = contradicts(own, prior, self._contradicted)
+        sigma_frame = self._sigma_frame * self._test.inflation
+        joint, known = self.state, self._knowledge(sigma_frame)
+        unknown = (math.nan, math.inf) if prior is None else (prior.n, prior.sigma)
+        n, sigma = unknown if joint is None else (joint.n, joint.sigma)
+        return IndexReading(
+            name=name,
+            time=time,
+            refused=refused,
+            n=n,
+            sigma=sigma,
+            sigma_random=math.inf if own is None else math.sqrt(own.random_variance),
+            n_pictures=math.nan if own is None else own.n,
+            sigma_pictures=math.inf if own is None else own.sigma,
+            n_frame=n_frame,
+            sigma_frame=math.inf if update is None else sigma_frame,
+            n_points=0 if update is None else update.used,
+            rms_px=math.nan if update is None else update.rms,
+            observable=known.observable,
+            prior_used=prior is not None and not self._contradicted,
+            step=step,
+            remarks=known.remarks(),
+        )
+
+    def _knowledge(self, sigma_frame: float) -> Knowledge:
+        return Knowledge(
+            own=self._state,
+            joint=self.state,
+            prior=self.prior,
+            contradicted=self._contradicted,
+            since_prior=self._since_prior,
+            sigma_frame=sigma_frame,
+            decentring=float(np.linalg.norm(self.rig.dome_from_cam.translation)),
+            n_lost=self._n_lost,
+            moved=self._moved,
+            n_camera=len(self._model.camera_names),
+            options=self.options,
+        )
+
+
+def _onset(surprises: FloatArray) -> int:
+    """Return the first of a run's frames (K,) that lies beyond the jump which ends the run.
+
+    Least squares of a change of mean from zero; what no mean explains counts no more than gross.
+    """
+    after = float(np.median(surprises[-_TELLING:]))
+    without = np.minimum(surprises**2, _GROSS)
+    with_jump = np.minimum((surprises - after) ** 2, _GROSS)
+    costs = np.concatenate([[0.0], np.cumsum(without - with_jump)[:-1]])
+    return int(np.argmin(costs))
+
+
+def _not_there(seen: Innovation) -> str:
+    return (
+        f"only {len(seen.frame.ids)} of {seen.n_points} corners are where the target should be; "
+        "it is hidden, has moved, or is not the one that target.yaml describes"
+    )
