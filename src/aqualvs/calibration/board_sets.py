@@ -10,6 +10,7 @@ import numpy as np
 from aqualvs.calibration.view import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.rig import Rig
 
 _MIN_VIEWS = 3
 _MIN_POINTS = 60
@@ -119,14 +120,19 @@ class DomeOptions:
             )
 
 
-def check_sets(sets: Sequence[BoardSet]) -> None:
-    """Refuse sets that hold too little.
+def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
+    """Refuse a rig without a dome, and sets that hold too little.
 
     Raises
     ------
     CalibrationError
         With what there is and what it takes.
     """
+    if rig.dome is None:
+        raise CalibrationError(
+            f"rig {rig.name} has no dome; write its inner_radius_mm, thickness_mm and n_acrylic "
+            "into the rig file"
+        )
     views = [view for one in sets for view in one.views]
     exact = any(
         kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))

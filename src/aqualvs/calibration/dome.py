@@ -75,14 +75,9 @@ def dome(
         If the views do not determine the lens, or contradict the board's file, the given poses,
         the medium or the dome.
     """
-    if rig.dome is None:
-        raise CalibrationError(
-            f"rig {rig.name} has no dome; write its inner_radius_mm, thickness_mm and n_acrylic "
-            "into the rig file"
-        )
+    check_sets(rig, sets)
     options = options or DomeOptions()
     known = rig_uncertainty(rig) if known is None else known
-    check_sets(sets)
     problem, solution = _solved(rig, sets, known, options)
     problem, solution = _without_bad_views(problem, solution)
     problem, solution = _without_wrong_distances(problem, solution, sets)

@@ -226,7 +226,8 @@ class IndexEstimator:
             state, update = self._believe_again(since[-1:])
         self._state, self._since_prior = state, WIDE**2
         size, sigma = state.step
-        step = None
+        slope = self._model.slope_uncertainty(state, since[-1][1].frame)
+        sigma, step = math.hypot(sigma, slope * size), None
         if abs(size) > max(self.options.smallest_step, 3.0 * sigma):
             misfit = float(np.median([seen.misfit for _, seen in since]))
             step = IndexStep(since[0][1].frame.time, size, sigma, misfit < _MISFIT)

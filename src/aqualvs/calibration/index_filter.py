@@ -71,7 +71,8 @@ class Innovation:
     sigma_frame : float
         Part of `sigma` that is the frame's own noise.
     misfit : float
-        Typical squared residual that no change of index explains, over its expectation.
+        Squared residuals that no change of index explains, in terms of their covariance and over
+        their number: about 1.
     """
 
     frame: Frame
@@ -191,6 +192,34 @@ class IndexModel:
         off += known[..., N] * (state.n - n) + known[..., FIRST_CAMERA:] @ rest
         residuals = frame.pixels - pixels - off
         return Line(residuals.reshape(-1), slopes.reshape(-1, len(state.mean)))
+
+    def slope_uncertainty(self, state: IndexState, frame: Frame) -> float:
+        """Return the relative standard deviation of a change of index for what a state leaves open.
+
+        The constants decide how far the picture moves with the index: a product of unknowns that a
+        joint Gaussian does not hold.
+        """
+        mean, size = state.mean, FIRST_CAMERA + len(self.camera_names)
+        reference = self._slope_at(mean[:size], state.n, frame)
+        by_constant = np.zeros(size)
+        for i in range(POSE.start, size):
+            sigma = np.sqrt(state.covariance[i, i])
+            if sigma > 0.0:
+                moved = mean[:size].copy()
+                moved[i] += sigma
+                change = self._slope_at(moved, state.n, frame) - reference
+                by_constant[i] = float(np.sum(change * reference)) / sigma
+        variance = by_constant @ state.covariance[:size, :size] @ by_constant
+        return float(np.sqrt(max(variance, 0.0)) / max(np.sum(reference**2), _BLIND**2))
+
+    def _slope_at(self, mean: FloatArray, n: float, frame: Frame) -> FloatArray:
+        """Return the derivative (M, 2) of pixels by the index, all constants as in `mean`."""
+        rig = rig_moved_by(self.rig, self.camera_names, mean[FIRST_CAMERA:])
+        camera = rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
+        target = moved_target(SE3.identity(), self.middle, mean[POSE])
+        slopes = camera.project_with_parameter_jacobian(target.apply(frame.points))[3]
+        by_n: FloatArray = slopes[..., parameter_names(camera).index("n_water")]
+        return by_n
 
     def _slopes(self, n: float, frame: Frame) -> FloatArray:
         """Return derivatives (M, 2, 9 + C) of pixels by all but the corners' errors."""
@@ -373,8 +402,8 @@ def _best_shift(state: IndexState, line: Line, noise: float) -> tuple[float, flo
     if not len(line.residuals):
         return 0.0, np.inf, np.inf
     spread = _spread(state, line, noise)
-    explained, variance, weights = _by_index(spread, line)
+    _, variance, weights = _by_index(spread, line)
     shift = float(weights @ line.residuals)
     left = line.residuals - line.slopes[:, N] * shift
-    misfit = float(np.median(left**2 / (np.diag(spread) - explained)) / _HALF)
+    misfit = float(left @ cho_solve(cho_factor(spread), left)) / max(len(left) - 1, 1)
     return shift, variance, misfit

@@ -1,0 +1,209 @@
+"""What cannot be calibrated from, and what to tell the user about it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from aqualvs.calibration.bundle import CORNER_SIGMA_PX
+from aqualvs.calibration.laser_names import match_to_rig
+from aqualvs.calibration.laser_report import Solved
+from aqualvs.calibration.laser_split import LaserSplit
+from aqualvs.calibration.laser_views import LaserView, PlacedView
+from aqualvs.calibration.stripes_on_planes import Surfaces
+from aqualvs.errors import CalibrationError
+from aqualvs.optics.rig import Rig
+
+# Targets beyond these sizes, in metres, have their lengths in another unit than they say.
+_SMALLEST, _LARGEST = 0.02, 10.0
+# Stripes at so many times the working range are no stripes that the rig is made for.
+_NEARER, _FARTHER = 0.2, 5.0
+# Corners that fit so many times worse with stripes than without contradict them; and stripes that
+# fit a plane so many times worse than each a line contradict each other.
+_CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
+_FEWEST_BINS = 5
+# No detection is as bad as this, in pixels.
+_IMPOSSIBLE_PX = 2.0
+# A further plane of light with this share of the weakest laser's points is a laser as well.
+_AS_STRONG = 0.5
+
+
+def check_size(views: Sequence[LaserView]) -> None:
+    """Refuse targets of a size that tells of a wrong unit.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    points = [v.view.points for v in views if len(v.view)]
+    if not points:
+        return
+    everything = np.concatenate(points)
+    size = float(np.max(everything.max(axis=0) - everything.min(axis=0)))
+    if not _SMALLEST <= size <= _LARGEST:
+        raise CalibrationError(
+            f"the target's points span {size * 1e3:.4g} mm; lengths in its file are millimetres: "
+            "check them against the print"
+        )
+
+
+def check_poses(views: Sequence[PlacedView]) -> None:
+    """Refuse pictures of which the corners contradict the rig, the medium or the target's file.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    misses = float(np.median([view.rms_px for view in views]))
+    if misses > _IMPOSSIBLE_PX:
+        raise CalibrationError(
+            f"corners miss by {misses:.1f} px (rms, median of {len(views)} pictures); the rig, the "
+            "medium (air or water?) or the target's file is wrong"
+        )
+
+
+def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
+    """Refuse stripes at distances that tell of a wrong unit, or of no stripes on the target.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    if not any(len(view.placed) for view in views):
+        raise CalibrationError(
+            f"{views[0].view.name}: no stripe lies on the target's surfaces; switch the lasers on, "
+            "and let them shine on it"
+        )
+    points = np.concatenate([view.placed.points_in_dome for view in views])
+    distance = float(np.median(np.linalg.norm(points, axis=1)))
+    near, far = rig.working_range
+    if not _NEARER * near <= distance <= _FARTHER * far:
+        raise CalibrationError(
+            f"stripes lie {distance * 1e3:.4g} mm away, but the rig works from {near * 1e3:.4g} "
+            f"to {far * 1e3:.4g} mm; check the units of the target's file and of the rig"
+        )
+
+
+def check_count(
+    split: LaserSplit,
+    expected: int | None,
+    rig: Rig,
+    views: Sequence[PlacedView],
+    surfaces: Surfaces,
+) -> list[str]:
+    """Refuse fewer or more lasers than expected; return warnings about the rest.
+
+    Raises
+    ------
+    CalibrationError
+        If there are fewer, more, or none.
+    """
+    found = len(split.planes)
+    if found < (expected or 1):
+        raise CalibrationError(_too_few(split, expected, rig, views, surfaces))
+    counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
+    if expected is not None and split.n_further >= _AS_STRONG * counts.min():
+        raise CalibrationError(
+            f"more than {expected} lasers are seen: a further plane of light has "
+            f"{split.n_further} points, the weakest of the {expected} has {counts.min()}; correct "
+            "the number of lasers, or cover what reflects them"
+        )
+    return [
+        f"a stripe of {len(line.members)} points ({_where(line.patch, views, surfaces)}) belongs "
+        "to no laser; a reflection, perhaps"
+        for line in split.unmatched
+        # The lasers' counts are of all pictures, a line is of one.
+        if len(line.members) >= _AS_STRONG * counts.min() / len(views)
+    ]
+
+
+def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
+    """Return what a pose by corners alone leaves of them in each direction, in pixels."""
+    return float(np.median([view.rms_px for view in views]) / np.sqrt(2.0))
+
+
+def contradicts(solved: Solved) -> bool:
+    """Return whether corners and stripes of a board cannot both be right.
+
+    Then stripes pull corners from where these alone would put the board, or stripes, though each
+    is straight, do not fit together.
+    """
+    corners = _corners_px(solved) / _alone_px(solved)
+    return corners > _CORNERS_CONTRADICT or _stripes_misfit(solved) > _STRIPES_CONTRADICT
+
+
+def _stripes_misfit(solved: Solved) -> float:
+    """Return how many times stripes miss their plane more than they miss straight lines."""
+    from_plane = from_line = 0.0
+    for i, group in enumerate(solved.problem.groups):
+        residuals, _ = solved.stripe_residuals_px(i)
+        seen = np.isfinite(residuals)
+        if np.count_nonzero(seen) < _FEWEST_BINS:
+            continue
+        weights = 1.0 / group.sigma_px[seen]
+        along = group.pixels[seen] - group.pixels[seen].mean(axis=0)
+        way = along @ np.linalg.svd(along, full_matrices=False)[2][0]
+        basis = np.stack([np.ones(len(way)), way], axis=-1) * weights[:, None]
+        values = residuals[seen] * weights
+        left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+        from_plane += float(values @ values)
+        from_line += float(left @ left)
+    return float(np.sqrt(from_plane / max(from_line, 1e-12)))
+
+
+def loose_words(solved: Solved) -> str:
+    """Return the warning that a board is taken to lie unevenly on its surface."""
+    slack = solved.state.slack
+    tilt = np.rad2deg(np.sqrt(np.mean(np.sum(slack[:, :2] ** 2, axis=1))))
+    offset = np.sqrt(np.mean(slack[:, 2] ** 2)) * 1e3
+    return (
+        "the board is taken to lie unevenly on the surface that the stripes are on, or to bend, "
+        f"because stripes and corners contradict each other; by {tilt:.1f} deg and {offset:.1f} mm "
+        "(rms). Fix a flat board to a flat wall for better lasers"
+    )
+
+
+def _corners_px(solved: Solved) -> float:
+    n_groups = len(solved.problem.groups)
+    blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
+    squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
+    return float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
+
+
+def _alone_px(solved: Solved) -> float:
+    return float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
+
+
+def _too_few(
+    split: LaserSplit,
+    expected: int | None,
+    rig: Rig,
+    views: Sequence[PlacedView],
+    surfaces: Surfaces,
+) -> str:
+    which = ""
+    if split.planes and len(rig.lasers) == expected:
+        matched = match_to_rig(rig, split.planes)
+        missing = [laser.name for laser, i in zip(rig.lasers, matched, strict=True) if i is None]
+        which = f" (not: {', '.join(missing)})"
+    seen = f"{len(split.planes)} of {expected}" if expected is not None else "none"
+    lonely = ""
+    if split.unmatched:
+        where = sorted({_where(line.patch, views, surfaces) for line in split.unmatched[:4]})
+        lonely = f"; stripes seen on one plane only: {'; '.join(where)}"
+    if len(surfaces.planes) > 1:
+        wanted = "on two planes of the box"
+        remedy = "add pictures in which every stripe crosses from one plane to another"
+    else:
+        wanted = "on two places of the board that differ"
+        remedy = "add pictures from other distances or angles"
+    return (
+        f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; {remedy}"
+    )
+
+
+def _where(patch: int, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+    i_view, i_surface = divmod(patch, len(surfaces.planes))
+    return f"{views[i_view].view.name}, plane '{surfaces.names[i_surface]}'"

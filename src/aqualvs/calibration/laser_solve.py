@@ -1,0 +1,188 @@
+"""Solving lasers from placed stripes: poses and planes together, in as many rounds as it takes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.bundle import Bundle, BundleState, TargetView
+from aqualvs.calibration.camera_doubt import CameraDoubt
+from aqualvs.calibration.laser_checks import contradicts, typical_corner_error_px
+from aqualvs.calibration.laser_names import like
+from aqualvs.calibration.laser_problem import N_SLACK, LaserProblem, LaserState, Slack
+from aqualvs.calibration.laser_report import Solved
+from aqualvs.calibration.laser_split import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
+from aqualvs.calibration.laser_views import PlacedView, pooled, replaced, split_by_view
+from aqualvs.calibration.least_squares import solve
+from aqualvs.calibration.sheet_choice import choose_sheets, start_sheets
+from aqualvs.calibration.stripe_groups import binned, points_on, with_gain, with_shared_error
+from aqualvs.calibration.stripes_on_planes import Surfaces
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.sheet import Sheet
+from aqualvs.optics.uncertainty import RigUncertainty
+
+# A board fixed by hand, of paper or foam: how it lies on a wall.
+_LOOSE = Slack(float(np.deg2rad(1.0)), 2e-3)
+# A laser with fewer points in a view says nothing there.
+_FEWEST_POINTS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What solves begin with.
+
+    Attributes
+    ----------
+    rig : Rig
+        In the medium of the pictures.
+    surfaces : Surfaces
+        Of the target.
+    views : tuple of PlacedView
+    doubt : CameraDoubt or None
+        What is refined along; None where the camera is held.
+    slack : Slack or None
+        How well a board lies on its surface; None where it is the surface.
+    shared_error_px : float
+        What shifts or turns a whole stripe in its picture.
+    """
+
+    rig: Rig
+    surfaces: Surfaces
+    views: tuple[PlacedView, ...]
+    doubt: CameraDoubt | None
+    slack: Slack | None = None
+    shared_error_px: float = 0.0
+
+    def planes(self, view: PlacedView) -> list[Plane]:
+        """Return the surfaces in `dome`."""
+        n = len(self.surfaces.planes)
+        return [self.surfaces.placed(i, view.dome_from_target) for i in range(n)]
+
+    def bundle(self) -> Bundle:
+        """Return the problem of the corners alone."""
+        doubt = self.doubt
+        return Bundle(
+            views=tuple(TargetView(v.view, 0, v.dome_from_target) for v in self.views),
+            free=() if doubt is None else doubt.names,
+            start=self.state(),
+            priors=RigUncertainty.none() if doubt is None else doubt.given,
+            media_sigma=np.array([0.0 if doubt is None else doubt.sigma_medium]),
+        )
+
+    def state(self) -> BundleState:
+        """Return camera, medium and poses to start from."""
+        poses = tuple(v.dome_from_target for v in self.views)
+        return BundleState(self.rig, np.array([self.rig.n_water]), poses)
+
+
+def tolerance_px(lasers: Sequence[Laser]) -> float:
+    """Return how far a stripe may be from its plane to be sorted to it, in pixels."""
+    bent = any(laser.window is not None for laser in lasers)
+    return BENT_TOLERANCE_PX if bent else TOLERANCE_PX
+
+
+def solve_lasers(
+    start: Start, lasers: Sequence[Laser], laser_of: IntArray, loose: bool | None
+) -> tuple[Solved, list[str]]:
+    """Solve lasers: first as planes, then with points sorted anew by those, then their sheets.
+
+    Parameters
+    ----------
+    start : Start
+    lasers : sequence of Laser
+        `plane` fits the light in the medium of the pictures roughly.
+    laser_of : int array, shape (N,)
+        Which laser each stripe point of all views is of; -1 for none.
+    loose : bool or None
+        As `LaserOptions.loose`.
+
+    Returns
+    -------
+    solved : Solved
+    words : list of str
+        For every laser, which sheet was taken and why.
+    """
+    first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of)
+    if len(start.surfaces.planes) == 1 and (contradicts(first) if loose is None else loose):
+        error = typical_corner_error_px(start.views)
+        again = replace(start, slack=_LOOSE, shared_error_px=error)
+    else:
+        again, laser_of = _sorted_again(start, first, laser_of, tolerance_px(lasers))
+    flat = _solve_from(again, first.state.sheets, laser_of)
+    found = [
+        replace(laser, plane=sheet.plane)
+        for laser, sheet in zip(lasers, flat.state.sheets, strict=True)
+    ]
+    return choose_sheets(
+        flat, start.rig, found, lambda sheets: _solve_from(again, sheets, laser_of)
+    )
+
+
+def _sorted_again(
+    start: Start, solved: Solved, laser_of: IntArray, tolerance: float
+) -> tuple[Start, IntArray]:
+    """Return the start with solved poses, and which laser each point is of by solved planes.
+
+    Both as they were if a laser would lose its points by it.
+    """
+    state = solved.state
+    camera = state.bundle.camera(0)
+    views = tuple(
+        replaced(camera, view, pose, start.surfaces)
+        for view, pose in zip(start.views, state.bundle.poses, strict=True)
+    )
+    planes = [sheet.plane for sheet in state.sheets]
+    sorted_anew = assigned(pooled(views, start.surfaces), planes, tolerance)
+    counts = np.bincount(sorted_anew[sorted_anew >= 0], minlength=len(planes))
+    if counts.min() < _FEWEST_POINTS:
+        return start, laser_of
+    return replace(start, views=views), sorted_anew
+
+
+def _solve_from(start: Start, sheets: tuple[Sheet, ...], laser_of: IntArray) -> Solved:
+    camera, groups = start.rig.camera(), []
+    for i_view, mine in enumerate(split_by_view(laser_of, start.views)):
+        view = start.views[i_view]
+        planes = start.planes(view)
+        for i_laser, sheet in enumerate(sheets):
+            members = np.flatnonzero(mine == i_laser)
+            if len(members) >= _FEWEST_POINTS:
+                stripes = view.stripes.at(view.placed.index[members])
+                group = binned(i_view, i_laser, stripes, view.placed.surface[members])
+                group = with_shared_error(group, start.shared_error_px)
+                groups.append(with_gain(group, camera, planes, sheet))
+    problem = LaserProblem(start.bundle(), start.surfaces, tuple(groups), len(sheets), start.slack)
+    slack = np.zeros((len(start.views), N_SLACK))
+    solution = solve(problem, LaserState(start.state(), sheets, slack))
+    return Solved(problem, solution, start.views)
+
+
+def paper_planes(solved: Solved) -> list[Plane]:
+    """Return the planes of all lasers by the paper's way (Eq. 33-36)."""
+    camera = solved.problem.bundle.start.camera(0)
+    surfaces, planes = solved.problem.surfaces, []
+    spatial = [
+        [surfaces.placed(i, view.spatial.dome_from_target) for i in range(len(surfaces.planes))]
+        for view in solved.views
+    ]
+    for i, sheet in enumerate(solved.state.sheets):
+        groups = [solved.problem.groups[k] for k in solved.groups_of(laser=i)]
+        points = [
+            points_on(camera, group.pixels, group.surface, spatial[group.view])[0]
+            for group in groups
+        ]
+        planes.append(like(paper_plane(np.concatenate(points)), sheet.plane))
+    return planes
+
+
+def paper_plane(points_in_dome: FloatArray) -> Plane:
+    """Fit a plane to points (N, 3) by the paper's pseudo-inverse (Eq. 35-36).
+
+    It minimises neither distances in space nor in the picture, and fails for planes through the
+    dome's centre; kept for comparison.
+    """
+    finite = points_in_dome[np.all(np.isfinite(points_in_dome), axis=1)]
+    normal_over_offset = np.linalg.lstsq(finite, np.ones(len(finite)), rcond=None)[0]
+    return Plane.from_normal(normal_over_offset, 1.0)

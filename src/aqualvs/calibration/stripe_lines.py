@@ -1,0 +1,129 @@
+"""Straight lines among stripe points on one flat surface: where laser planes cut it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.calibration.stripes_on_planes import PlacedStripes
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+
+# Points this near to a line, in pixels across their stripe, belong to it.
+_TOLERANCE_PX = 2.0
+# Points this near are taken away with it: the halo of a stripe is no second one.
+_HALO_PX = 6.0
+# A point's stripe runs along the line to within this tangent, as seen in the image.
+_ALIGNED = 0.35
+_MIN_POINTS = 12
+_MIN_LENGTH_PX = 20.0
+_MAX_LINES = 40
+_N_GUESSES, _N_SAMPLED, _N_FITS = 1500, 1000, 3
+
+
+@dataclass(frozen=True, slots=True)
+class StripeLine:
+    """A straight stripe on a surface.
+
+    Attributes
+    ----------
+    patch : int
+        Which surface of which view.
+    members : int array, shape (M,)
+        Indices of its points among those of all patches.
+    """
+
+    patch: int
+    members: IntArray
+
+
+def lines_on_patch(
+    placed: PlacedStripes, normal: FloatArray, members: IntArray, patch: int
+) -> list[StripeLine]:
+    """Find the straight stripes among points of one surface.
+
+    Parameters
+    ----------
+    placed : PlacedStripes
+        Points of all patches.
+    normal : array, shape (3,)
+        Of the surface, in `dome`.
+    members : int array, shape (M,)
+        Which points lie on the surface.
+    patch : int
+        Its number.
+
+    Returns
+    -------
+    list of StripeLine
+        The longest first; no point belongs to two.
+    """
+    points, across = placed.points_in_dome[members], placed.by_across[members]
+    along = placed.by_along[members]
+    some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
+    guessed, offsets = _guesses(points, normal, patch)
+    votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
+    lines: list[StripeLine] = []
+    free = np.ones(len(members), np.bool_)
+    while len(lines) < _MAX_LINES and len(guessed):
+        counts = np.count_nonzero(votes[free[some]], axis=0)
+        best = int(np.argmax(counts))
+        m, c = guessed[best], float(offsets[best])
+        for _ in range(_N_FITS):
+            near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
+            if np.count_nonzero(near) < _MIN_POINTS:
+                return lines
+            m, c = _fitted(points[near], across[near], normal, m)
+        near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
+        if _length_px(points[near], along[near]) >= _MIN_LENGTH_PX:
+            lines.append(StripeLine(patch, members[near]))
+        free &= ~near & ~_near(points, across, along, m[None], c, _HALO_PX)[:, 0]
+    return lines
+
+
+def _guesses(points: FloatArray, normal: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Lines m·X = c through pairs of points, m in the surface."""
+    n = len(points)
+    if n < 2:
+        return np.zeros((0, 3)), np.zeros(0)
+    i, j = np.random.default_rng(seed).integers(0, n, (2, _N_GUESSES))
+    m = np.cross(normal, points[j] - points[i])
+    length = np.linalg.norm(m, axis=1)
+    apart = length > 1e-6
+    m = m[apart] / length[apart, None]
+    return m, np.einsum("ni,ni->n", m, points[i[apart]])
+
+
+def _near(
+    points: FloatArray,
+    across: FloatArray,
+    along: FloatArray,
+    m: FloatArray,
+    c: FloatArray | float,
+    tolerance_px: float,
+) -> BoolArray:
+    """Return which points (N) are near which lines (H) and run along them, shape (N, H)."""
+    gain = np.abs(across @ m.T)
+    near: BoolArray = np.abs(points @ m.T - c) <= tolerance_px * gain
+    near &= np.abs(along @ m.T) <= _ALIGNED * gain
+    return near
+
+
+def _fitted(
+    points: FloatArray, across: FloatArray, normal: FloatArray, m: FloatArray
+) -> tuple[FloatArray, float]:
+    """Fit a line by least squares, weighing points as the image measures them."""
+    weight = 1.0 / np.maximum(np.abs(across @ m), 1e-9) ** 2
+    middle = weight @ points / weight.sum()
+    t = np.cross(m, normal)
+    u, v = (points - middle) @ t, (points - middle) @ m
+    turned = m - t * float(weight @ (u * v)) / max(float(weight @ (u * u)), 1e-30)
+    turned /= np.linalg.norm(turned)
+    return turned, float(turned @ middle)
+
+
+def _length_px(points: FloatArray, along: FloatArray) -> float:
+    """Return how long a line is in the image, roughly."""
+    if not len(points):
+        return 0.0
+    spread = points.max(axis=0) - points.min(axis=0)
+    per_px = float(np.median(np.linalg.norm(along, axis=1)))
+    return float(np.linalg.norm(spread)) / per_px

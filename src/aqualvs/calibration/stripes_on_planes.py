@@ -1,0 +1,233 @@
+"""Which surface of a target a stripe's light lies on, and where."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.calibration.stripe_points import StripePoints
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.rays import Rays
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Camera
+
+# Points this near to where two surfaces meet may be light of the other one, or of both.
+_EDGE = 0.006
+# An open side of a box ends this share of the box's size beyond the outermost marker.
+_RIM_SHARE = 0.02
+_ON_PLANE = 1e-4
+_PIXEL_STEPS: FloatArray = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Surfaces:
+    """The flat surfaces of a target that stripes are seen on, in the target's frame.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What messages call them.
+    planes : tuple of Plane
+        Normals point away from the side that is seen.
+    lowest, highest : array, shape (3,)
+        Stripes outside these bounds, in metres, lie on something else.
+    """
+
+    names: tuple[str, ...]
+    planes: tuple[Plane, ...]
+    lowest: FloatArray
+    highest: FloatArray
+
+    def hits(self, rays_in_target: Rays) -> tuple[FloatArray, IntArray]:
+        """Find where rays meet the surfaces.
+
+        Returns
+        -------
+        points : array, shape (N, 3)
+            In the target's frame; NaN where a ray meets none.
+        surface : int array, shape (N,)
+            Index of the surface; -1 where there is none, or the hit lies near another surface.
+        """
+        n = len(rays_in_target.origins)
+        points, surface = np.full((n, 3), np.nan), np.full(n, -1)
+        for i, plane in enumerate(self.planes):
+            there, valid = plane.intersect(rays_in_target)
+            valid &= rays_in_target.directions @ plane.normal > 0.0
+            valid &= self._inside(there, i) & (surface < 0)
+            points[valid], surface[valid] = there[valid], i
+        return points, surface
+
+    def placed(self, i_surface: int, dome_from_target: SE3) -> Plane:
+        """Return the plane of a surface in `dome`."""
+        plane = self.planes[i_surface]
+        normal = dome_from_target.rotate(plane.normal)
+        return Plane(normal, plane.offset + float(normal @ dome_from_target.translation))
+
+    def _inside(self, points: FloatArray, i_own: int) -> BoolArray:
+        with np.errstate(invalid="ignore"):
+            inside: BoolArray = np.all((points >= self.lowest) & (points <= self.highest), axis=1)
+            for i, plane in enumerate(self.planes):
+                if i != i_own:
+                    inside &= plane.signed_distance(points) <= -_EDGE
+        return inside
+
+
+def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> Surfaces:
+    """Return the surfaces of an open box.
+
+    Parameters
+    ----------
+    planes : mapping of str to Plane
+        In `box`; normals may point either way. Surfaces end where they meet.
+    points : array, shape (N, 3)
+        All corners of all markers, in `box`. On its open sides the box is taken to end just beyond
+        the outermost of them, along the axes of `box`.
+
+    Raises
+    ------
+    CalibrationError
+        If there are fewer than two planes, or markers on both sides of one.
+    """
+    if len(planes) < 2:
+        raise CalibrationError(
+            f"the box has {len(planes)} plane; a laser's plane needs stripes on two or more"
+        )
+    outward = []
+    for name, plane in planes.items():
+        beyond = plane.signed_distance(points)
+        if beyond.max() > _ON_PLANE and beyond.min() < -_ON_PLANE:
+            raise CalibrationError(
+                f"plane '{name}' of the box has markers {beyond.max() * 1e3:.1f} mm on one side "
+                f"and {-beyond.min() * 1e3:.1f} mm on the other; correct its normal, its d, or "
+                "the markers' corners"
+            )
+        outward.append(plane if beyond.max() <= _ON_PLANE else Plane(-plane.normal, -plane.offset))
+    lowest, highest = points.min(axis=0), points.max(axis=0)
+    rim = _RIM_SHARE * float(np.max(highest - lowest))
+    return Surfaces(tuple(planes), tuple(outward), lowest - rim, highest + rim)
+
+
+def board_surface(*, thickness: float = 0.0) -> Surfaces:
+    """Return the surface that a board lies on, with its stripes beside or on the board.
+
+    Parameters
+    ----------
+    thickness : float
+        How far the board's printed face stands in front of the surface that the stripes lie on, in
+        metres; 0 where the print is on the surface itself.
+    """
+    far = np.full(3, np.inf)
+    # A board's z axis points into it (OpenCV).
+    return Surfaces(("board",), (Plane(np.array([0.0, 0.0, 1.0]), thickness),), -far, far)
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedStripes:
+    """Stripe points of one picture on the surfaces of its target, N of them.
+
+    Attributes
+    ----------
+    index : int array, shape (N,)
+        Which of the `StripePoints` they are: those that lie on a surface.
+    surface : int array, shape (N,)
+        Index into `Surfaces`.
+    points_in_dome : array, shape (N, 3)
+        In metres.
+    by_pixel : array, shape (N, 3, 2)
+        How a point moves on its surface with its pixel, metres per pixel.
+    across : array, shape (N, 2)
+        As `StripePoints.across`.
+    """
+
+    index: IntArray
+    surface: IntArray
+    points_in_dome: FloatArray
+    by_pixel: FloatArray
+    across: FloatArray
+
+    @property
+    def by_across(self) -> FloatArray:
+        """How points move on their surface with their pixel across the stripe, shape (N, 3)."""
+        moved: FloatArray = np.einsum("nij,nj->ni", self.by_pixel, self.across)
+        return moved
+
+    @property
+    def by_along(self) -> FloatArray:
+        """How points move on their surface with their pixel along the stripe, shape (N, 3)."""
+        along = np.stack([-self.across[:, 1], self.across[:, 0]], axis=-1)
+        moved: FloatArray = np.einsum("nij,nj->ni", self.by_pixel, along)
+        return moved
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.index)
+
+
+def place_stripes(
+    camera: Camera, stripes: StripePoints, dome_from_target: SE3, surfaces: Surfaces
+) -> PlacedStripes:
+    """Find the surface and place of every stripe point (paper, Eq. 34).
+
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    stripes : StripePoints
+        Of the picture.
+    dome_from_target : SE3
+        Pose of the target in it.
+    surfaces : Surfaces
+        Of the target.
+
+    Returns
+    -------
+    PlacedStripes
+        Only points that lie on a surface and not near its edge to another.
+    """
+    rays = camera.rays(stripes.pixels)
+    target_from_dome = dome_from_target.inverse()
+    in_target = Rays(
+        target_from_dome.apply(rays.origins),
+        target_from_dome.rotate(rays.directions),
+        rays.valid,
+    )
+    points, surface = surfaces.hits(in_target)
+    index = np.flatnonzero(surface >= 0)
+    points_in_dome = dome_from_target.apply(points[index])
+    normals = np.stack([dome_from_target.rotate(p.normal) for p in surfaces.planes])
+    _, _, by_point = camera.project_with_jacobian(points_in_dome)
+    by_pixel = solve_on_surface(by_point, normals[surface[index]], _PIXEL_STEPS)
+    seen = np.all(np.isfinite(by_pixel), axis=(1, 2))
+    index = index[seen]
+    return PlacedStripes(
+        index, surface[index], points_in_dome[seen], by_pixel[seen], stripes.across[index]
+    )
+
+
+def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the moves (N, 3, K) of points on surfaces that bring about given changes.
+
+    Parameters
+    ----------
+    by_point : array, shape (N, 2, 3)
+        Derivative of the projection.
+    normals : array, shape (N, 3)
+        Of the surfaces, in `dome`.
+    right : array, shape (N, 3, K) or (3, K)
+        Changes of the pixel's x and y, and of the distance along the normal.
+
+    Notes
+    -----
+    The inverse of the projection within the surface: three equations for a point's three
+    coordinates, two of them the pixel's.
+    """
+    system = np.concatenate([by_point, normals[:, None, :]], axis=1)
+    finite = np.all(np.isfinite(system), axis=(1, 2))
+    system[~finite] = np.eye(3)
+    moved: FloatArray = np.linalg.solve(
+        system, np.broadcast_to(right, (len(system), *right.shape[-2:]))
+    )
+    moved[~finite] = np.nan
+    return moved

@@ -1,0 +1,318 @@
+"""Stripes in a whole picture, when nothing is known yet of the lasers that draw them."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.scanning.detection import FrameDetector
+from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch
+from aqualvs.scanning.segments import Segments, link_segments
+from aqualvs.scanning.stripe import Returns, StripeOptions
+
+# A stripe that runs less than 45 degrees off a search line is left to the other axis.
+_STEEPEST = 1.0
+# Slopes come from this many returns on either side.
+_SLOPE_REACH = 6
+# A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a mark.
+_MIN_LENGTH_IN_WIDTHS = 2.5
+# Returns beyond this many median widths of their chain are a dot that sits on the stripe.
+_MAX_WIDTH = 1.8
+# The centre of a stripe wanders with its speckle by this much of its width; the least is what 8
+# bits and a Bayer pattern leave.
+_SIGMA_IN_WIDTHS, _LEAST_SIGMA_PX = 0.01, 0.05
+# Where one side is lighter than the other, beyond the stripe or on its slopes, paint pulls the
+# centre by about so many widths for each height of the stripe.
+_FLANK_AT, _FLANK_PULL = 1.3, 0.2
+_SLOPE_AT, _SLOPE_PULL = 0.5, 0.35
+# In pictures this wide a stripe can be a pixel or two thin, its centre then locked to the pixels
+# and its noise that of single pixels.
+_FINE_FROM, _FINE_BLUR_PX = 1280, 1.0
+_RETURNS_PER_LINE = 60
+_MAP_LENGTH = 30000
+# A single return may fall short of the green that its piece must have, but not be grey.
+_LEAST_GREEN = 1.0
+# Grey levels: added to both sides of ratios of colours, for those near black; and saturation.
+_DARK, _SATURATED = 8.0, 240.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WholePictureOptions:
+    """Options of `find_stripes`.
+
+    Attributes
+    ----------
+    min_contrast : int
+        Least height of a stripe above its background, in grey levels.
+    min_green : float
+        Least median excess of green along a piece of stripe over what its flanks' paint would show
+        there, in grey levels: what tells a laser's line from a printed edge. Only used where the
+        picture has colour.
+    min_length_px : int
+        Shortest unbroken piece of a stripe.
+    min_share : float
+        Returns lower than this share of the picture's bright ones are left out.
+    """
+
+    min_contrast: int = 6
+    min_green: float = 4.0
+    min_length_px: int = 12
+    min_share: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if self.min_length_px < 3:
+            raise OptionError(f"min_length_px is {self.min_length_px}; use 3 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class StripePixels:
+    """Points on stripes of a picture, N of them, chain by chain along each stripe.
+
+    Attributes
+    ----------
+    pixels : array, shape (N, 2)
+        Sub-pixel centres, in `image`.
+    across : array, shape (N, 2)
+        Unit vectors at right angles to the stripe.
+    chain : int array, shape (N,)
+        Which unbroken piece of a stripe a point belongs to.
+    height : array, shape (N,)
+        Peak above background, in grey levels.
+    width : array, shape (N,)
+        Full width at half height across the stripe, in pixels.
+    sigma_px : array, shape (N,)
+        Nominal standard deviation of the centre across the stripe.
+    """
+
+    pixels: FloatArray
+    across: FloatArray
+    chain: IntArray
+    height: FloatArray
+    width: FloatArray
+    sigma_px: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.chain)
+
+
+def find_stripes(
+    image: ImagePlane | Frame, options: WholePictureOptions | None = None
+) -> StripePixels:
+    """Find what is thin, long and greener than its surroundings.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width) or (height, width, 3), or Frame
+        Grey, or BGR as OpenCV reads it. In a grey picture every thin bright line counts.
+    options : WholePictureOptions, optional
+
+    Returns
+    -------
+    StripePixels
+        Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
+    """
+    options = options or WholePictureOptions()
+    picture = _as_bgr(image) if isinstance(image, Frame) else image
+    luma = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    if luma.shape[1] >= _FINE_FROM:
+        luma = cv2.GaussianBlur(luma, (0, 0), _FINE_BLUR_PX)
+    # Averaging three by three keeps colour noise of single pixels from making or hiding a line.
+    colour = None if picture.ndim == 2 else cv2.blur(picture, (3, 3)).astype(np.float64)
+    found = _joined([_along(axis, luma, colour, options) for axis in SearchAxis])
+    return replace(found, sigma_px=_sigma_px(luma, found))
+
+
+def _as_bgr(frame: Frame) -> ImagePlane:
+    """Return the frame's picture with its chroma at full size."""
+    if frame.chroma is None:
+        return frame.luma
+    height, width = frame.luma.shape
+    u, v = (cv2.resize(plane, (width, height)) for plane in frame.chroma)
+    bgr: ImagePlane = cv2.cvtColor(cv2.merge([frame.luma, v, u]), cv2.COLOR_YCrCb2BGR)
+    return bgr
+
+
+def _along(
+    axis: SearchAxis, luma: ImagePlane, colour: FloatArray | None, options: WholePictureOptions
+) -> StripePixels:
+    height, width = luma.shape
+    search = _whole_search((width, height), axis)
+    detection = StripeOptions(
+        min_contrast=options.min_contrast,
+        min_share=options.min_share,
+        max_returns=_RETURNS_PER_LINE * len(search.lowest),
+    )
+    detector = FrameDetector((width, height), [search], detection)
+    returns = detector.detect(Frame(0, 0.0, luma))[axis]
+    green = np.full(len(returns), np.inf)
+    if colour is not None:
+        across = axis is SearchAxis.ALONG_Y
+        green = _green_excess(colour.swapaxes(0, 1) if across else colour, returns)
+        not_grey = green >= _LEAST_GREEN
+        returns, green = _where(returns, not_grey), green[not_grey]
+    return _pieces(axis, returns, green, link_segments(returns, search), options)
+
+
+def _whole_search(size_px: tuple[int, int], axis: SearchAxis) -> StripeSearch:
+    n_lines, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
+    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _STEEPEST)
+    lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
+    return StripeSearch(axis, 1, lowest, highest, -slopes, slopes)
+
+
+def _where(returns: Returns, keep: BoolArray) -> Returns:
+    return Returns(
+        returns.line[keep],
+        returns.position[keep],
+        returns.height[keep],
+        returns.width[keep],
+        returns.green_fall[keep],
+    )
+
+
+def _green_excess(colour: FloatArray, returns: Returns) -> FloatArray:
+    """Return how much greener (N,), in grey levels, a return is than its flanks' paint would be.
+
+    Lit like its flanks, lighter paint has more of every colour; a laser adds green. A saturated
+    core is white, so that its edges count.
+    """
+    last = colour.shape[1] - 1
+
+    def at(offset: FloatArray) -> FloatArray:
+        place = np.clip(np.rint(returns.position + offset), 0, last).astype(np.int64)
+        value: FloatArray = colour[returns.line, place]
+        return value
+
+    edge, flank = 0.5 * returns.width, 1.2 * returns.width + 3.0
+    flanks = at(-flank), at(flank)
+    core = _excess(at(np.zeros(len(returns))), flanks)
+    edges = np.maximum(_excess(at(-edge), flanks), _excess(at(edge), flanks))
+    saturated = at(np.zeros(len(returns)))[:, 1] >= _SATURATED
+    excess: FloatArray = np.where(saturated, np.maximum(core, edges), core)
+    return excess
+
+
+def _excess(here: FloatArray, flanks: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Return green (N,) beyond what blue and red foretell from the flanks' own colours."""
+
+    def foretold(flank: FloatArray) -> FloatArray:
+        lighter = (here + _DARK) / (flank + _DARK)
+        level: FloatArray = (flank[:, 1] + _DARK) * 0.5 * (lighter[:, 0] + lighter[:, 2]) - _DARK
+        return level
+
+    excess: FloatArray = here[:, 1] - np.maximum(foretold(flanks[0]), foretold(flanks[1]))
+    return excess
+
+
+def _pieces(
+    axis: SearchAxis,
+    returns: Returns,
+    green: FloatArray,
+    segments: Segments,
+    options: WholePictureOptions,
+) -> StripePixels:
+    """Return the pieces that are green, long enough, and cross the search lines well."""
+    chains = np.split(segments.order, np.flatnonzero(np.diff(segments.stretch)) + 1)
+    long = [chain for chain in chains if len(chain) >= options.min_length_px]
+    kept = [chain for chain in long if np.median(green[chain]) >= options.min_green]
+    pieces = [_piece(axis, returns, chain) for chain in kept]
+    return _joined([piece for piece in pieces if _is_long(piece)])
+
+
+def _piece(axis: SearchAxis, returns: Returns, chain: IntArray) -> StripePixels:
+    chain = chain[np.argsort(returns.line[chain], kind="stable")]
+    slope = _slopes(returns.line[chain].astype(np.float64), returns.position[chain])
+    width = returns.width[chain]
+    # At just 45 degrees one of the axes must have it.
+    steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
+    keep = steep_enough & (width <= _MAX_WIDTH * np.median(width))
+    chain, slope = chain[keep], slope[keep]
+    along_x = axis is SearchAxis.ALONG_X
+    cosine = 1.0 / np.hypot(1.0, slope)
+    pixels = np.stack([returns.line[chain].astype(np.float64), returns.position[chain]], axis=-1)
+    across = np.stack([-slope * cosine, cosine], axis=-1)
+    width = returns.width[chain] * cosine
+    return StripePixels(
+        pixels[:, ::-1] if along_x else pixels,
+        across[:, ::-1] if along_x else across,
+        np.zeros(len(chain), np.int64),
+        returns.height[chain],
+        width,
+        np.zeros(len(chain)),
+    )
+
+
+def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
+    """Return the nominal noise (N,) of points across their stripes."""
+
+    def lopsided(at: float) -> FloatArray:
+        arms = at * stripes.width[:, None] * stripes.across
+        sides = [_bilinear(luma, stripes.pixels + sign * arms) for sign in (-1.0, 1.0)]
+        share: FloatArray = (sides[1] - sides[0]) / stripes.height
+        return share
+
+    pull = np.hypot(_FLANK_PULL * lopsided(_FLANK_AT), _SLOPE_PULL * lopsided(_SLOPE_AT))
+    in_widths = np.hypot(_SIGMA_IN_WIDTHS, pull)
+    return np.hypot(_LEAST_SIGMA_PX, in_widths * stripes.width)
+
+
+def _bilinear(luma: ImagePlane, pixels: FloatArray) -> FloatArray:
+    x, y = np.ascontiguousarray(pixels.T, np.float32)
+    # OpenCV's maps are pictures, of which the sides have a limit.
+    rows = [slice(i, i + _MAP_LENGTH) for i in range(0, len(x), _MAP_LENGTH)]
+    values = [
+        cv2.remap(luma, x[r], y[r], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
+        for r in rows
+    ]
+    return np.concatenate([np.zeros(0), *values])
+
+
+def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
+    """Return d position / d line (N,), by a straight fit to the neighbours along the chain."""
+    index = np.arange(len(line))
+    first = np.maximum(index - _SLOPE_REACH, 0)
+    last = np.minimum(index + _SLOPE_REACH + 1, len(line))
+    x, y = line - line.mean(), position - position.mean()
+
+    def window(values: FloatArray) -> FloatArray:
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        summed: FloatArray = total[last] - total[first]
+        return summed
+
+    n = (last - first).astype(np.float64)
+    spread = window(x * x) - window(x) ** 2 / n
+    slope: FloatArray = (window(x * y) - window(x) * window(y) / n) / np.maximum(spread, 1e-9)
+    return slope
+
+
+def _is_long(piece: StripePixels) -> bool:
+    if len(piece) < 3:
+        return False
+    length = float(np.hypot(*(piece.pixels[-1] - piece.pixels[0])))
+    return length >= _MIN_LENGTH_IN_WIDTHS * float(np.median(piece.width))
+
+
+def _joined(parts: list[StripePixels]) -> StripePixels:
+    """Return all parts as one, with chains numbered through."""
+    if not parts:
+        none = np.zeros(0)
+        return StripePixels(
+            np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), none, none, none
+        )
+    chains, first = [], 0
+    for part in parts:
+        chains.append(part.chain + first)
+        first += int(part.chain.max(initial=-1)) + 1
+    return StripePixels(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.across for part in parts]),
+        np.concatenate(chains),
+        np.concatenate([part.height for part in parts]),
+        np.concatenate([part.width for part in parts]),
+        np.concatenate([part.sigma_px for part in parts]),
+    )

@@ -1,0 +1,154 @@
+"""Lasers: simulated calibrations against their promised uncertainty, samples against truth."""
+
+import importlib.util
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.calibration.detection import detect_board, detect_markers
+from aqualvs.calibration.hold_out import leave_one_out
+from aqualvs.calibration.laser_views import LaserView
+from aqualvs.calibration.lasers import LaserOptions, calibrate_lasers
+from aqualvs.calibration.stripe_points import StripePoints
+from aqualvs.calibration.stripes_on_planes import board_surface, box_surfaces
+from aqualvs.calibration.target_files import load_box
+from aqualvs.calibration.targets import Board, BoardKind
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.lens import Lens
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.uncertainty import LASER_PARAMETERS, RigUncertainty, rig_moved_by, tangent_basis
+from aqualvs.scanning.whole_picture import find_stripes
+from aqualvs.simulation.example_rigs import example_rig
+from laser_cases import (
+    Noise,
+    board_views,
+    box,
+    box_views,
+    camera_uncertainty,
+    laser_error,
+    without_lasers,
+)
+
+BIAS_PX = 0.03
+_TOOL = Path(__file__).resolve().parents[2] / "tools" / "rig_from_sample_truth.py"
+
+
+def whitened(found: Rig, true: Rig, uncertainty: RigUncertainty, held: FloatArray) -> FloatArray:
+    """Errors of camera and lasers together, in standard deviations, made independent.
+
+    `held` (C,) are the errors of the camera's numbers, where they were held.
+    """
+    errors = list(held)
+    names = list(camera_uncertainty().names)
+    for a, b in zip(found.lasers, true.lasers, strict=True):
+        errors += (tangent_basis(a.plane.normal) @ b.plane.normal).tolist()
+        errors.append(b.plane.offset - a.plane.offset)
+        names += [f"{a.name}:{name}" for name in LASER_PARAMETERS]
+    covariance = uncertainty.of(names)
+    size = np.sqrt(np.diag(covariance))
+    lower = np.linalg.cholesky(covariance / np.outer(size, size))
+    independent: FloatArray = np.linalg.solve(lower, np.array(errors) / size)
+    return independent
+
+
+@pytest.mark.parametrize("target", ["box", "board"])
+def test_errors_are_as_large_as_promised(target: str) -> None:
+    """Cameras drawn from their covariance, noisy corners and stripes, stripes with a bias."""
+    given, nominal = camera_uncertainty(), example_rig()
+    lower = np.linalg.cholesky(given.covariance)
+    surfaces = box() if target == "box" else board_surface()
+    scores = []
+    for k in range(30):
+        rng = np.random.default_rng(1000 + k)
+        camera_error = lower @ rng.standard_normal(len(given.names))
+        true = rig_moved_by(nominal, given.names, camera_error)
+        bias = BIAS_PX * rng.standard_normal((3, len(surfaces.planes)))
+        noise = Noise(corner_px=0.1, stripe_px=0.1, bias_px=bias, correlation=0.3)
+        make = box_views if target == "box" else board_views
+        views = make(true, noise=noise, seed=k, spacing=0.006)
+        result = calibrate_lasers(
+            nominal,
+            views,
+            surfaces,
+            uncertainty=given,
+            options=LaserOptions(stripe_bias_px=BIAS_PX),
+        )
+        scores.append(whitened(result.rig, true, result.uncertainty, camera_error))
+    lasers = np.array(scores)[:, len(given.names) :]
+    # 270 values: their standard deviation is known to 4 % if they are independent.
+    assert 0.85 < lasers.std() < 1.15
+    assert np.abs(lasers).max() < 4.5
+
+
+def true_rig(folder: Path) -> Rig:
+    spec = importlib.util.spec_from_file_location("rig_from_sample_truth", _TOOL)
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    rig: Rig = tool.load_truth(folder / "truth" / "rig_truth.json")
+    return rig
+
+
+def stripes_of(image: np.ndarray, name: str) -> StripePoints:
+    found = find_stripes(image)
+    return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize("folder", ["box", "box_water"])
+def test_lasers_of_the_sample_box(folder: str, samples: Path) -> None:
+    rig = true_rig(samples / "lab-paper")
+    markers, n_medium = load_box(samples / "lab-paper" / folder / "box.yaml")
+    views = []
+    for path in sorted((samples / "lab-paper" / folder).glob("*.png")):
+        image = cv2.imread(str(path))
+        assert image is not None
+        view = detect_markers(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), markers, path.name)
+        assert view, str(view)
+        views.append(LaserView(view, stripes_of(image, path.name)))
+    assert len(views) == 6
+    options = LaserOptions(n_lasers=3, n_medium=n_medium if folder == "box" else None)
+    surfaces = box_surfaces(markers.planes, markers.points())
+    result = calibrate_lasers(without_lasers(rig), views, surfaces, options=options)
+    assert [f.laser.name for f in result.lasers] == ["horizontal", "vertical", "diagonal"]
+    assert result.warnings == ()
+    for figures, laser in zip(result.lasers, rig.lasers, strict=True):
+        angle, offset = laser_error(figures.laser.plane, laser.plane)
+        assert np.rad2deg(angle) < 0.05
+        assert abs(offset) < 0.3e-3
+        assert angle < 3.0 * figures.sigma_normal
+        assert abs(offset) < 3.0 * figures.sigma_offset
+
+
+@pytest.mark.samples
+def test_fifteen_lines_on_a_wall_in_real_photographs(samples: Path) -> None:
+    rig = Rig(
+        name="bare",
+        size_px=(2208, 1242),
+        lens=Lens(fx=1407.86, fy=1407.12, cx=1083.25, cy=623.67),
+        dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
+        dome=None,
+        n_air=1.0,
+        n_water=1.0,
+        lasers=(),
+        working_range=(0.3, 1.0),
+    )
+    board = Board(kind=BoardKind.CHESSBOARD, squares=(7, 10), square=0.02909)
+    views = []
+    for path in sorted((samples / "real-laser-on-wall").glob("*.png")):
+        image = cv2.imread(str(path))
+        assert image is not None
+        view = detect_board(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), board, path.name)
+        assert view, str(view)
+        views.append(LaserView(view, stripes_of(image, path.name)))
+    assert len(views) == 9
+    # Nobody tells how many lines there are.
+    held = leave_one_out(rig, views, board_surface())
+    assert all(h.n_lasers == 15 for h in held)
+    assert np.median([abs(h.range_error) for h in held]) < 5e-3
+    assert np.rad2deg(np.median([abs(h.yaw_error) for h in held])) < 1.2
+    assert np.rad2deg(np.median([abs(h.pitch_error) for h in held])) < 0.25
