@@ -12,7 +12,7 @@ from aqualvs.app.cli import main
 from aqualvs.errors import AqualvsError
 from shell_cases import rig_file
 
-COMMANDS = ("run", "simulate", "demo", "check", "report")
+COMMANDS = ("run", "simulate", "demo", "check", "report", "board")
 HEAVY = {"numpy", "numba", "cv2", "av", "pydantic", "pyarrow", "plotly", "scipy", "rich", "yaml"}
 
 
@@ -33,6 +33,13 @@ def test_every_command_has_help_with_an_example(command, capsys):
     assert main([command, "--help"]) == 0
     said = capsys.readouterr().out
     assert f"Example: aqualvs {command}" in said
+
+
+@pytest.mark.parametrize("step", ["camera", "dome", "lasers", "water"])
+def test_every_calibration_has_help_with_an_example(step, capsys):
+    assert main(["calibrate", step, "--help"]) == 0
+    said = capsys.readouterr().out
+    assert f"Example: aqualvs calibrate {step}" in said
 
 
 def test_help_without_a_command_names_them_all(capsys):

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import typer
 
 from aqualvs import __version__
+from aqualvs.app.cli_calibrate import board, calibrate
 from aqualvs.errors import AqualvsError
 
 app = typer.Typer(
@@ -21,6 +22,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+app.add_typer(calibrate)
+app.command(
+    help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
+    epilog="Example: aqualvs board charuco --paper a3 -o board",
+)(board)
 
 # Older versions of Typer keep this class in Click, newer ones in a private module of their own.
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
@@ -97,6 +104,13 @@ def run(
     truth: Annotated[
         Path | None, typer.Option(help="CSV with the truth to compare with.", show_default=False)
     ] = None,
+    index_target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Measure a dive."""
     from aqualvs.app import run as body
@@ -115,6 +129,7 @@ def run(
         overlay=overlay,
         report=report,
         truth=truth,
+        index_target=index_target,
     )
     raise typer.Exit(body.run_and_tell(request, typer.echo))
 
@@ -163,10 +178,20 @@ def demo(
 
 @app.command(
     help="Say in words whether a rig is sane and what it can measure.",
-    epilog="Example: aqualvs check rig.yaml",
+    epilog="Example: aqualvs check rig.yaml --against rig.before.yaml",
 )
-def check(rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")]) -> None:
+def check(
+    rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")],
+    against: Annotated[
+        Path | None,
+        typer.Option(help="Older rig file: say what has moved since.", show_default=False),
+    ] = None,
+) -> None:
     """Check a rig."""
+    if against is not None:
+        from aqualvs.app.check_compare import run_compare
+
+        raise typer.Exit(run_compare(rig, against))
     from aqualvs.app.check import run_check
 
     raise typer.Exit(run_check(rig))

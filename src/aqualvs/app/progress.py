@@ -23,16 +23,20 @@ _FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
 
 
 class _Rate(ProgressColumn):
-    """Frames per second."""
+    """Frames, or whatever is counted, per second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
 
     def render(self, task: Task) -> Text:
         """Return the rate as text."""
         speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.0f} frames/s")
+        return Text("" if speed is None else f"{speed:.0f} {self._unit}/s")
 
 
 @contextlib.contextmanager
-def progress(label: str, n_frames: int | None) -> Iterator[Tick]:
+def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
     """Show a progress bar; nothing where standard error is not a terminal.
 
     Parameters
@@ -41,6 +45,8 @@ def progress(label: str, n_frames: int | None) -> Iterator[Tick]:
         What is going on.
     n_frames : int or None
         Frames to come, if known.
+    unit : str
+        What is counted, if not frames.
 
     Yields
     ------
@@ -48,7 +54,7 @@ def progress(label: str, n_frames: int | None) -> Iterator[Tick]:
         To be called with the number of frames that have been done since the last call.
     """
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit))
     bar = Progress(
         *columns,
         TimeRemainingColumn(),

@@ -23,6 +23,7 @@ from aqualvs.app.run_inputs import (
     source_facts,
 )
 from aqualvs.app.run_overlay import RunOverlay
+from aqualvs.app.run_water import WaterFollowingScanner
 from aqualvs.app.runfile import Status
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.tally import Tally
@@ -60,6 +61,8 @@ class RunRequest:
         Whether to write `overlay.mp4` and `report.html`.
     truth : Path or None
         Truth to compare with.
+    index_target : Path or None
+        Markers on the vehicle that tell the water's index, followed frame by frame.
     """
 
     source: str
@@ -74,6 +77,7 @@ class RunRequest:
     overlay: bool = False
     report: bool = True
     truth: Path | None = None
+    index_target: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,6 +93,8 @@ class RunResult:
     tally : Tally
     dome_lines : list of str
         What the dome model is worth, in words.
+    water_lines : list of str
+        What was found of the water's index, in words; empty where it was given.
     elapsed_s : float
         From the first frame to the complete folder, without the report.
     report : Path or None
@@ -101,6 +107,7 @@ class RunResult:
     stopped_by: str
     tally: Tally
     dome_lines: list[str]
+    water_lines: list[str]
     elapsed_s: float
     report: Path | None
     comparison: TruthComparison | None
@@ -135,7 +142,8 @@ def run(
     fault: AqualvsError | None = None
     with open_source(request.source, fps=request.fps) as source:
         check_fits(source, rig)
-        scanner = scanner_for(rig, request.scanner)
+        following = _following(request, rig)
+        scanner = following or scanner_for(rig, request.scanner)
         agreement = None if request.no_dome else agreement_of(rig, request.rig)
         frames = _ready(_window(source, request.frames), source, request.frames)
         prepare_folder(request.out, overwrite=request.overwrite)
@@ -169,6 +177,7 @@ def run(
         stopped_by=stop.caught.name if stop.caught else "",
         tally=outputs.tally,
         dome_lines=bare_lens.lines(),
+        water_lines=following.lines() if following else [],
         elapsed_s=time.perf_counter() - started,
         report=_report(request),
         comparison=_comparison(request),
@@ -196,6 +205,7 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
     """Return what the command prints at the end."""
     lines = [f"{request.source}: {result.tally.n_frames} frames in {result.elapsed_s:.1f} s"]
     lines += result.tally.lines()
+    lines += result.water_lines
     lines += result.dome_lines
     if result.comparison is not None:
         lines += result.comparison.lines()
@@ -206,6 +216,14 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
         )
     lines.append(f"report: {result.report}" if result.report else f"results: {request.out}")
     return lines
+
+
+def _following(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
+    if request.index_target is None:
+        return None
+    if rig.dome is None:
+        raise OptionError("--index-target: without a dome the water's index cannot be seen")
+    return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
 
 
 def _window(source: FrameSource, window: FrameWindow) -> Iterator[Frame]:
@@ -257,6 +275,7 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
         width=none,
         quality=none,
         label=np.empty(0, np.uint8),
+        used=np.empty(0, np.bool_),
     )
     return Scan(index, time_s, Refusal(Reason.CORRUPT_FRAME), nothing, n_water)
 
@@ -272,6 +291,7 @@ def _options(request: RunRequest) -> dict[str, Any]:
     found = {"rig_file": str(request.rig), "no_dome": request.no_dome}
     found |= asdict(request.water)
     found |= {"first_frame": request.frames.first, "stop_frame": request.frames.stop}
+    found["index_target"] = None if request.index_target is None else str(request.index_target)
     return found | {"scanner": scanner_facts(request.scanner)}
 
 

@@ -47,7 +47,7 @@ class Water:
         if self.n_water is not None:
             if seawater != (None, None):
                 raise OptionError("--water-n: give the index or temperature and salinity, not both")
-            return rig.in_water(_checked_index(self.n_water))
+            return rig.in_water(checked_index(self.n_water, "--water-n"))
         if self.temperature_c is None and self.salinity is None:
             return rig
         if self.temperature_c is None or self.salinity is None:
@@ -162,8 +162,15 @@ def source_facts(source: FrameSource) -> dict[str, Any]:
     return found
 
 
-def _checked_index(n_water: float) -> float:
+def checked_index(n: float, option: str) -> float:
+    """Return an index that the user gave by an option.
+
+    Raises
+    ------
+    OptionError
+        If it is that of no medium one dives in.
+    """
     low, high = _INDEX_LIMITS
-    if not low <= n_water <= high:
-        raise OptionError(f"--water-n {n_water:g}: no water; give a value from {low} to {high}")
-    return n_water
+    if not low <= n <= high:
+        raise OptionError(f"{option} {n:g}: no water; give a value from {low} to {high}")
+    return n

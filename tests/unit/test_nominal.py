@@ -1,0 +1,50 @@
+"""What is known of a rig before any calibration."""
+
+import pytest
+
+from aqualvs.app.nominal import load_nominal
+from aqualvs.errors import RigError
+from aqualvs.optics.rigfile import save_rig
+from aqualvs.simulation.example_rigs import example_rig
+
+
+def test_a_nominal_file(tmp_path):
+    path = tmp_path / "nominal.yaml"
+    path.write_text(
+        "name: blue\nimage: {width: 720, height: 576}\nn_air: 1.0002\nfps: 25\n"
+        "dome: {inner_radius_mm: 44.25, thickness_mm: 5.75, n_acrylic: 1.48}\n"
+        "lasers: {count: 3, wavelength_nm: 532}\n"
+    )
+    nominal = load_nominal(path)
+    assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("blue", (720, 576), 3)
+    assert nominal.n_air == 1.0002
+    assert nominal.dome is not None
+    assert nominal.dome.inner_radius == pytest.approx(0.04425, rel=1e-12)
+    assert nominal.dome.n_acrylic == 1.48
+
+
+def test_a_rig_file_serves_too(tmp_path):
+    rig = example_rig()
+    save_rig(rig, tmp_path / "rig.yaml")
+    nominal = load_nominal(tmp_path / "rig.yaml")
+    assert nominal.size_px == rig.size_px
+    assert nominal.dome == rig.dome
+    assert nominal.n_lasers == len(rig.lasers)
+    assert nominal.n_water == rig.n_water
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("dome: {inner_radius_mm: -3, thickness_mm: 5}", "dome.inner_radius_mm is -3"),
+        ("lasers: {cuont: 3}", "lasers"),
+        ("just words", "is not a nominal rig"),
+    ],
+)
+def test_faults_name_file_place_and_value(tmp_path, text, words):
+    path = tmp_path / "nominal.yaml"
+    path.write_text(text)
+    with pytest.raises(RigError, match=r"nominal\.yaml") as caught:
+        load_nominal(path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
