@@ -11,14 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from aqualvs.calibration.index_filter import (
-    MIN_POINTS,
-    WIDE,
-    Frame,
-    IndexModel,
-    Innovation,
-    Update,
-)
+from aqualvs.calibration.index_filter import Innovation, Update, believe, compare
+from aqualvs.calibration.index_frame import MIN_POINTS, Frame
+from aqualvs.calibration.index_model import WIDE, IndexModel
 from aqualvs.calibration.index_prior import IndexPrior
 from aqualvs.calibration.index_reading import (
     IndexOptions,
@@ -176,10 +171,10 @@ class IndexEstimator:
         start = self.rig.n_water if self.prior is None else self.prior.n
         state, noise = self._model.first(frame, start), _NOMINAL_NOISE
         for _ in range(_FIRST_ROUNDS):
-            seen = self._model.innovation(state, frame, noise)
+            seen = compare(self._model, state, frame, noise)
             if not seen.fits:
                 return self._reading(frame.time, name, _not_there(seen))
-            update = self._model.update(state, seen.frame, noise)
+            update = believe(self._model, state, seen.frame, noise)
             noise = max(update.noise, _FIRST_NOISE)
         self._last_time, self._noise = frame.time, noise
         return self._believe(name, seen, update, state.n)
@@ -189,7 +184,7 @@ class IndexEstimator:
         self._since_prior += self.options.drift**2 * (frame.time - self._last_time)
         self._last_time = frame.time
         noise = self._noise * self._test.inflation
-        seen = self._model.innovation(state, frame, noise)
+        seen = compare(self._model, state, frame, noise)
         if not seen.fits:
             self._n_lost += 1
             return self._reading(frame.time, name, _not_there(seen))
@@ -203,7 +198,7 @@ class IndexEstimator:
             n = state.n + seen.shift
             waits = f"alone it gives an index of {n:.4f}; the next frames will tell"
             return self._reading(frame.time, name, waits, n_frame=n)
-        update = self._model.update(state, seen.frame, noise)
+        update = believe(self._model, state, seen.frame, noise)
         return self._believe(name, seen, update, state.n)
 
     def _believe(self, name: str, seen: Innovation, update: Update, n: float) -> IndexReading:
@@ -241,12 +236,12 @@ class IndexEstimator:
         before, seen = since[0]
         noise = self._noise * self._test.inflation
         state = self._model.jumped(self._until(before, seen.frame), seen.frame)
-        update = self._model.update(state, seen.frame, noise)
+        update = believe(self._model, state, seen.frame, noise)
         for _, later in since[1:]:
             state = self._until(update.state, later.frame)
-            seen = self._model.innovation(state, later.frame, noise)
+            seen = compare(self._model, state, later.frame, noise)
             if seen.fits and abs(seen.shift) < _WAIT * seen.sigma:
-                update = self._model.update(state, seen.frame, noise)
+                update = believe(self._model, state, seen.frame, noise)
         return update.state.later(self._last_time, self.options.drift), update
 
     def _until(self, state: IndexState, frame: Frame) -> IndexState:

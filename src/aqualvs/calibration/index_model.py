@@ -1,0 +1,228 @@
+"""How a target on the vehicle is seen through a medium: prediction and derivatives by a state."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aqualvs.calibration.index_frame import Frame
+from aqualvs.calibration.index_state import FIRST_CAMERA, POSE, IndexState, N, first_state
+from aqualvs.calibration.pose_steps import moved_target, point_by_pose
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import parameter_names
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
+
+WIDE = 0.2
+"""Standard deviation of an index that is not known at all, or has just jumped."""
+BLIND = 1e-6
+"""Below this motion of the picture, pixels per unit of index, nothing is seen at all."""
+LINEAR = 1e-4
+"""Steps of the index up to this are linear to far below the noise of a corner."""
+
+_LOWEST, _HIGHEST = 1.0, 1.7
+_NEWTON = 30
+# Changes of a camera's number up to this many standard deviations are added linearly.
+_NEARLY = 0.02
+
+
+class Line(NamedTuple):
+    """Prediction of a frame near a state.
+
+    Attributes
+    ----------
+    residuals : array, shape (2M,)
+        Measured less predicted pixels.
+    slopes : array, shape (2M, D)
+        Derivative of the prediction by the state's mean.
+    """
+
+    residuals: FloatArray
+    slopes: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class IndexModel:
+    """How a target on the vehicle is seen through media of different index.
+
+    Attributes
+    ----------
+    rig : Rig
+        Behind a dome; its own `n_water` plays no part.
+    uncertainty : RigUncertainty
+        How well the camera's numbers are known.
+    pose_sigmas : array, shape (6,)
+        How well the target's place is known: turn about its middle (radians), shift (metres).
+    sigma_corner : float
+        What a corner is always off, standard deviation in pixels.
+    middle : array, shape (3,)
+        What the target turns about, in `dome`.
+    camera_names : tuple of str
+        Numbers of the camera that are uncertain, in the state's order.
+
+    Raises
+    ------
+    CalibrationError
+        If the rig has no dome.
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty
+    pose_sigmas: FloatArray
+    sigma_corner: float
+    middle: FloatArray
+    camera_names: tuple[str, ...] = field(init=False)
+    _moved: "_MovedRig" = field(init=False, repr=False, compare=False)
+    _cache: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.rig.dome is None:
+            raise CalibrationError(
+                f"rig {self.rig.name} has no dome: a bare lens looks the same in every medium, so "
+                "its index cannot be found; add the dome to the rig"
+            )
+        sigmas = self.uncertainty.sigmas
+        names = parameter_names(self.rig.camera())
+        uncertain = tuple(n for n in names if n != "n_water" and sigmas.get(n, 0.0) > 0.0)
+        object.__setattr__(self, "camera_names", uncertain)
+        scale = np.array([sigmas[name] for name in uncertain])
+        object.__setattr__(self, "_moved", _MovedRig(self.rig, uncertain, scale))
+
+    def first(self, frame: Frame, n: float) -> IndexState:
+        """Return the state before a first frame, its index looked for from `n` on."""
+        camera = self.uncertainty.of(self.camera_names)
+        blank = first_state(frame.time, n, WIDE, self.pose_sigmas, camera)
+        return first_state(
+            frame.time, self.nearest(blank, frame), WIDE, self.pose_sigmas, camera
+        ).with_corners(frame.ids, self.sigma_corner)
+
+    def jumped(self, state: IndexState, frame: Frame) -> IndexState:
+        """Return the state after a jump of the index to where a frame has it."""
+        return state.stepped(self.nearest(state, frame), WIDE)
+
+    def line(self, state: IndexState, frame: Frame) -> Line:
+        """Return the prediction of a frame near a state; residuals are NaN where none is seen.
+
+        Slopes are those at the constants' first guesses and at `state.n_of_slopes`: taken anew
+        for every frame they would differ by the noise of the estimate, and seem to tell apart what
+        no frame can (first-estimates Jacobian, Huang et al. 2010, doi:10.1177/0278364909353640).
+        """
+        slopes = np.zeros((len(frame.ids), 2, len(state.mean)))
+        first_corner = FIRST_CAMERA + len(self.camera_names)
+        known = self._slopes(state.n_of_slopes, frame)
+        slopes[..., :first_corner] = known
+        off = np.zeros((len(frame.ids), 2))
+        for row, i in enumerate(frame.ids):
+            if i in state.ids:
+                at = first_corner + 2 * state.ids.index(i)
+                off[row] = state.mean[at : at + 2]
+                slopes[row, 0, at] = slopes[row, 1, at + 1] = 1.0
+        n = min(max(state.n, _LOWEST), _HIGHEST)
+        rig, rest = self._moved.near(state.mean[FIRST_CAMERA:first_corner])
+        target = moved_target(SE3.identity(), self.middle, state.mean[POSE])
+        pixels, _ = rig.in_water(n).camera().project(target.apply(frame.points))
+        off += known[..., N] * (state.n - n) + known[..., FIRST_CAMERA:] @ rest
+        residuals = frame.pixels - pixels - off
+        return Line(residuals.reshape(-1), slopes.reshape(-1, len(state.mean)))
+
+    def slope_uncertainty(self, state: IndexState, frame: Frame) -> float:
+        """Return the relative standard deviation of a change of index for what a state leaves open.
+
+        The constants decide how far the picture moves with the index: a product of unknowns that a
+        joint Gaussian does not hold.
+        """
+        mean, size = state.mean, FIRST_CAMERA + len(self.camera_names)
+        reference = self._slope_at(mean[:size], state.n, frame)
+        by_constant = np.zeros(size)
+        for i in range(POSE.start, size):
+            sigma = np.sqrt(state.covariance[i, i])
+            if sigma > 0.0:
+                moved = mean[:size].copy()
+                moved[i] += sigma
+                change = self._slope_at(moved, state.n, frame) - reference
+                by_constant[i] = float(np.sum(change * reference)) / sigma
+        variance = by_constant @ state.covariance[:size, :size] @ by_constant
+        return float(np.sqrt(max(variance, 0.0)) / max(np.sum(reference**2), BLIND**2))
+
+    def _slope_at(self, mean: FloatArray, n: float, frame: Frame) -> FloatArray:
+        """Return the derivative (M, 2) of pixels by the index, all constants as in `mean`."""
+        rig = rig_moved_by(self.rig, self.camera_names, mean[FIRST_CAMERA:])
+        camera = rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
+        target = moved_target(SE3.identity(), self.middle, mean[POSE])
+        slopes = camera.project_with_parameter_jacobian(target.apply(frame.points))[3]
+        by_n: FloatArray = slopes[..., parameter_names(camera).index("n_water")]
+        return by_n
+
+    def _slopes(self, n: float, frame: Frame) -> FloatArray:
+        """Return derivatives (M, 2, 9 + C) of pixels by all but the corners' errors."""
+        if self._cache.get("n") != n or self._cache.get("ids") != frame.ids:
+            camera = self.rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
+            _, _, by_point, by_number = camera.project_with_parameter_jacobian(frame.points)
+            names = parameter_names(camera)
+            slopes = np.zeros((len(frame.ids), 2, FIRST_CAMERA + len(self.camera_names)))
+            slopes[..., N] = by_number[..., names.index("n_water")]
+            slopes[..., POSE] = by_point @ point_by_pose(frame.points, self.middle)
+            columns = [names.index(name) for name in self.camera_names]
+            slopes[..., FIRST_CAMERA:] = by_number[..., columns]
+            self._cache.update(n=n, ids=frame.ids, slopes=slopes)
+        known: FloatArray = self._cache["slopes"]
+        return known
+
+    def nearest(self, state: IndexState, frame: Frame) -> float:
+        """Return the index that puts most corners where they are, all constants as they are.
+
+        Newton's method on the weighted median of what the corners say one by one: half of them
+        may be wrong.
+        """
+        n = min(max(state.n, _LOWEST), _HIGHEST)
+        for _ in range(_NEWTON):
+            step = median_shift(self.line(at_index(state, n, slopes_too=True), frame))
+            new = min(max(n + step, _LOWEST), _HIGHEST)
+            if abs(new - n) < LINEAR:
+                return n + step
+            n = new
+        return n
+
+
+@dataclass(slots=True)
+class _MovedRig:
+    """A rig moved by small changes of its numbers; making one takes longer than a projection."""
+
+    rig: Rig
+    names: tuple[str, ...]
+    sigmas: FloatArray
+    _step: FloatArray = field(init=False)
+    _last: Rig = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._step, self._last = np.zeros(len(self.names)), self.rig
+
+    def near(self, step: FloatArray) -> tuple[Rig, FloatArray]:
+        """Return the rig moved by nearly `step`, and what is left of that to be added linearly."""
+        if np.any(np.abs(step - self._step) > _NEARLY * self.sigmas):
+            self._last = rig_moved_by(self.rig, self.names, step)
+            self._step = step.copy()
+        return self._last, step - self._step
+
+
+def at_index(state: IndexState, n: float, *, slopes_too: bool = False) -> IndexState:
+    """Return the state with another index, all else the same."""
+    mean = state.mean.copy()
+    mean[N] = n
+    return replace(state, mean=mean, n_of_slopes=n if slopes_too else state.n_of_slopes)
+
+
+def median_shift(line: Line) -> float:
+    """Return the weighted median of the changes of index that corners, each alone, ask for."""
+    slopes, residuals = line.slopes[:, N].reshape(-1, 2), line.residuals.reshape(-1, 2)
+    weights = np.sum(slopes**2, axis=1)
+    seen = np.isfinite(residuals[:, 0]) & (weights > BLIND**2)
+    if not np.any(seen):
+        return 0.0
+    shifts = np.sum(slopes[seen] * residuals[seen], axis=1) / weights[seen]
+    order = np.argsort(shifts)
+    # Slopes, not their squares: corners that move most would outvote all others.
+    along = np.cumsum(np.sqrt(weights[seen])[order])
+    return float(shifts[order[np.searchsorted(along, 0.5 * along[-1])]])
