@@ -35,7 +35,7 @@ def _bundle(rig: Rig, seed: int = 1, n_views: int = 4, noise_px: float = 0.0) ->
     for medium, n in enumerate((AIR, WATER)):
         shoot = rail(rig, n, "distance", rng, n_views=n_views, tilt=0.2, noise_px=noise_px)
         for i, (view, pose) in enumerate(zip(shoot.views, shoot.poses, strict=True)):
-            known = (KnownDistance(plane_distance(pose), 2e-4), SquareBoard(square, 0.1))
+            known = (KnownDistance(plane_distance(pose), 2e-4), SquareBoard(square, 0.1, 0.1))
             targets.append(TargetView(view, medium, pose, i == 0, known if i == 1 else ()))
     free = POSE + (DOME if rig.dome else ()) + rig.lens.parameter_names
     state = BundleState(rig, np.array([AIR, WATER]), tuple(t.dome_from_target for t in targets))

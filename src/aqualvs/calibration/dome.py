@@ -28,6 +28,7 @@ from aqualvs.calibration.dome_problem import DomeProblem, dome_problem, start_ri
 from aqualvs.calibration.dome_result import DomeCalibration, SolvedMedium, ViewFit, view_fit
 from aqualvs.calibration.dome_words import findings
 from aqualvs.calibration.held_back import compare_with_bare_lens
+from aqualvs.calibration.lean_scale import with_leaning_as_found
 from aqualvs.calibration.least_squares import Solution, solve
 from aqualvs.calibration.medium_check import check_media, noise_px
 from aqualvs.errors import CalibrationError, RigError
@@ -81,6 +82,7 @@ def dome(
     problem, solution = _solved(rig, sets, known, options)
     problem, solution = _without_bad_views(problem, solution)
     problem, solution = _without_wrong_distances(problem, solution, sets)
+    problem, solution = with_leaning_as_found(problem, solution, options.tilt_sigma)
     names, covariance = considered(problem.bundle, solution, problem.held)
     n_solved = len(solution.covariance)
     doubts = check_shared_errors(problem, solution, covariance[:n_solved, :n_solved])

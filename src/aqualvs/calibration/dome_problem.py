@@ -111,6 +111,17 @@ class DomeProblem:
             views[i] = replace(views[i], known=known)
         return replace(self, bundle=replace(self.bundle, views=tuple(views)))
 
+    def with_lean_sigma(self, sigma: float) -> "DomeProblem":
+        """Return the problem with other expectations of how boards lean that stand well."""
+        views = []
+        for view in self.bundle.views:
+            known = tuple(
+                replace(term, lean_sigma=sigma) if isinstance(term, SquareBoard) else term
+                for term in view.known
+            )
+            views.append(replace(view, known=known))
+        return replace(self, bundle=replace(self.bundle, views=tuple(views)))
+
 
 def shots_of(sets: Sequence[BoardSet]) -> list[Shot]:
     """Return all views of all sets."""
@@ -220,7 +231,7 @@ def _known(shot: Shot, square: FloatArray, options: DomeOptions) -> tuple[PoseTe
         return ()
     return (
         KnownDistance(shot.given.distance, options.distance_sigma),
-        SquareBoard(square, options.tilt_sigma),
+        SquareBoard(square, options.tilt_sigma, options.tilt_sigma),
     )
 
 

@@ -124,10 +124,17 @@ class IndexEstimator:
     @property
     def state(self) -> IndexState | None:
         """Joint estimate with the prior, None before the first frame that counts."""
-        state = self._state
+        state = self._own
         if state is None or self.prior is None or self._contradicted:
             return state
         return state.given_anchor(self.prior.n, self.prior.sigma)
+
+    @property
+    def _own(self) -> IndexState | None:
+        """Estimate without the prior, at the time of the last frame, used or not."""
+        if self._state is None:
+            return None
+        return self._state.later(max(self._last_time, self._state.time), self.options.drift)
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -258,7 +265,7 @@ class IndexEstimator:
         update: Update | None = None,
         step: IndexStep | None = None,
     ) -> IndexReading:
-        own, prior = self._state, self.prior
+        own, prior = self._own, self.prior
         if own is not None and prior is not None:
             self._contradicted = contradicts(own, prior, self._contradicted)
         sigma_frame = self._sigma_frame * self._test.inflation
@@ -286,7 +293,7 @@ class IndexEstimator:
 
     def _knowledge(self, sigma_frame: float) -> Knowledge:
         return Knowledge(
-            own=self._state,
+            own=self._own,
             joint=self.state,
             prior=self.prior,
             contradicted=self._contradicted,

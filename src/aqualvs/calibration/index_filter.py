@@ -97,6 +97,7 @@ def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
         n = model.nearest(state, frame)
         far = abs(n - state.n_of_slopes) > FAR
         line, moved = model.line(at_index(state, n, slopes_too=far), frame), n - state.n
+        state = model.settled(state, line, frame)
     keep = np.isfinite(line.residuals[::2])
     keep[keep] &= _left_over(state, _rows(line, keep), noise) < _REJECT
     line = _rows(line, keep)
@@ -122,6 +123,7 @@ def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
         Standard deviation of a coordinate, in pixels.
     """
     state = state.with_slopes_near()
+    state = model.settled(state, model.line(state, frame), frame)
     at, weights = state, np.ones(len(frame.ids))
     for _ in range(_PASSES):
         used = weights

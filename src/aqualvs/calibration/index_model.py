@@ -100,7 +100,16 @@ class IndexModel:
 
     def jumped(self, state: IndexState, frame: Frame) -> IndexState:
         """Return the state after a jump of the index to where a frame has it."""
-        return state.stepped(self.nearest(state, frame), WIDE)
+        n = self.nearest(state, frame)
+        line = self.line(at_index(state, n, slopes_too=True), frame)
+        return self.settled(state, line, frame).stepped(n, WIDE)
+
+    def settled(self, state: IndexState, line: Line, frame: Frame) -> IndexState:
+        """Return a state whose corners' errors hold for the picture that `line` predicts."""
+        predicted = frame.pixels - line.residuals.reshape(-1, 2)
+        visible = np.isfinite(predicted[:, 0])
+        ids = frame.where(visible).ids
+        return state.with_corners_at(ids, predicted[visible], self.sigma_corner) if ids else state
 
     def line(self, state: IndexState, frame: Frame) -> Line:
         """Return the prediction of a frame near a state; residuals are NaN where none is seen.
@@ -144,7 +153,8 @@ class IndexModel:
                 change = self._slope_at(moved, state.n, frame) - reference
                 by_constant[i] = float(np.sum(change * reference)) / sigma
         variance = by_constant @ state.covariance[:size, :size] @ by_constant
-        return float(np.sqrt(max(variance, 0.0)) / max(np.sum(reference**2), BLIND**2))
+        power = max(float(np.sum(reference**2)), BLIND**2)
+        return float(np.sqrt(max(float(variance), 0.0))) / power
 
     def _slope_at(self, mean: FloatArray, n: float, frame: Frame) -> FloatArray:
         """Return the derivative (M, 2) of pixels by the index, all constants as in `mean`."""

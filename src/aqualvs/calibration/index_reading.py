@@ -183,7 +183,7 @@ class Knowledge:
     @property
     def observable(self) -> bool:
         """Whether the index rests on the pictures."""
-        if self.own is None or self.joint is None or self.moved:
+        if self.own is None or self.joint is None or self.moved or self.n_lost >= _LOST_FRAMES:
             return False
         if self.prior is None or self.contradicted:
             return self.own.sigma < self.options.largest_sigma
@@ -199,12 +199,12 @@ class Knowledge:
         if self.n_lost >= _LOST_FRAMES:
             found.append(
                 f"the target has not been where it should be for {self.n_lost} frames: it is "
-                "hidden or has moved"
+                "hidden or has moved, and the index is that from before"
             )
         return tuple(remark for remark in found if remark)
 
     def _about_sight(self) -> str:
-        if self.observable or self.own is None or self.moved:
+        if self.observable or self.own is None or self.moved or self.n_lost >= _LOST_FRAMES:
             return ""
         if self.sigma_frame > self.options.largest_sigma:
             return (

@@ -1,5 +1,6 @@
 """What an index estimate knows: the index and the constants of rig and target, jointly Gaussian."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,9 @@ POSE = slice(3, 9)
 FIRST_CAMERA = 9
 FAR = 0.02
 """Changes of the index from which on slopes are taken anew."""
+
+# Motion of the picture over which corners' errors stay the same, and up to which nobody asks.
+_SAME_PX, _STILL_PX = 0.4, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,8 @@ class IndexState:
         Of the index now if all constants were known: the part that more frames reduce.
     n_of_slopes : float
         Index for which derivatives are taken, see `IndexModel.line`.
+    seen_at : array, shape (K, 2)
+        Pixels of the corners at which their own errors hold; NaN where nothing holds yet.
     """
 
     time: float
@@ -42,6 +48,7 @@ class IndexState:
     ids: tuple[int, ...]
     random_variance: float
     n_of_slopes: float
+    seen_at: FloatArray
 
     @property
     def n(self) -> float:
@@ -104,8 +111,53 @@ class IndexState:
         covariance = np.zeros((size + more, size + more))
         covariance[:size, :size] = self.covariance
         covariance[size:, size:] = sigma_px**2 * np.eye(more)
-        mean = np.concatenate([self.mean, np.zeros(more)])
-        return replace(self, mean=mean, covariance=covariance, ids=self.ids + new)
+        return replace(
+            self,
+            mean=np.concatenate([self.mean, np.zeros(more)]),
+            covariance=covariance,
+            ids=self.ids + new,
+            seen_at=np.concatenate([self.seen_at, np.full((len(new), 2), np.nan)]),
+        )
+
+    def with_corners_at(
+        self, ids: tuple[int, ...], pixels: FloatArray, sigma_px: float
+    ) -> "IndexState":
+        """Return the state with corners' errors that hold where the corners are seen.
+
+        What a detector is off depends on where in its pixel a corner lies: where the picture has
+        moved by a good part of a pixel, fresh errors replace the old ones.
+
+        Parameters
+        ----------
+        ids : tuple of int
+            Corners of a picture, all known.
+        pixels : array, shape (M, 2)
+            Where they are predicted.
+        sigma_px : float
+            Standard deviation of the errors.
+        """
+        rows = [self.ids.index(i) for i in ids]
+        moved = pixels - self.seen_at[rows]
+        known = np.isfinite(moved[:, 0])
+        way = float(np.linalg.norm(np.median(moved[known], axis=0))) if np.any(known) else 0.0
+        state, seen_at = self, self.seen_at.copy()
+        if way > _STILL_PX:
+            kept = math.exp(-((way / _SAME_PX) ** 2))
+            state = self._with_corners_renewed(kept, sigma_px)
+            seen_at[:] = np.nan
+        fresh = ~np.isfinite(seen_at[rows, 0])
+        seen_at[np.array(rows)[fresh]] = pixels[fresh]
+        return replace(state, seen_at=seen_at)
+
+    def _with_corners_renewed(self, kept: float, sigma_px: float) -> "IndexState":
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        first = len(mean) - 2 * len(self.ids)
+        mean[first:] *= kept
+        covariance[first:] *= kept
+        covariance[:, first:] *= kept
+        rows = np.arange(first, len(mean))
+        covariance[rows, rows] += (1.0 - kept**2) * sigma_px**2
+        return replace(self, mean=mean, covariance=covariance)
 
     def given_anchor(self, n: float, sigma: float) -> "IndexState":
         """Return the state if the anchor is known to be `n` within `sigma` (a Kalman update)."""
@@ -148,4 +200,4 @@ def first_state(
     covariance[:N_INDICES, :N_INDICES] = sigma**2
     covariance[POSE, POSE] = np.diag(np.asarray(pose_sigmas) ** 2)
     covariance[FIRST_CAMERA:, FIRST_CAMERA:] = camera
-    return IndexState(time, mean, covariance, (), sigma**2, n)
+    return IndexState(time, mean, covariance, (), sigma**2, n, np.zeros((0, 2)))

@@ -11,8 +11,8 @@ import numpy as np
 _ALLOWANCE = 0.5
 # False alarms of independent normal surprises are exp(2 * 0.5 * 21) frames apart: years at 25 fps.
 _LIMIT = 20.0
-# No single frame counts more, so that one wrong picture never rings; six in a row do.
-_LARGEST = 4.0
+# No single frame counts more, so that one wrong picture never rings; four in a row do.
+_LARGEST = 7.0
 # Compression repeats its errors over a group of pictures: what frames say is correlated that long.
 _BLOCK = 12
 _MEMORY = 40

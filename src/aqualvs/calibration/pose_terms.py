@@ -50,32 +50,35 @@ class SquareBoard:
     ----------
     square : array, shape (3, 3)
         `dome_from_target` rotation of a board without tilt.
-    sigma : float
+    lean_sigma, roll_sigma : float
         How square boards are that were set up well, in radians about each axis; boards far beyond
         it count little (Cauchy), so that the square majority decides. How a board leans (about x
         and z) and how it is rolled (about y) are judged apart: a rail keeps the roll of all.
     """
 
     square: FloatArray
-    sigma: float
+    lean_sigma: float
+    roll_sigma: float
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
         """Return the leaning of the board (about x and z), and its roll (about y)."""
         del centre
         off_square = dome_from_target.rotation @ self.square.T
-        tilt = tilt_of(off_square)[None, None, :] / self.sigma
-        by_turn = 0.5 * (np.trace(off_square) * np.eye(3) - off_square) / self.sigma
-        leaning, roll = [0, 2], [1]
+        tilt = tilt_of(off_square)
+        by_turn = 0.5 * (np.trace(off_square) * np.eye(3) - off_square)
         return [
             Block(
                 group,
                 columns[:3],
-                tilt[:, 0, axes],
-                by_turn[None, axes, :],
+                tilt[None, axes] / sigma,
+                by_turn[None, axes, :] / sigma,
                 Loss.CAUCHY,
                 False,
             )
-            for group, axes in ((TILTS, leaning), (ROLLS, roll))
+            for group, axes, sigma in (
+                (TILTS, [0, 2], self.lean_sigma),
+                (ROLLS, [1], self.roll_sigma),
+            )
         ]
 
 
