@@ -192,10 +192,10 @@ class IndexEstimator:
         self._last_time = frame.time
         noise = self._noise * self._test.inflation
         seen = compare(self._model, state, frame, noise)
+        # Corners that fit one by one may still be those of a plate that has moved a little.
+        self._n_lost = 0 if seen.fits and seen.misfit < _MISFIT else self._n_lost + 1
         if not seen.fits:
-            self._n_lost += 1
             return self._reading(frame.time, name, _not_there(seen))
-        self._n_lost = 0
         self._recent.append((last, seen))
         surprise = seen.shift / seen.sigma
         began = self._test.add(surprise)

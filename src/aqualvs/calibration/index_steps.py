@@ -15,7 +15,7 @@ _LIMIT = 20.0
 _LARGEST = 7.0
 # Compression repeats its errors over a group of pictures: what frames say is correlated that long.
 _BLOCK = 12
-_MEMORY = 40
+_MEMORY = 100
 
 
 @dataclass(slots=True)
