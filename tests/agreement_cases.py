@@ -78,6 +78,7 @@ class Diver:
             width=np.full(n, 5.0),
             quality=np.ones(n),
             label=np.zeros(n, np.uint8),
+            used=np.ones(n, np.bool_),
         )
         fit = fit_robust(
             points,

@@ -93,7 +93,7 @@ def points_table(dive: Dive, n: int) -> pa.Table:
                 [dive.range_m[i], float(str(laser["offset_mm"])) / 1e3, 0.0],
             )
             for step in np.linspace(-0.2, 0.2, 30):
-                rows.append((i, index, start + step * along, "target"))
+                rows.append((i, index, start + step * along, "net"))
             rows.append((i, index, start * 0.7, "clutter"))
     xyz = np.array([row[2] for row in rows])
     frame = np.array([row[0] for row in rows])
@@ -111,6 +111,7 @@ def points_table(dive: Dive, n: int) -> pa.Table:
             "sigma_m": np.full(len(rows), 1e-3),
             "quality": np.full(len(rows), 0.8),
             "label": pa.array([row[3] for row in rows]).dictionary_encode(),
+            "used": [row[3] == "net" for row in rows],
         }
     )
 

@@ -130,6 +130,7 @@ def scan(index=0, n=60, *, time_s=None, reason=None, seed=0):
         width=rng.uniform(1, 5, n),
         quality=rng.uniform(0, 1, n),
         label=rng.integers(0, 5, n).astype(np.uint8),
+        used=rng.random(n) < 0.5,
     )
     return Scan(index, index / 25 if time_s is None else time_s, posture, points, 1.3333)
 

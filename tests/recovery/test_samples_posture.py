@@ -13,7 +13,6 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.live.sources import open_source
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner
-from aqualvs.scanning.scan import Label
 from aqualvs.scanning.triangulate import Triangulator
 
 pytestmark = pytest.mark.samples
@@ -168,8 +167,7 @@ def test_leaving_the_dome_out_costs_tens_of_percent_of_a_point(samples: Path, ri
     with open_source(samples / "lab-paper" / "dives" / "wall_range.mp4") as source:
         frames = list(source)
     points = Scanner(rig).process(frames[-1]).points
-    on_target = points.label == Label.TARGET
-    lower = on_target & (points.laser == 0)
+    lower = points.used & (points.laser == 0)
     assert np.count_nonzero(lower) > 200
     pixels, laser = points.pixels[lower], points.laser[lower].astype(np.int64)
     along_x = np.zeros(len(pixels), np.bool_)

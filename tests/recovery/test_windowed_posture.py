@@ -15,7 +15,7 @@ from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario
@@ -56,7 +56,7 @@ def errors(posture: Posture, truth: Plane) -> tuple[float, float]:
 
 def off_target(scan: Scan, truth: Plane) -> float:
     """Root mean square distance of what was believed from the truth, in metres."""
-    believed = scan.points.label == Label.TARGET
+    believed = scan.points.used
     off = truth.signed_distance(scan.points.points_in_dome[believed])
     return float(np.sqrt(np.mean(off**2)))
 

@@ -8,6 +8,8 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.labels import label_readings
+from aqualvs.scanning.measure import Measurement
+from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.search import SearchAxis, plan_searches
@@ -18,6 +20,9 @@ from aqualvs.simulation.example_rigs import example_rig
 from scanning_cases import Lit, behind_strands, everywhere, returns_of, strands
 
 NET = Plane.from_normal([-0.1, 1.0, 0.05], 0.45)
+NONE = Refusal(Reason.COLLINEAR)
+RANGE = (0.3, 1.0)
+SHORT = (0.3, 0.46)
 WALL = Plane.from_normal([0.07, 1.0, 0.0], 0.8)
 
 
@@ -43,7 +48,7 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
         offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
         target = surfaces[int(np.argmin(offsets))]
         in_posture = target.members[index]
-    points = label_readings(readings, index, surfaces, target, in_posture)
+    points = label_readings(readings, index, surfaces, target, Measurement(NONE, in_posture), RANGE)
     return Labelled(returns, readings, index, surfaces, points)
 
 
@@ -67,7 +72,7 @@ def times_seen(points: ScanPoints) -> IntArray:
 def test_light_on_the_target_is_labelled_once_with_its_laser() -> None:
     found = label([(WALL, everywhere)], WALL)
     points = found.points
-    on_target = points.label == Label.TARGET
+    on_target = points.used
     assert np.all(times_seen(points)[on_target] == 1)
     off = np.abs(WALL.signed_distance(points.points_in_dome[on_target]))
     assert np.percentile(off, 99) < 0.005
@@ -87,47 +92,72 @@ def test_no_return_is_lost() -> None:
     assert missing < 0.02 * len(all_pixels(found.returns))
 
 
-def test_the_wall_behind_is_another_surface() -> None:
+def test_the_wall_behind_the_net_is_background() -> None:
     found = label([(NET, strands), (WALL, behind_strands)], NET)
     points = found.points
     on_wall = np.abs(WALL.signed_distance(points.points_in_dome)) < 0.004
     on_net = np.abs(NET.signed_distance(points.points_in_dome)) < 0.003
-    assert np.mean(points.label[on_net & ~on_wall] == Label.TARGET) > 0.9
-    assert np.mean(points.label[on_wall & ~on_net] == Label.OTHER_SURFACE) > 0.9
+    assert np.mean(points.label[on_net & ~on_wall] == Label.NET) > 0.98
+    assert np.mean(points.label[on_wall & ~on_net] == Label.BACKGROUND) > 0.9
 
 
-def test_without_a_target_nothing_is_target() -> None:
+def test_a_net_before_the_wall_that_is_the_target_stays_a_net() -> None:
+    points = label([(NET, strands), (WALL, behind_strands)], WALL).points
+    on_wall = np.abs(WALL.signed_distance(points.points_in_dome)) < 0.004
+    on_net = np.abs(NET.signed_distance(points.points_in_dome)) < 0.003
+    assert np.mean(points.label[on_net & ~on_wall] == Label.NET) > 0.9
+    assert np.mean(points.label[on_wall & ~on_net] == Label.SOLID) > 0.9
+
+
+def test_without_a_target_nothing_is_used() -> None:
     found = label([(WALL, everywhere)], None)
     assert len(found.surfaces) >= 1
-    assert not np.any(found.points.label == Label.TARGET)
-    assert np.mean(found.points.label == Label.OTHER_SURFACE) > 0.9
+    assert not np.any(found.points.used)
+    assert np.mean(found.points.label == Label.SOLID) > 0.9
 
 
-def test_what_the_posture_left_out_of_its_target_is_ambiguous() -> None:
+def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
     found = label([(WALL, everywhere)], WALL)
     target = found.surfaces[0]
     on_it = target.members[found.index]
     left_out = on_it & (found.readings.pixels[:, 1] < 200.0)
-    points = label_readings(found.readings, found.index, found.surfaces, target, on_it & ~left_out)
+    points = label_readings(
+        found.readings,
+        found.index,
+        found.surfaces,
+        target,
+        Measurement(NONE, on_it & ~left_out),
+        RANGE,
+    )
     assert np.count_nonzero(left_out) > 50
-    ambiguous = points.label == Label.AMBIGUOUS
-    assert np.count_nonzero(ambiguous) >= np.count_nonzero(left_out)
-    assert not np.any((points.label == Label.TARGET) & (points.pixels[:, 1] < 200.0))
+    assert np.count_nonzero((points.label == Label.SOLID) & ~points.used) >= np.count_nonzero(
+        left_out
+    )
+    assert not np.any(points.used & (points.pixels[:, 1] < 200.0))
 
 
-def test_light_that_nothing_explains_is_clutter_or_ambiguous() -> None:
-    found = label([(NET, strands), (WALL, behind_strands)], None)
+def test_short_pieces_that_nothing_explains_are_clutter_or_ambiguous() -> None:
+    found = label([(NET, strands)], None)
     points = label_readings(
         found.readings,
         found.index,
         [],
         None,
-        np.zeros(len(found.readings), np.bool_),
+        Measurement(NONE, np.zeros(len(found.readings), np.bool_)),
+        SHORT,
     )
     assert len(points) == len(found.readings)
     several = times_seen(points) > 1
     assert np.all(points.label[several] == Label.AMBIGUOUS)
-    assert np.all(points.label[~several] == Label.CLUTTER)
+    distance = np.linalg.norm(points.points_in_dome, axis=1)
+    outside = distance > SHORT[1]
+    far = points.label == Label.OUT_OF_RANGE
+    assert far.any()
+    assert np.all(outside[far])
+    assert not np.any(outside & (points.label == Label.CLUTTER))
+    # One laser runs along a lit band: long and straight, as on something solid.
+    assert np.all(np.isin(points.label[~several & ~far], (Label.CLUTTER, Label.SOLID)))
+    assert np.mean(points.label[~several & ~far] == Label.CLUTTER) > 0.4
     assert several.any()
     assert (~several).any()
 

@@ -3,6 +3,7 @@
 import csv
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,8 @@ from shell_cases import scan
 
 HEADER = (
     "frame,time_s,valid,reason,range_m,pitch_deg,yaw_deg,sigma_range_m,sigma_pitch_deg,"
-    "sigma_yaw_deg,slant_range_m,nearest_m,n_points,n_water"
+    "sigma_yaw_deg,slant_range_m,nearest_m,n_points,n_water,"
+    "curvature_x_per_m,curvature_z_per_m,sigma_curvature_x_per_m,sigma_curvature_z_per_m"
 )
 
 
@@ -69,14 +71,23 @@ def test_a_posture_row_holds_the_posture_in_file_units():
         "n_points": 60,
         "n_water": 1.3333,
     }
+    assert not any(cells[name] for name in HEADER.split(",")[-4:])
     found = {name: float(cells[name]) for name in expected}
     # The file keeps a micrometre, a hundred-thousandth of a degree, four digits of a sigma.
     assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
 
+def test_a_curved_net_has_its_curvature_in_the_last_columns():
+    flat = scan(3)
+    bent = replace(flat.posture, curvature=(0.5, -0.25), sigma_curvature=(0.02, 0.0345678))
+    cells = posture_row(replace(flat, posture=bent)).strip().split(",")
+    assert cells[-4:] == ["0.5", "-0.25", "0.02", "0.03457"]
+    assert cells[:-4] == posture_row(flat).strip().split(",")[:-4]
+
+
 def test_a_refused_frame_has_its_reason_and_no_numbers():
     row = posture_row(scan(7, reason=Reason.ONE_LASER))
-    assert row == "7,0.280000,0,one_laser" + "," * 10 + "\n"
+    assert row == "7,0.280000,0,one_laser" + "," * 14 + "\n"
     assert row.count(",") == HEADER.count(",")
 
 
@@ -140,7 +151,7 @@ def test_points_become_columns_of_the_schema():
     assert batch.schema == POINTS_SCHEMA
     assert [field.name for field in POINTS_SCHEMA] == [
         *("frame", "time_s", "laser", "u_px", "v_px", "x_m", "y_m", "z_m"),
-        *("sigma_m", "quality", "label"),
+        *("sigma_m", "quality", "label", "used"),
     ]
     table = batch.to_pydict()
     assert table["frame"] == [5] * 40
@@ -151,6 +162,7 @@ def test_points_become_columns_of_the_schema():
     points = np.stack([table["x_m"], table["y_m"], table["z_m"]], -1)
     np.testing.assert_array_equal(points, made.points.points_in_dome.astype(np.float32))
     assert table["label"] == [Label(i).name.lower() for i in made.points.label]
+    assert table["used"] == made.points.used.tolist()
     np.testing.assert_array_equal(table["sigma_m"], made.points.sigma.astype(np.float32))
     np.testing.assert_array_equal(table["quality"], made.points.quality.astype(np.float32))
 
@@ -219,7 +231,7 @@ def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch)
     assert file.read().equals(expected)
 
     vertices = read_ply(tmp_path / "p.ply")
-    target = np.concatenate([s.points.label == Label.TARGET for s in scans])
+    target = np.concatenate([s.points.used for s in scans])
     points = np.concatenate([s.points.points_in_dome for s in scans])[target]
     found = np.stack([vertices[axis] for axis in "xyz"], -1)
     np.testing.assert_array_equal(found, points.astype(np.float32))

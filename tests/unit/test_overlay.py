@@ -16,7 +16,7 @@ GREY = np.full((240, 320, 3), 90, np.uint8)
 REFUSAL = Refusal(Reason.ONE_LASER)
 
 
-def scan_points(pixels: FloatArray, laser: list[int], label: list[Label]) -> ScanPoints:
+def scan_points(pixels: FloatArray, laser: list[int], used: list[bool]) -> ScanPoints:
     n = len(pixels)
     one = np.ones(n)
     return ScanPoints(
@@ -27,7 +27,8 @@ def scan_points(pixels: FloatArray, laser: list[int], label: list[Label]) -> Sca
         intensity=one,
         width=one,
         quality=one,
-        label=np.array(label, np.uint8),
+        label=np.full(n, Label.NET, np.uint8),
+        used=np.array(used),
     )
 
 
@@ -47,8 +48,8 @@ def a_posture() -> Posture:
 
 def test_target_points_take_the_colour_of_their_laser_and_rejected_ones_are_faint() -> None:
     pixels = np.array([[100.0, 120.0], [200.0, 120.0], [150.0, 60.0]])
-    points = scan_points(pixels, [0, 1, 0], [Label.TARGET, Label.TARGET, Label.CLUTTER])
-    drawn = draw_points(GREY, points.laser, points.pixels, points.label)
+    points = scan_points(pixels, [0, 1, 0], [True, True, False])
+    drawn = draw_points(GREY, points.laser, points.pixels, points.used)
     first, second = bgr(LASER_COLOURS[0]), bgr(LASER_COLOURS[1])
     assert tuple(drawn[120, 100]) == first
     assert tuple(drawn[120, 200]) == second
@@ -61,7 +62,7 @@ def test_target_points_take_the_colour_of_their_laser_and_rejected_ones_are_fain
 
 def test_points_outside_or_not_finite_are_left_out() -> None:
     pixels = np.array([[-50.0, 10.0], [np.nan, 5.0], [1e12, 5.0], [319.0, 239.0]])
-    drawn = draw_points(GREY, np.zeros(4, np.int8), pixels, np.full(4, int(Label.TARGET), np.uint8))
+    drawn = draw_points(GREY, np.zeros(4, np.int8), pixels, np.ones(4, np.bool_))
     changed = np.argwhere((drawn != 90).any(axis=-1))
     assert len(changed)
     assert changed.min(axis=0).tolist() == [238, 318]

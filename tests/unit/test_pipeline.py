@@ -152,10 +152,11 @@ def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> Non
     found = scan(both)
     on_wall = np.abs(wall.signed_distance(found.points.points_in_dome)) < 0.004
     on_net = np.abs(net.signed_distance(found.points.points_in_dome)) < 0.003
-    assert np.mean(found.points.label[on_wall & ~on_net] == Label.OTHER_SURFACE) > 0.85
-    assert not np.any(found.points.label[on_wall & ~on_net] == Label.TARGET)
-    # Fragments of strands and crossings are left out.
-    assert np.mean(found.points.label[on_net & ~on_wall] == Label.TARGET) > 0.3
+    assert np.mean(found.points.label[on_wall & ~on_net] == Label.BACKGROUND) > 0.85
+    assert not np.any(found.points.used[on_wall & ~on_net])
+    assert np.mean(found.points.label[on_net & ~on_wall] == Label.NET) > 0.98
+    # Fragments of strands and crossings are left out of the posture.
+    assert np.mean(found.points.used[on_net & ~on_wall]) > 0.3
 
 
 @pytest.mark.parametrize(
@@ -163,7 +164,7 @@ def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> Non
     [(example_rig(), 0.5), (windowed(example_rig()), 0.5), (windowed(example_rig()), 0.9)],
     ids=["planes", "bent", "bent, far"],
 )
-def test_crossings_are_ambiguous_and_the_rest_is_target(rig: Rig, distance: float) -> None:
+def test_crossings_are_on_the_target_but_not_in_the_posture(rig: Rig, distance: float) -> None:
     target = plane(distance, 3.0, -4.0)
     points = scan([(target, everywhere)], rig=rig).points
     near = np.zeros(len(points), np.bool_)
@@ -172,11 +173,11 @@ def test_crossings_are_ambiguous_and_the_rest_is_target(rig: Rig, distance: floa
         near |= (points.laser != i) & (off * 878.0 / distance < SIGMA_PX)
     on_it = np.abs(target.signed_distance(points.points_in_dome)) < 0.003
     assert np.count_nonzero(near & on_it) > 3
-    assert np.all(points.label[near & on_it] == Label.AMBIGUOUS)
-    clear = points.label[on_it & ~near]
+    assert not np.any(points.used[near & on_it])
+    clear = on_it & ~near
     # Crossing zones are wider than what is counted as near here; bent stripes cross more flatly.
-    assert np.mean(clear == Label.TARGET) > 0.88
-    assert np.mean((clear == Label.TARGET) | (clear == Label.AMBIGUOUS)) > 0.98
+    assert np.mean(points.used[clear]) > 0.88
+    assert np.mean(points.label[on_it] == Label.SOLID) > 0.98
 
 
 def test_every_point_has_its_pixel_laser_and_label() -> None:
@@ -186,7 +187,7 @@ def test_every_point_has_its_pixel_laser_and_label() -> None:
     assert valid.all()
     np.testing.assert_allclose(pixels, points.pixels, rtol=0.0, atol=1e-6)
     assert set(np.unique(points.label)) <= {int(one) for one in Label}
-    target = points.label == Label.TARGET
+    target = points.used
     _, counts = np.unique(points.pixels[target], axis=0, return_counts=True)
     assert counts.max() == 1
 
@@ -273,7 +274,7 @@ def test_a_wall_where_a_net_was_asked_for() -> None:
     found = scan([(plane(0.5), everywhere)], options=ScannerOptions(target=TargetKind.NET))
     assert reason(found.posture) is Reason.NO_TARGET
     assert found.posture == Refusal(Reason.NO_TARGET, "surfaces in view, but none of kind net")
-    assert np.mean(found.points.label == Label.OTHER_SURFACE) > 0.9
+    assert np.mean(found.points.label == Label.SOLID) > 0.9
 
 
 @pytest.mark.parametrize("distance", [0.27, 1.1])
@@ -282,7 +283,7 @@ def test_a_wall_out_of_range(distance: float) -> None:
     assert reason(found.posture) is Reason.OUT_OF_RANGE
     assert isinstance(found.posture, Refusal)
     assert f"range {distance:.2f}" in found.posture.detail
-    assert not np.any(found.points.label == Label.TARGET)
+    assert not np.any(found.points.used)
 
 
 def test_frames_do_not_depend_on_each_other() -> None:

@@ -135,13 +135,13 @@ def test_laser_plane_view_is_the_papers_frame(dive: Dive, page: str) -> None:
     normal = np.array(LASERS[0]["normal"]) / np.linalg.norm(LASERS[0]["normal"])
     assert np.cross(e_y, normal) == pytest.approx(e_x, abs=1e-6)
     assert e_y @ [0.0, 1.0, 0.0] > 0.0
-    assert laser["label"].count(Label.TARGET) == 30
+    assert laser["label"].count(Label.NET) == sum(laser["used"]) == 30
     # Points and basis lead back to the laser's plane, and the dotted line runs through the target.
     a, b, c = laser["line"]
     for x, y, label in zip(laser["x"], laser["y"], laser["label"], strict=True):
         point = np.array(basis["origin"]) + x * e_x + y * e_y
         assert normal @ point == pytest.approx(-143.0, abs=0.2)
-        if label == Label.TARGET:
+        if label == Label.NET:
             # Coordinates are rounded to 0.1 mm.
             assert a * x + b * y == pytest.approx(c, abs=0.15)
 
@@ -464,9 +464,17 @@ def test_page_of_a_long_dive_stays_small(tmp_path: Path) -> None:
     columns = {name: rng.normal(size=count).astype(np.float32) for name in ("u_px", "v_px")}
     columns |= {name: rng.normal(size=count).astype(np.float32) for name in ("x_m", "y_m", "z_m")}
     laser = (np.arange(count) % 3).astype(np.int8)
-    label = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["target"])
+    label = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["net"])
     parquet.write_table(
-        pa.table({"frame": frame, "laser": laser, **columns, "label": label}),
+        pa.table(
+            {
+                "frame": frame,
+                "laser": laser,
+                **columns,
+                "label": label,
+                "used": np.ones(count, np.bool_),
+            }
+        ),
         tmp_path / "points.parquet",
     )
     page = write_report(tmp_path)

@@ -199,6 +199,7 @@ def surface(offset: float, support: float, is_mesh: bool, extent: float = 300.0)
         members=np.ones(4, np.bool_),
         n_lines=int(support),
         support=support,
+        voice=support,
         extent=extent,
         is_mesh=is_mesh,
     )

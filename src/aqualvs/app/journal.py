@@ -26,9 +26,13 @@ POINTS_SCHEMA = pa.schema(
         *((name, pa.float32()) for name in ("u_px", "v_px", "x_m", "y_m", "z_m")),
         *((name, pa.float32()) for name in ("sigma_m", "quality")),
         ("label", pa.dictionary(pa.int8(), pa.string())),
+        ("used", pa.bool_()),
     ]
 )
-"""Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`."""
+"""Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`.
+
+`label` says what a point lies on (`Label`), `used` whether it entered the posture.
+"""
 
 _LABEL_NAMES = pa.array(LABELS, pa.string())
 
@@ -111,7 +115,7 @@ def points_batch(scan: Scan) -> Any:
     head = (np.full(n, scan.index, np.int32), np.full(n, scan.time_s), points.laser)
     label = pa.array(np.ascontiguousarray(points.label).view(np.int8))
     names = pa.DictionaryArray.from_arrays(label, _LABEL_NAMES, safe=False)
-    arrays = [*(pa.array(column) for column in (*head, *numbers)), names]
+    arrays = [*(pa.array(column) for column in (*head, *numbers)), names, pa.array(points.used)]
     return pa.RecordBatch.from_arrays(arrays, schema=POINTS_SCHEMA)
 
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from aqualvs.app.report_words import bgr, laser_colour, reason_words
 from aqualvs.errors import OutputError
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture, Refusal
-from aqualvs.scanning.scan import ImagePlane, Label, ScanPoints
+from aqualvs.scanning.scan import ImagePlane, ScanPoints
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _WHITE = (255, 255, 255)
@@ -48,7 +48,7 @@ def draw_overlay(
     image : uint8 array, shape (height, width, 3)
         A new picture, BGR.
     """
-    drawn = draw_points(image, points.laser, points.pixels, points.label)
+    drawn = draw_points(image, points.laser, points.pixels, points.used)
     draw_caption(drawn, posture_lines(posture), warn=not posture)
     draw_legend(drawn, [laser.name for laser in rig.lasers])
     return drawn
@@ -58,7 +58,7 @@ def draw_points(
     image: ImagePlane,
     laser: NDArray[np.integer],
     pixels: FloatArray,
-    label: NDArray[np.integer],
+    used: BoolArray,
 ) -> ImagePlane:
     """Return a copy of a BGR picture with stripe points drawn into it.
 
@@ -68,18 +68,17 @@ def draw_points(
     laser : integer array, shape (N,)
     pixels : array, shape (N, 2)
         Points outside of the picture, or not finite, are left out.
-    label : integer array, shape (N,)
-        `Label` values.
+    used : bool array, shape (N,)
+        Points that entered the posture: dots; others are faint crosses.
     """
     drawn = np.array(image, dtype=np.uint8)
     scale = _mark_scale(drawn)
     finite = np.isfinite(pixels).all(axis=1)
-    target = label == Label.TARGET
     for index in np.unique(laser):
         colour = np.array(bgr(laser_colour(int(index))), dtype=np.float64)
         mine = finite & (laser == index)
-        _stamp(drawn, pixels[mine & ~target], _grown(_CROSS, scale), colour, _FAINT)
-        _stamp(drawn, pixels[mine & target], _grown(_DOT, scale), colour, 1.0)
+        _stamp(drawn, pixels[mine & ~used], _grown(_CROSS, scale), colour, _FAINT)
+        _stamp(drawn, pixels[mine & used], _grown(_DOT, scale), colour, 1.0)
     return drawn
 
 

@@ -10,12 +10,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import parquet
 
-from aqualvs.app.journal import LABELS, POINTS_SCHEMA, read_journal
+from aqualvs.app.journal import POINTS_SCHEMA, read_journal
 from aqualvs.app.report_words import bgr, laser_colour
-from aqualvs.scanning.scan import Label
 
 _ROWS_PER_GROUP = 1 << 17
-_TARGET = LABELS[Label.TARGET]
 _N_LASERS = 128
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -23,7 +21,7 @@ _VERTEX = np.dtype(
 
 
 def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
-    """Write the points of a journal as Parquet, and those on the target as PLY.
+    """Write the points of a journal as Parquet, and those that entered a posture as PLY.
 
     Both files appear whole or not at all; memory does not grow with the journal.
 
@@ -90,10 +88,8 @@ def _row_groups(batches: Iterable[Any]) -> Iterator[Any]:
 
 
 def _vertices(table: Any) -> NDArray[np.void]:
-    """Return the target points of a table as PLY vertices."""
-    label = table["label"].combine_chunks()
-    names = label.dictionary.to_pylist()
-    target = label.indices.to_numpy() == names.index(_TARGET)
+    """Return the points of a table that entered a posture, as PLY vertices."""
+    target = table["used"].to_numpy()
     vertices = np.empty(np.count_nonzero(target), _VERTEX)
     for axis in "xyz":
         vertices[axis] = table[f"{axis}_m"].to_numpy()[target]

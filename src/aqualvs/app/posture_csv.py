@@ -26,7 +26,12 @@ POSTURE_COLUMNS = (
     "nearest_m",
     "n_points",
     "n_water",
+    "curvature_x_per_m",
+    "curvature_z_per_m",
+    "sigma_curvature_x_per_m",
+    "sigma_curvature_z_per_m",
 )
+"""The last four are empty unless the target is a curved net: horizontal and vertical."""
 _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 
 
@@ -83,7 +88,13 @@ def posture_row(scan: Scan) -> str:
     posture = scan.posture
     if not isinstance(posture, Posture):
         return f"{head},0,{posture.reason.value},{',' * (_N_NUMBERS - 1)}\n"
-    return f"{head},1,,{_numbers(posture)},{scan.n_water:.6f}\n"
+    return f"{head},1,,{_numbers(posture)},{scan.n_water:.6f},{_curvature(posture)}\n"
+
+
+def _curvature(posture: Posture) -> str:
+    if posture.curvature is None or posture.sigma_curvature is None:
+        return ",,,"
+    return ",".join(f"{value:.4g}" for value in (*posture.curvature, *posture.sigma_curvature))
 
 
 def _numbers(posture: Posture) -> str:

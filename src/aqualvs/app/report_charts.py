@@ -43,7 +43,10 @@ _QUANTITIES = (
     ("pitch", "°", 1.0, 3, 0.5),
     ("yaw", "°", 1.0, 3, 0.5),
 )
-_SYMBOLS = ("circle", "square", "x", "diamond", "circle-open")
+_SYMBOLS = (
+    *("circle", "square", "triangle-up", "star", "square-open", "x"),
+    *("diamond", "circle-open"),
+)
 
 Json = dict[str, Any]
 
@@ -239,7 +242,7 @@ def _plane_frame(points: PointSummary, track: Track, row: int, lasers: list[Lase
 def _in_plane(points: FramePoints | None, index: int, laser: LaserFacts) -> Json:
     """Return a frame's points on one laser as x, y in its plane (mm) with their labels."""
     if points is None or not laser.known:
-        return {"x": [], "y": [], "label": []}
+        return {"x": [], "y": [], "label": [], "used": []}
     mine = np.flatnonzero(points.laser == index)
     mine = mine[:: max(1, -(-len(mine) // _PER_LASER))]
     origin, e_x, e_y = laser.frame()
@@ -248,6 +251,7 @@ def _in_plane(points: FramePoints | None, index: int, laser: LaserFacts) -> Json
         "x": rounded(1e3 * local @ e_x, 1),
         "y": rounded(1e3 * local @ e_y, 1),
         "label": points.label[mine].tolist(),
+        "used": points.used[mine].astype(int).tolist(),
     }
 
 

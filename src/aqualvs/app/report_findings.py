@@ -178,9 +178,10 @@ def _precision_warnings(track: Track) -> Iterator[str]:
 
 
 def _laser_warnings(points: PointSummary, names: list[str]) -> Iterator[str]:
-    total = points.labels[:, 0].sum()
+    used = points.on_target.sum(axis=0)
+    total = used.sum()
     for index, name in enumerate(names):
-        share = points.labels[index, 0] / total if total else 0.0
+        share = used[index] / total if total else 0.0
         if total and share < 0.3 / len(names):
             yield f"Laser “{name}” gave only {100 * share:.1f} % of the target points."
 

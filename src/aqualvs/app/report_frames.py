@@ -19,7 +19,7 @@ from aqualvs.app.report_series import stretches
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.live.sources.images import IMAGE_SUFFIXES, images_in
 from aqualvs.scanning.posture import Reason
-from aqualvs.scanning.scan import ImagePlane, Label
+from aqualvs.scanning.scan import ImagePlane
 
 N_PICTURES = 6
 N_SAMPLES = 24
@@ -106,7 +106,7 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
         )
     if points is not None:
         pixels = (points.pixels + 0.5) * scale - 0.5
-        small = draw_points(small, points.laser, pixels, points.label)
+        small = draw_points(small, points.laser, pixels, points.used)
     _, jpeg = cv2.imencode(".jpg", small, _JPEG)
     text = base64.b64encode(jpeg.tobytes()).decode("ascii")
     return Picture(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
@@ -116,7 +116,7 @@ def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:
     """Return the share of target points on a pixel with a channel at 250 or above."""
     if points is None:
         return float("nan")
-    pixels = points.pixels[(points.label == Label.TARGET) & np.isfinite(points.pixels).all(axis=1)]
+    pixels = points.pixels[points.used & np.isfinite(points.pixels).all(axis=1)]
     columns, rows = np.round(pixels).astype(np.int64).T
     inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
     if not inside.any():

@@ -19,7 +19,7 @@ from aqualvs.app.report_words import LABEL_COLOURS, LABEL_WORDS, clock, laser_co
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.scan import Label
 
-_MARKS = ("●", "■", "✕", "◆", "○")
+_MARKS = ("●", "■", "▲", "★", "□", "✕", "◆", "○")
 
 
 def asset(name: str) -> str:
@@ -166,7 +166,7 @@ def cloud_view(points: PointSummary | None, planes_known: bool) -> str:
     """Return the place of the cloud, or why there is none."""
     if points is None or not len(points.cloud_in_dome):
         return '<p class="note">The run left no points on the target.</p>'
-    total = int(points.labels[:, Label.TARGET].sum())
+    total = int(points.on_target.sum())
     shown = len(points.cloud_in_dome)
     amount = f"All {total:,}" if shown == total else f"A random {shown:,} of {total:,}"
     buttons = ""
@@ -321,9 +321,11 @@ def _image(picture: Picture | None, missing: str, heading: str) -> str:
 
 
 def _laser_counts(points: PointSummary, names: list[str]) -> str:
-    head = ("laser", *(LABEL_WORDS[label] for label in Label))
+    head = ("laser", "in the posture", *(LABEL_WORDS[label] for label in Label))
+    used = points.on_target.sum(axis=0)
+    counts = np.column_stack([used, points.labels])
     rows = [
-        (Raw(swatch(index) + escape(name)), *(f"{count:,}" for count in points.labels[index]))
+        (Raw(swatch(index) + escape(name)), *(f"{count:,}" for count in counts[index]))
         for index, name in enumerate(names)
     ]
     return table(head, rows)

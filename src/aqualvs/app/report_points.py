@@ -12,13 +12,13 @@ from pyarrow import parquet
 
 from aqualvs.app.journal import read_journal
 from aqualvs.app.report_run import Track
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.scanning.scan import Label
 
 _BATCH = 1 << 16
 _CLOUD = 15_000
 _LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
-_NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label")
+_NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label", "used")
 _OPTIONAL = ("quality",)
 MAX_LASERS = 16
 
@@ -33,6 +33,8 @@ class FramePoints:
     Attributes
     ----------
     laser, label : integer array, shape (M,)
+    used : bool array, shape (M,)
+        Points that entered the posture: the target points.
     pixels : array, shape (M, 2)
     points_in_dome : array, shape (M, 3)
         Metres.
@@ -40,6 +42,7 @@ class FramePoints:
 
     laser: IntArray
     label: IntArray
+    used: BoolArray
     pixels: FloatArray
     points_in_dome: FloatArray
 
@@ -51,7 +54,7 @@ class PointSummary:
     Attributes
     ----------
     on_target : int array, shape (n_frames, MAX_LASERS)
-        Target points per frame and laser.
+        Points that entered the posture, per frame and laser: the target points.
     labels : int array, shape (MAX_LASERS, len(Label))
         Points per laser and label over the dive.
     squares_mm2, n_squares : array, shape (n_frames,)
@@ -199,7 +202,7 @@ def _add(
     points = np.stack([batch["x_m"], batch["y_m"], batch["z_m"]], axis=-1).astype(np.float64)
     np.add.at(summary.labels, (laser, label), 1)
     _keep_samples(summary, batch, laser, label, points, sample_frames)
-    target = (label == Label.TARGET) & np.isfinite(points).all(axis=1)
+    target = batch["used"] & np.isfinite(points).all(axis=1)
     np.add.at(summary.on_target, (row[target], laser[target]), 1)
     if "quality" in batch:
         quality = batch["quality"][target].astype(np.float64)
@@ -220,7 +223,7 @@ def _keep_samples(
     for frame in np.intersect1d(batch["frame"], sample_frames).tolist():
         mine = batch["frame"] == frame
         pixels = np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64)
-        new = FramePoints(laser[mine], label[mine], pixels, points[mine])
+        new = FramePoints(laser[mine], label[mine], batch["used"][mine], pixels, points[mine])
         old = summary.samples.get(frame)
         summary.samples[frame] = new if old is None else _joined(old, new)
 
@@ -229,6 +232,7 @@ def _joined(first: FramePoints, second: FramePoints) -> FramePoints:
     return FramePoints(
         np.concatenate([first.laser, second.laser]),
         np.concatenate([first.label, second.label]),
+        np.concatenate([first.used, second.used]),
         np.concatenate([first.pixels, second.pixels]),
         np.concatenate([first.points_in_dome, second.points_in_dome]),
     )

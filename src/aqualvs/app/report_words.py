@@ -19,17 +19,23 @@ REASON_WORDS: dict[str, str] = {
 }
 
 LABEL_WORDS: dict[Label, str] = {
-    Label.TARGET: "target",
-    Label.OTHER_SURFACE: "other surface",
+    Label.NET: "net",
+    Label.SOLID: "solid",
+    Label.FISH: "fish",
+    Label.BUBBLE: "bubble",
+    Label.BACKGROUND: "behind the target",
     Label.CLUTTER: "clutter",
     Label.AMBIGUOUS: "ambiguous",
     Label.OUT_OF_RANGE: "out of range",
 }
 
 LABEL_COLOURS: dict[Label, str] = {
-    Label.TARGET: "#009E73",
-    Label.OTHER_SURFACE: "#0072B2",
-    Label.CLUTTER: "#D55E00",
+    Label.NET: "#009E73",
+    Label.SOLID: "#E69F00",
+    Label.FISH: "#D55E00",
+    Label.BUBBLE: "#56B4E9",
+    Label.BACKGROUND: "#0072B2",
+    Label.CLUTTER: "#555555",
     Label.AMBIGUOUS: "#CC79A7",
     Label.OUT_OF_RANGE: "#999999",
 }

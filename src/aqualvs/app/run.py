@@ -275,6 +275,7 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
         width=none,
         quality=none,
         label=np.empty(0, np.uint8),
+        used=np.empty(0, np.bool_),
     )
     return Scan(index, time_s, Refusal(Reason.CORRUPT_FRAME), nothing, n_water)
 

@@ -13,8 +13,10 @@ class Chunks:
     ----------
     table : array, shape (7, C)
         Rows as `plane_search` names them: centroid in `dome` (m), mean derivative of the points by
-        the stripe's position (m/px), and voice: its search lines, but a long stretch has no more
+        the stripe's position (m/px), and voice: its light, but a long stretch has no more
         voice than a few strands, because all of it may follow one strand off the sheet's middle.
+    light : array, shape (C,)
+        Search lines in it, each as far as its return looks like laser light.
     n_lines : int array, shape (C,)
         Search lines in it.
     first_line, last_line : int array, shape (C,)
@@ -24,6 +26,7 @@ class Chunks:
     """
 
     table: FloatArray
+    light: FloatArray
     n_lines: IntArray
     first_line: IntArray
     last_line: IntArray

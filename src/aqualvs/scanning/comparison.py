@@ -5,7 +5,7 @@ import numpy as np
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.plane_fit import SOLID_ERROR, fit_robust
 from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
-from aqualvs.scanning.scan import Label, Scan
+from aqualvs.scanning.scan import Scan
 from aqualvs.scanning.search import plan_searches
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -42,7 +42,7 @@ class BareLensComparison:
         """
         if not scan.posture:
             return scan.posture
-        rows = np.flatnonzero(scan.points.label == Label.TARGET)[::_EVERY]
+        rows = np.flatnonzero(scan.points.used)[::_EVERY]
         laser = scan.points.laser[rows].astype(np.int64)
         pixels = scan.points.pixels[rows]
         found = self._triangulator.triangulate(pixels, self._along_x[laser], laser)

@@ -7,12 +7,20 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.measure import Measurement
+from aqualvs.scanning.net_labels import recruit
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.quadric import Patch, flat_patch
 from aqualvs.scanning.readings import Readings
 from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.scanning.stretch_shape import StretchShapes
 from aqualvs.scanning.surfaces import Surface, in_lit_cell, lit_cells
 
 # Position error of the best returns there are: quality 1.
 _BEST_SIGMA_PX = 0.1
+# A surface is a fish if this share of its light lies in bent stretches.
+_MOSTLY = 0.5
 
 
 def label_readings(
@@ -20,7 +28,8 @@ def label_readings(
     chunk_index: IntArray,
     surfaces: Sequence[Surface],
     target: Surface | None,
-    in_posture: BoolArray,
+    found: Measurement,
+    working_range: tuple[float, float],
 ) -> ScanPoints:
     """Label every return once, as the laser that explains it best.
 
@@ -34,27 +43,123 @@ def label_readings(
         All that were found.
     target : Surface or None
         The one the posture is measured to.
-    in_posture : bool array, shape (N,)
-        Points that the posture rests on.
+    found : Measurement
+        The posture, and the readings that it rests on.
+    working_range : (float, float)
+        Distances from the dome's centre, in metres, beyond which clutter is out of range.
 
     Returns
     -------
     ScanPoints
         Readings of a return that another reading explains are left out. A return that nothing
-        explains is clutter, or ambiguous when several lasers could have made it.
+        explains is told by its shape, and ambiguous where that says nothing and several lasers
+        could have made it.
     """
     label = np.full(len(readings), Label.CLUTTER, np.uint8)
+    if not len(readings):
+        return _scan_points(readings, label, found.rests_on, np.empty(0, np.int64))
+    shapes = readings.shapes()
+    facing = None if target is None else _facing(target, found)
     explained = np.zeros(len(readings), np.bool_)
     for surface in surfaces:
-        on_it = surface.members[chunk_index]
-        explained |= on_it
-        label[on_it] = Label.AMBIGUOUS if surface is target else Label.OTHER_SURFACE
-    label[in_posture] = Label.TARGET
+        if surface is not target:
+            on_it = surface.members[chunk_index]
+            explained |= on_it
+            label[on_it] = _kind(surface, on_it, readings, shapes, facing)
+    if target is not None and facing is not None:
+        on_target = _light_on(target, facing, readings, chunk_index, explained)
+        on_target |= found.rests_on
+        label[on_target] = Label.NET if target.is_mesh else Label.SOLID
+        explained |= on_target
     kept, shared = np.ones(len(readings), np.bool_), np.zeros(len(readings), np.bool_)
-    if len(readings):
-        _drop_explained(readings.source, readings.pixels, explained, kept, shared)
-    label[shared & ~explained] = Label.AMBIGUOUS
-    return _scan_points(readings, label, np.flatnonzero(kept))
+    _drop_explained(readings.source, readings.pixels, explained, kept, shared)
+    _label_loose(label, kept & ~explained, shared, readings, shapes, facing, working_range)
+    return _scan_points(readings, label, found.rests_on, np.flatnonzero(kept))
+
+
+def _facing(target: Surface, found: Measurement) -> Patch:
+    """Return the target's surface, as well as it is known."""
+    if found.patch is not None:
+        return found.patch
+    posture = found.posture
+    if isinstance(posture, Posture):
+        return flat_patch(Plane(posture.normal_in_dome, posture.range))
+    return flat_patch(target.plane)
+
+
+def _light_on(
+    target: Surface, facing: Patch, readings: Readings, chunk_index: IntArray, elsewhere: BoolArray
+) -> BoolArray:
+    """Mark the readings on the target; on a net also those that the search left out."""
+    on_target = target.members[chunk_index]
+    if target.is_mesh:
+        recruit(
+            readings.points,
+            readings.sensitivity,
+            chunk_index,
+            len(target.members),
+            facing.packed(),
+            elsewhere,
+            _of_same_return(readings.source, elsewhere),
+            on_target,
+        )
+    return on_target
+
+
+def _of_same_return(source: IntArray, explained: BoolArray) -> BoolArray:
+    """Mark every reading of the returns that have an explained one."""
+    known = np.zeros(int(source.max()) + 1, np.bool_)
+    known[source[explained]] = True
+    same: BoolArray = known[source]
+    return same
+
+
+def _kind(
+    surface: Surface,
+    on_it: BoolArray,
+    readings: Readings,
+    shapes: StretchShapes,
+    target: Patch | None,
+) -> Label:
+    """Return what the light on a surface other than the target is on."""
+    if target is not None and np.median(target.height(readings.points[on_it])) > 0.0:
+        return Label.BACKGROUND
+    if surface.is_mesh:
+        return Label.NET
+    bent = shapes.bent()[readings.stretch[on_it]]
+    return Label.FISH if np.mean(bent) > _MOSTLY else Label.SOLID
+
+
+def _label_loose(
+    label: NDArray[np.uint8],
+    loose: BoolArray,
+    shared: BoolArray,
+    readings: Readings,
+    shapes: StretchShapes,
+    target: Patch | None,
+    working_range: tuple[float, float],
+) -> None:
+    """Label what lies on no surface by its shape, in place."""
+    rows = np.flatnonzero(loose)
+    stretch, several = readings.stretch[rows], shared[rows]
+    kind = np.where(several, Label.AMBIGUOUS, Label.CLUTTER)
+    points = readings.points[rows]
+    distance = np.linalg.norm(points, axis=1)
+    outside = (distance < working_range[0]) | (distance > working_range[1])
+    kind[outside & ~several] = Label.OUT_OF_RANGE
+    straight = shapes.straight()[stretch] & ~several
+    kind[straight] = Label.SOLID
+    if target is not None:
+        kind[straight & (target.height(points) > 0.0)] = Label.BACKGROUND
+    kind[shapes.bent()[stretch]] = Label.FISH
+    kind[shapes.round(_bright(readings.height))[stretch]] = Label.BUBBLE
+    label[rows] = kind
+
+
+def _bright(height: FloatArray) -> float:
+    """Height of the frame's bright returns."""
+    rank = int(0.9 * (len(height) - 1))
+    return float(np.partition(height, rank)[rank])
 
 
 @kernel
@@ -78,7 +183,9 @@ def _drop_explained(
         shared[i] = kept[i] and readings_of[source[i]] > 1
 
 
-def _scan_points(readings: Readings, label: NDArray[np.uint8], rows: IntArray) -> ScanPoints:
+def _scan_points(
+    readings: Readings, label: NDArray[np.uint8], used: BoolArray, rows: IntArray
+) -> ScanPoints:
     found = ScanPoints(
         laser=np.empty(len(rows), np.int8),
         pixels=np.empty((len(rows), 2)),
@@ -88,6 +195,7 @@ def _scan_points(readings: Readings, label: NDArray[np.uint8], rows: IntArray) -
         width=np.empty(len(rows)),
         quality=np.empty(len(rows)),
         label=label[rows],
+        used=used[rows],
     )
     _copy_numbers(
         rows,

@@ -1,13 +1,14 @@
 """The posture to one surface: which readings it rests on, and the fit to them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.sheet_kernels import COLUMNS, START, WINDOWED, sheet_distance
@@ -19,6 +20,13 @@ from aqualvs.scanning.plane_fit import (
     fit_robust,
 )
 from aqualvs.scanning.posture import Posture, Reason, Refusal, believable, posture_from_fit
+from aqualvs.scanning.quadric import (
+    Patch,
+    fit_patch,
+    hints_at_curvature,
+    nearest_tangent,
+    tangent_covariance,
+)
 from aqualvs.scanning.readings import Observations, Readings
 from aqualvs.scanning.search import StripeSearch
 from aqualvs.scanning.surfaces import Surface
@@ -31,6 +39,11 @@ _CROSSING_WIDTHS = 1.2
 _CROSSING_PX = 2.0
 # The light on a strand covers this many search lines; less is a fragment, off the strand's middle.
 _SHORTEST_STRAND = 3
+# A net bends out of the plane that touches it by at most this share of the range.
+_DEEPEST_BEND = 0.15
+# Light counts as on a plane, or beside it, within these shares of the range.
+_ON_IT, _BESIDE = 0.008, 0.04
+_MUCH = 0.85
 # Independent pieces of stripe that the second best laser must show.
 _MIN_PIECES = 3
 
@@ -54,10 +67,13 @@ class Measurement:
         The answer.
     rests_on : bool array, shape (N,)
         Readings in the posture; none where it is refused.
+    patch : Patch or None
+        The curved surface, where the net is none that a plane describes.
     """
 
     posture: Posture | Refusal
     rests_on: BoolArray
+    patch: Patch | None = None
 
 
 class PostureMeter:
@@ -124,10 +140,54 @@ class PostureMeter:
             return _nothing(readings, Refusal(Reason.ONE_LASER, detail))
         rests_on = (group >= 0) & (fit.weights[group] > 0.0)
         measured = posture_from_fit(fit, readings.points[rests_on], self._axis_in_dome)
+        if target.is_mesh and self._fit_method is FitMethod.ROBUST:
+            plane = _plane_of(fit)
+            off = np.abs(readings.points @ plane.normal - plane.offset) / plane.offset
+            if _much_beside(off) or hints_at_curvature(observed, fit.weights, plane):
+                curved = self._measure_curved(readings, plane)
+                if curved is not None:
+                    return curved
         posture = believable(measured, self._working_range)
         if not posture:
             return _nothing(readings, posture)
         return Measurement(posture, rests_on)
+
+    def _measure_curved(self, readings: Readings, plane: Plane) -> Measurement | None:
+        """Measure the posture to a curved net; None where a plane does."""
+        off = readings.points @ plane.normal - plane.offset
+        candidates = np.abs(off) < _DEEPEST_BEND * plane.offset
+        group = np.empty(len(readings), np.int64)
+        n_groups, _ = _select(
+            readings.points,
+            readings.laser,
+            readings.width,
+            readings.stretch,
+            _SHORTEST_STRAND,
+            candidates,
+            self._planes,
+            self._bent,
+            self._focal_px,
+            group,
+        )
+        if n_groups == 0:
+            return None
+        seen = readings.observations(group, n_groups, plane.normal)
+        fit = fit_patch(seen, plane, MESH_ERROR)
+        if fit is None or not _held_by_two_lasers(seen.laser[fit.weights > 0.0]):
+            return None
+        m = nearest_tangent(fit.patch)
+        if m is None:
+            return None
+        rests_on = (group >= 0) & (fit.weights[group] > 0.0)
+        tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
+        measured = posture_from_fit(tangent, readings.points[rests_on], self._axis_in_dome)
+        posture = believable(measured, self._working_range)
+        if not posture:
+            return None
+        along = fit.patch.coefficients[[3, 5]].tolist()
+        sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
+        bent = replace(posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
+        return Measurement(bent, rests_on, fit.patch)
 
     def _fit(
         self, readings: Readings, group: IntArray, seen: Observations, target: Surface
@@ -145,6 +205,20 @@ class PostureMeter:
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
         return fit_pseudo_inverse(readings.points[group >= 0], len(seen.laser), robust.covariance)
+
+
+def _much_beside(off: FloatArray) -> bool:
+    """Whether so much light lies just off the plane that the net may bend away from it.
+
+    Where stripes cross, wrong readings lie there as well.
+    """
+    on_it, near = np.count_nonzero(off < _ON_IT), np.count_nonzero(off < _BESIDE)
+    return bool(near - on_it > _MUCH * on_it)
+
+
+def _plane_of(fit: PlaneFit) -> Plane:
+    length = float(np.linalg.norm(fit.m))
+    return Plane(fit.m / length, 1.0 / length)
 
 
 def _held_by_two_lasers(laser: IntArray) -> bool:

@@ -1,5 +1,7 @@
 """Whether the stripes on a surface are broken as those on a net are, and how far they reach."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -9,18 +11,42 @@ from aqualvs.scanning.chunks import Chunks
 # A typical lit stretch over itself and a typical gap: below, it is a mesh. Strands of a net leave
 # longer gaps than they light; a wall behind a net is lit between short shadows.
 _MESH_DUTY = 0.6
+# Below this the gaps are at least no specks: a dense net, or a wall in a net's shadows.
+_GAPPY_DUTY = 0.9
 # Lit stretches with fewer dark search lines between them are one.
 _MIN_GAP_LINES = 3
 _MIN_STRETCHES = 3
+# So many short stretches on all lasers, and none longer, are a net of which little is seen.
+_FEW_STRETCHES = 5
 # The light on one strand is typically shorter than this, in metres.
 _LONGEST_STRETCH = 0.03
 # Share of the lines at each end of a stripe that may be stragglers.
 _STRAGGLERS = 0.1
 
 
+class Pattern(NamedTuple):
+    """How the stripes on a surface are broken.
+
+    Attributes
+    ----------
+    is_mesh : bool
+        As on a net: two lasers (or the only one asked) show short lit stretches between longer
+        gaps. One laser may run along a strand and look unbroken even on a net. Where little is
+        seen, a few short stretches and nothing longer are enough.
+    is_gappy : bool
+        As on a dense net, or as on a wall in the shadows of a net: short stretches at any gaps.
+    extent : float
+        Search lines over which the gappy stripes reach, summed over the lasers.
+    """
+
+    is_mesh: bool
+    is_gappy: bool
+    extent: float
+
+
 def describe_pattern(
     chunks: Chunks, members: BoolArray, n_lasers: int, min_lines: int, focal_px: float
-) -> tuple[bool, float]:
+) -> Pattern:
     """Describe the stripes on a surface.
 
     Parameters
@@ -38,14 +64,9 @@ def describe_pattern(
 
     Returns
     -------
-    is_mesh : bool
-        Whether at least two lasers (or the only one asked) show broken stripes. One laser may run
-        along a strand and look unbroken even on a net.
-    extent : float
-        Search lines over which the broken stripes reach, summed over the lasers.
+    Pattern
     """
-    asked = 0
-    broken = 0
+    asked, broken, gappy, long, n_stretches = 0, 0, 0, 0, 0
     total = 0.0
     for index in range(n_lasers):
         mine = np.flatnonzero(members & (chunks.laser == index))
@@ -53,12 +74,18 @@ def describe_pattern(
             continue
         asked += 1
         order = mine[np.argsort(chunks.first_line[mine])]
-        is_broken, extent = _describe_stripe(
+        n, duty, length, extent = _describe_stripe(
             chunks.table, chunks.n_lines, chunks.first_line, chunks.last_line, order, focal_px
         )
-        broken += is_broken
-        total += extent if is_broken else 0.0
-    return broken >= min(2, asked), total
+        n_stretches += n
+        is_short = length < _LONGEST_STRETCH
+        long += not is_short
+        is_gappy = n >= _MIN_STRETCHES and is_short and duty < _GAPPY_DUTY
+        gappy += is_gappy
+        broken += is_gappy and duty < _MESH_DUTY
+        total += extent if is_gappy else 0.0
+    few = not long and gappy == broken and n_stretches >= _FEW_STRETCHES
+    return Pattern(broken >= min(2, asked) or few, gappy >= min(2, asked) or few, total)
 
 
 @kernel
@@ -69,8 +96,8 @@ def _describe_stripe(
     last_line: IntArray,
     order: IntArray,
     focal_px: float,
-) -> tuple[bool, float]:
-    """Whether one laser's stripe is broken as on a net, and its extent in search lines.
+) -> tuple[int, float, float, float]:
+    """Stretches of one laser's stripe, their duty, typical length (m), and extent (search lines).
 
     Medians, so that what hides behind a fish or a box for a while does not count.
     """
@@ -90,14 +117,11 @@ def _describe_stripe(
             begin = first_line[c]
         end = max(end, last_line[c] + 1)
     extent = _extent(n_lines, first_line, last_line, order)
-    if n_stretches + 1 < _MIN_STRETCHES:
-        return False, extent
-    gap = np.median(dark[:n_stretches])
+    gap = np.median(dark[:n_stretches]) if n_stretches else 0.0
     lit[n_stretches] = end - begin
     stretch = np.median(lit[: n_stretches + 1])
     length = stretch / focal_px * np.median(distance)
-    is_broken = stretch < _MESH_DUTY * (stretch + gap) and length < _LONGEST_STRETCH
-    return bool(is_broken), extent
+    return n_stretches + 1, float(stretch / (stretch + gap)), float(length), extent
 
 
 @kernel

@@ -106,7 +106,9 @@ class Scanner:
             found = _no_target(readings, surfaces, self.options.target)
         else:
             found = self._meter.measure(readings, chunk_index, target)
-        points = label_readings(readings, chunk_index, surfaces, target, found.rests_on)
+        points = label_readings(
+            readings, chunk_index, surfaces, target, found, self.rig.working_range
+        )
         return Scan(frame.index, frame.time_s, found.posture, points, self.rig.n_water)
 
     def _filtered(self, readings: Readings) -> Readings:

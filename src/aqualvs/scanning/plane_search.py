@@ -24,6 +24,8 @@ _MAX_HYPOTHESES = 6000
 _MAX_WORK = 10_000_000
 # A neighbour for sampling lies at most this many chunks away in the same laser's list.
 _NEIGHBOURHOOD = 8
+# Chunks with a smaller share of the typical voice are not sampled.
+_SOFTEST_SHARE = 0.5
 # Normals farther than this from the vehicle's forward axis are not a target in front of it.
 _MIN_FACING = float(np.cos(np.deg2rad(55.0)))
 # Distance of a chunk from a plane: this share of the range, and this shift of the stripe.
@@ -143,6 +145,24 @@ def _pick(voice_up_to: FloatArray, draw: float) -> int:
 
 
 @kernel
+def _loud(voice: FloatArray) -> IntArray:
+    """Return the chunks to sample: those not much softer than the one half of all voice is above.
+
+    Where glare makes specks by the thousand, most neighbours on a stripe would be specks.
+    """
+    order = np.argsort(voice)
+    wanted = 0.5 * np.sum(voice)
+    seen = 0.0
+    middle = 0.0
+    for k in range(order.shape[0]):
+        seen += voice[order[k]]
+        middle = voice[order[k]]
+        if seen >= wanted:
+            break
+    return np.flatnonzero(voice >= _SOFTEST_SHARE * middle)
+
+
+@kernel
 def search_plane(
     table: FloatArray,
     laser: IntArray,
@@ -174,20 +194,24 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    voice_up_to = np.cumsum(table[WEIGHT])
+    loud = _loud(table[WEIGHT])
+    n_loud = loud.shape[0]
+    voice_up_to = np.cumsum(table[WEIGHT][loud])
+    total = np.sum(table[WEIGHT])
     most = min(_MAX_HYPOTHESES, _MAX_WORK // n)
     needed = most
     trial = 0
     while trial < needed:
         trial += 1
         state, draw = _next_random(state)
-        i = _pick(voice_up_to, draw)
+        at = _pick(voice_up_to, draw)
         state, draw = _next_random(state)
-        j = i + 1 + int(draw * _NEIGHBOURHOOD)
+        beside = at + 1 + int(draw * _NEIGHBOURHOOD)
         state, draw = _next_random(state)
-        k = _pick(voice_up_to, draw)
-        if j >= n or laser[i] != laser[j] or laser[k] == laser[i]:
+        i, k = loud[at], loud[_pick(voice_up_to, draw)]
+        if beside >= n_loud or laser[i] != laser[loud[beside]] or laser[k] == laser[i]:
             continue
+        j = loud[beside]
         if not _plane_through(table, i, j, k, plane):
             continue
         if plane[3] < nearest or plane[3] > farthest or plane[1] < _MIN_FACING:
@@ -207,7 +231,7 @@ def search_plane(
         # With a share s of the voice on the plane a trial succeeds with probability of about
         # s^2 / 5: of neighbours half fit, and a third of the draws are of one laser. Five times the
         # expected number of trials leaves one search in 150 short of it.
-        share = min(best / voice_up_to[n - 1], 1.0)
+        share = min(best / total, 1.0)
         needed = min(most, int(25.0 / (share * share)) + 20)
     for _ in range(3):
         if best > 0.0:

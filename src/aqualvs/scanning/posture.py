@@ -72,7 +72,12 @@ class Posture:
     n_points : int
         Stripe points that the fit rests on.
     rms : float
-        Root mean square distance of their chunks from the plane, in metres.
+        Root mean square distance of their chunks from the plane, in metres; from the curved
+        surface where there is one.
+    curvature, sigma_curvature : (float, float) or None
+        Of a curved net along the horizontal and along the vertical, in 1/m, and their standard
+        deviations; positive where the net recedes beside the point nearest to the vehicle. Range,
+        pitch and yaw are then those of the tangent plane at that point. None for a plane.
     """
 
     range: float
@@ -84,6 +89,8 @@ class Posture:
     nearest: float
     n_points: int
     rms: float
+    curvature: tuple[float, float] | None = None
+    sigma_curvature: tuple[float, float] | None = None
 
     def __bool__(self) -> Literal[True]:
         """Return True: a posture is an answer."""

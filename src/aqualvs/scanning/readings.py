@@ -10,6 +10,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import Segments, link_segments
+from aqualvs.scanning.stretch_shape import StretchShapes, stretch_shapes
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -25,8 +26,14 @@ _SPREAD_SHARE = 0.12
 # at least so many search lines.
 _LOUDEST_SHARE = 2.0
 _LOUD_ENOUGH = 16.0
+# What is left of the voice of a curved stretch: a fish is no plane, though it has tangent ones.
+_CURVED_VOICE = 0.2
 # Shorter stretches are specks; they do not say what is typical.
 _SPECK_LINES = 3.0
+
+# The best returns of a frame are those from this quantile on.
+_BEST_SHARE = 0.95
+_NOTHING = np.empty(0)
 
 FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 """The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
@@ -52,6 +59,9 @@ class Readings:
         Of the return: grey levels, pixels.
     sigma_px : array, shape (N,)
         Standard deviation of the position along the search line.
+    trust : array, shape (N,)
+        How much the return looks like laser light: its height, and where there is colour its green
+        fall, as shares of the frame's best; 0 to 1.
     points : array, shape (N, 3)
         In `dome`, metres.
     sensitivity : array, shape (N, 3)
@@ -67,6 +77,7 @@ class Readings:
     height: FloatArray
     width: FloatArray
     sigma_px: FloatArray
+    trust: FloatArray
     points: FloatArray
     sensitivity: FloatArray
 
@@ -91,11 +102,20 @@ class Readings:
         index = np.empty(len(self), np.int64)
         n = _number_chunks(self.chunk, index)
         facts = np.empty((4, n), np.int64)
-        voice = np.empty(n)
-        _chunk_facts(index, self.line, self.laser, self.stretch, facts, voice)
+        voice, light = np.empty(n), np.zeros(n)
+        _chunk_facts(index, self.line, self.laser, self.stretch, self.trust, facts, voice, light)
+        curved = self.shapes().curved()
+        if curved.any():
+            _hush(index, self.stretch, curved, voice)
         pieces = self.observations(index, n, FORWARD)
         table = np.vstack([pieces.points.T, pieces.sensitivity.T, voice])
-        return Chunks(table, *facts), index
+        return Chunks(table, light, *facts), index
+
+    def shapes(self) -> StretchShapes:
+        """Describe the shape of every stretch."""
+        return stretch_shapes(
+            self.stretch, self.line, self.points, self.sensitivity, self.width, self.height
+        )
 
     def observations(self, index: IntArray, n: int, normal: FloatArray) -> "Observations":
         """Average groups of readings, weighted by the light in each return.
@@ -183,7 +203,8 @@ def read_returns(
         Only those whose ray meets the laser's sheet in front of the camera.
     """
     capacity = sum(len(returns[one.axis]) for one in searches if one.axis in returns)
-    numbers, measures = np.empty((6, capacity), np.int64), np.empty((3, capacity))
+    numbers, measures = np.empty((6, capacity), np.int64), np.empty((4, capacity))
+    best = _best(returns)
     pixels = np.empty((capacity, 2))
     n = 0
     for i, search in enumerate(searches):
@@ -191,7 +212,9 @@ def read_returns(
             found = returns[search.axis]
             segments = link_segments(found, search)
             along_x = search.axis is SearchAxis.ALONG_X
-            n = _append(i, along_x, found, segments, search.line_px, n, numbers, measures, pixels)
+            n = _append(
+                i, along_x, found, segments, search.line_px, best, n, numbers, measures, pixels
+            )
     source, laser, line, stretch, chunk, along = numbers[:, :n]
     located = triangulator.triangulate(pixels[:n], along, laser, chunk)
     readings = Readings(
@@ -204,10 +227,25 @@ def read_returns(
         measures[0, :n],
         measures[1, :n],
         measures[2, :n],
+        measures[3, :n],
         located.points_in_dome,
         located.sensitivity,
     )
     return readings if located.valid.all() else readings.where(located.valid)
+
+
+def _best(returns: Mapping[SearchAxis, Returns]) -> tuple[float, float]:
+    """Height and green fall of the frame's best returns."""
+    height = [one.height for one in returns.values()]
+    green = [one.green_fall for one in returns.values()]
+    return _high(np.concatenate(height or [_NOTHING])), _high(np.concatenate(green or [_NOTHING]))
+
+
+def _high(values: FloatArray) -> float:
+    if not len(values):
+        return 1.0
+    rank = int(_BEST_SHARE * (len(values) - 1))
+    return float(np.partition(values, rank)[rank])
 
 
 def _append(
@@ -216,6 +254,7 @@ def _append(
     found: Returns,
     segments: Segments,
     line_px: int,
+    best: tuple[float, float],
     n: int,
     numbers: IntArray,
     measures: FloatArray,
@@ -226,10 +265,12 @@ def _append(
         laser,
         along_x,
         line_px,
+        *best,
         found.line,
         found.position,
         found.height,
         found.width,
+        found.green_fall,
         segments.order,
         segments.stretch,
         segments.chunk,
@@ -246,10 +287,13 @@ def _gather(
     laser: int,
     along_x: bool,
     line_px: int,
+    best_height: float,
+    best_green: float,
     line: IntArray,
     position: FloatArray,
     height: FloatArray,
     width: FloatArray,
+    green_fall: FloatArray,
     order: IntArray,
     stretch: IntArray,
     chunk: IntArray,
@@ -276,6 +320,10 @@ def _gather(
         measures[0, i] = height[r]
         measures[1, i] = width[r]
         measures[2, i] = np.hypot(_FLOOR_PX, _FLANK_NOISE * width[r] / height[r])
+        trust = min(height[r] / best_height, 1.0)
+        if green_fall[r] == green_fall[r]:
+            trust *= min(green_fall[r] / best_green, 1.0)
+        measures[3, i] = np.sqrt(trust)
         # The middle of a search line that is several pixels wide.
         pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
         pixels[i, along] = position[r]
@@ -298,10 +346,12 @@ def _chunk_facts(
     line: IntArray,
     laser: IntArray,
     stretch: IntArray,
+    trust: FloatArray,
     facts: IntArray,
     voice: FloatArray,
+    light: FloatArray,
 ) -> None:
-    """Write (n_lines, first_line, last_line, laser) and the voice of each chunk."""
+    """Write (n_lines, first_line, last_line, laser), voice and light of each chunk."""
     n_stretches = 0
     for i in range(stretch.shape[0]):
         n_stretches = max(n_stretches, stretch[i] + 1)
@@ -313,14 +363,25 @@ def _chunk_facts(
             facts[1, c] = line[i]
             facts[3, c] = laser[i]
         facts[0, c] += 1
+        light[c] += trust[i]
         facts[2, c] = line[i]
         lines_of_stretch[stretch[i]] += 1.0
     stretches = lines_of_stretch[lines_of_stretch >= _SPECK_LINES]
     typical = np.median(stretches) if stretches.shape[0] else 0.0
     loudest = max(_LOUDEST_SHARE * typical, _LOUD_ENOUGH)
     for i in range(index.shape[0]):
-        n_lines = float(facts[0, index[i]])
-        voice[index[i]] = n_lines * min(1.0, loudest / lines_of_stretch[stretch[i]])
+        voice[index[i]] = light[index[i]] * min(1.0, loudest / lines_of_stretch[stretch[i]])
+
+
+@kernel
+def _hush(index: IntArray, stretch: IntArray, curved: BoolArray, voice: FloatArray) -> None:
+    """Lower the voice of chunks of curved stretches, in place."""
+    hushed = np.zeros(voice.shape[0], np.bool_)
+    for i in range(index.shape[0]):
+        c = index[i]
+        if curved[stretch[i]] and not hushed[c]:
+            voice[c] *= _CURVED_VOICE
+            hushed[c] = True
 
 
 @kernel

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanning.posture import Posture, Refusal
 
 ImagePlane: TypeAlias = NDArray[np.uint8]
@@ -38,16 +38,22 @@ class Frame:
 class Label(IntEnum):
     """What a stripe point was found to be; `points.parquet` holds the lower-case name."""
 
-    TARGET = 0
-    """Lies on the target plane and entered the posture."""
-    OTHER_SURFACE = 1
-    """Lies on another plane: a wall behind the net, a face of a box."""
-    CLUTTER = 2
-    """Lies on no plane: fish, bubble, marine snow, glare."""
-    AMBIGUOUS = 3
-    """In a crossing zone; could belong to more than one laser."""
-    OUT_OF_RANGE = 4
-    """Triangulates outside the working range."""
+    NET = 0
+    """On a surface whose stripes are broken as those on a net are."""
+    SOLID = 1
+    """On a surface with unbroken stripes: the wall that is the target, a box before the net."""
+    FISH = 2
+    """On something smooth and short that no two lasers see as one plane."""
+    BUBBLE = 3
+    """An isolated return, as high as it is wide."""
+    BACKGROUND = 4
+    """On a surface behind the target: the tank's wall behind the net."""
+    CLUTTER = 5
+    """On nothing that can be told: marine snow, glare, fragments."""
+    AMBIGUOUS = 6
+    """As clutter, and several lasers could have made it; listed once for each of them."""
+    OUT_OF_RANGE = 7
+    """On no surface, and outside the working range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +75,9 @@ class ScanPoints:
         line (px), and quality between 0 and 1.
     label : uint8 array, shape (N,)
         `Label` values.
+    used : bool array, shape (N,)
+        Points that entered the posture. Others on the target lie where stripes cross, are
+        fragments of a strand, or stand out of the plane.
     """
 
     laser: NDArray[np.int8]
@@ -79,6 +88,7 @@ class ScanPoints:
     width: FloatArray
     quality: FloatArray
     label: NDArray[np.uint8]
+    used: BoolArray
 
     def __len__(self) -> int:
         """Return the number of points."""

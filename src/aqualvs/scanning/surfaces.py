@@ -5,7 +5,7 @@ readings scatter in space, right ones share a plane. Planes are found one after 
 that one explains is free for no other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from aqualvs.scanning.plane_search import (
     JY,
     JZ,
     MOST_TO_SECOND,
+    WEIGHT,
     X,
     Y,
     Z,
@@ -28,6 +29,12 @@ from aqualvs.scanning.plane_search import (
 
 _MAX_SURFACES = 5
 _MIN_CHUNKS = 6
+# Planes through noise hold up to a hundredth of the light in the frame, all readings counted.
+_LEAST_SHARE = 0.03
+# So much of a net's light lies on strands; that of a fish lies in long or bent stretches.
+_STRANDS_SHARE = 0.4
+# A wall's shadows reach nearly as far as the net that casts them.
+_EXTENT_SHARE = 0.6
 _MIN_LINES = 30
 MIN_LINES_PER_LASER = 8
 """Search lines with which a laser supports a surface."""
@@ -50,21 +57,27 @@ class Surface:
     n_lines : int
         Search lines on it.
     support : float
-        The same, but without what one laser has beyond three times the second: a plane rests on
+        Light on it, without what one laser has beyond three times the second: a plane rests on
         two lasers.
+    voice : float
+        The same, but a long stretch counts as a few strands.
     extent : float
         Search lines over which its broken stripes reach, summed over the lasers, stragglers left
         out.
     is_mesh : bool
         Whether its stripes are broken as those on a net are.
+    is_gappy : bool
+        Whether they are broken at least, as on a dense net or in a net's shadows.
     """
 
     plane: Plane
     members: BoolArray
     n_lines: int
     support: float
+    voice: float
     extent: float
     is_mesh: bool
+    is_gappy: bool = False
 
 
 def find_surfaces(
@@ -107,9 +120,23 @@ def find_surfaces(
         if surface is None:
             break
         surfaces.append(surface)
-        enough = max(enough, WORTH_SHARE * surface.support)
+        enough = max(enough, WORTH_SHARE * surface.n_lines)
         _claim_light(pixels, chunk_index, surface.members, free)
-    return surfaces
+    return [replace(one, is_mesh=one.is_mesh or _is_dense_net(one, surfaces)) for one in surfaces]
+
+
+def _is_dense_net(surface: Surface, surfaces: list[Surface]) -> bool:
+    """Whether a surface casts the shadows that make another one behind it look like a net.
+
+    The twine of a dense net catches more light than it lets pass.
+    """
+    return surface.is_gappy and any(
+        other.is_mesh
+        and other.plane.offset > surface.plane.offset
+        and other.voice < surface.voice
+        and other.extent >= _EXTENT_SHARE * surface.extent
+        for other in surfaces
+    )
 
 
 def _find_surface(
@@ -127,35 +154,42 @@ def _find_surface(
     plane = np.empty(4)
     if not search_plane(table, laser, laser_start, *working_range, seed, plane):
         return None
-    members, lines = np.zeros(len(free), np.bool_), np.zeros(n_lasers)
-    _collect(table, rows, chunks.n_lines, laser, plane, members, lines)
+    members = np.zeros(len(free), np.bool_)
+    _collect(table, rows, plane, members)
+    lines, light, voice = (
+        np.bincount(chunks.laser[members], weight[members], n_lasers).astype(np.float64)
+        for weight in (chunks.n_lines, chunks.light, chunks.table[WEIGHT])
+    )
     n_lines = int(lines.sum())
     enough = np.count_nonzero(lines >= MIN_LINES_PER_LASER) >= 2 and n_lines >= _MIN_LINES
     if not enough or np.count_nonzero(members) < _MIN_CHUNKS:
         return None
-    second, first = np.sort(lines)[-2:]
-    is_mesh, extent = describe_pattern(chunks, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
+    if light.sum() < _LEAST_SHARE * chunks.light.sum():
+        return None
+    support, loud = _on_two(light), _on_two(voice)
+    pattern = describe_pattern(chunks, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,
         n_lines=n_lines,
-        support=float(min(n_lines, n_lines - first + MOST_TO_SECOND * second)),
-        extent=extent,
-        is_mesh=is_mesh,
+        support=support,
+        voice=loud,
+        extent=pattern.extent,
+        is_mesh=pattern.is_mesh and loud > _STRANDS_SHARE * support,
+        is_gappy=pattern.is_gappy,
     )
 
 
+def _on_two(weight: FloatArray) -> float:
+    """Sum over the lasers, the first of them with at most three times the second's share."""
+    second, first = np.sort(weight)[-2:]
+    total = weight.sum()
+    return float(min(total, total - first + MOST_TO_SECOND * second))
+
+
 @borrowing_kernel
-def _collect(
-    table: FloatArray,
-    rows: IntArray,
-    n_lines: IntArray,
-    laser: IntArray,
-    plane: FloatArray,
-    members: BoolArray,
-    lines: FloatArray,
-) -> None:
-    """Mark the chunks on the plane and count each laser's search lines on it."""
+def _collect(table: FloatArray, rows: IntArray, plane: FloatArray, members: BoolArray) -> None:
+    """Mark the chunks on the plane."""
     for k in range(rows.shape[0]):
         residual = (
             plane[0] * table[X, k] + plane[1] * table[Y, k] + plane[2] * table[Z, k] - plane[3]
@@ -163,7 +197,6 @@ def _collect(
         per_px = plane[0] * table[JX, k] + plane[1] * table[JY, k] + plane[2] * table[JZ, k]
         if residual * residual < squared_gate(per_px, plane[3]):
             members[rows[k]] = True
-            lines[laser[k]] += n_lines[rows[k]]
 
 
 @kernel

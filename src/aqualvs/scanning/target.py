@@ -37,8 +37,8 @@ def choose_target(
     """
     near, far = working_range
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
-    most = max((surface.support for surface in surfaces), default=0.0)
-    meshes = [one for one in surfaces if one.is_mesh and one.support >= WORTH_SHARE * most]
+    most = max((surface.voice for surface in surfaces), default=0.0)
+    meshes = [one for one in surfaces if one.is_mesh and one.voice >= WORTH_SHARE * most]
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.support, default=None)
     net = _nearest_far_reaching(meshes)
@@ -51,11 +51,11 @@ def choose_target(
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
     farthest = max((surface.extent for surface in meshes), default=0.0)
-    most = max((surface.support for surface in meshes), default=0.0)
+    most = max((surface.voice for surface in meshes), default=0.0)
     wide = [
         one
         for one in meshes
-        if one.extent >= _EXTENT_SHARE * farthest and one.support >= _SUPPORT_SHARE * most
+        if one.extent >= _EXTENT_SHARE * farthest and one.voice >= _SUPPORT_SHARE * most
     ]
-    best = max(meshes, key=lambda surface: surface.support, default=None)
+    best = max(meshes, key=lambda surface: surface.voice, default=None)
     return min(wide, key=lambda surface: surface.plane.offset, default=best)

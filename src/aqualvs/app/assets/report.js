@@ -180,8 +180,8 @@
     const basis = data.planes.basis[index], out = { x: [], y: [], z: [] };
     if (!basis) return out;
     const points = data.planes.frames[chosen].lasers[index];
-    points.label.forEach((label, i) => {
-      if (label !== 0) return;
+    points.used.forEach((used, i) => {
+      if (!used) return;
       ["x", "y", "z"].forEach((name, k) => out[name].push(
         basis.origin[k] + points.x[i] * basis.x[k] + points.y[i] * basis.y[k]));
     });

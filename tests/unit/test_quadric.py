@@ -1,0 +1,126 @@
+"""Patches: curved nets from exact and noisy observations."""
+
+import numpy as np
+import pytest
+
+from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.plane_fit import SharedError
+from aqualvs.scanning.quadric import (
+    FLAT,
+    Patch,
+    fit_patch,
+    flat_patch,
+    hints_at_curvature,
+    nearest_tangent,
+    tangent_covariance,
+)
+from aqualvs.scanning.readings import Observations
+
+BASE = Plane.from_normal([0.1, 1.0, -0.05], 0.6)
+SHARED = SharedError(shift_px=0.02, tilt_px=0.02)
+_PX = 1.0e-3
+
+
+def observed(patch: Patch, noise_px: float = 0.1, n: int = 40, wrong: int = 0) -> Observations:
+    """Strands along three lines on a patch, as three lasers see them, and wrong readings."""
+    rng = np.random.default_rng(5)
+    s = np.linspace(-0.22, 0.22, n)
+    uv = np.concatenate(
+        [
+            np.stack([s, np.full(n, -0.10)], axis=-1),
+            np.stack([np.full(n, -0.08), s], axis=-1),
+            np.stack([s, 0.05 - 0.7 * s], axis=-1),
+        ]
+    )
+    laser = np.repeat([0, 1, 2], n)
+    line = np.tile(np.linspace(0.0, 700.0, n), 3)
+    u, v = uv.T
+    a, b, c, p, q, r = patch.coefficients
+    h = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
+    h += rng.normal(0.0, noise_px * _PX, len(h))
+    h[rng.permutation(len(h))[:wrong]] += rng.uniform(0.02, 0.06, wrong)
+    normal = patch.base.normal
+    points = (patch.base.offset + h)[:, None] * normal + u[:, None] * patch.right
+    points += v[:, None] * patch.up
+    m = len(points)
+    return Observations(
+        points=points,
+        sensitivity=np.tile(_PX * normal, (m, 1)),
+        sigma_px=np.full(m, 0.1),
+        line=line,
+        laser=laser,
+    )
+
+
+def patch_of(*coefficients: float) -> Patch:
+    flat = flat_patch(BASE)
+    return Patch(BASE, flat.right, flat.up, np.array(coefficients))
+
+
+def test_a_flat_patch_measures_heights_as_its_plane_does() -> None:
+    points = np.random.default_rng(0).normal(0.0, 0.3, (50, 3))
+    patch = flat_patch(BASE)
+    np.testing.assert_allclose(patch.height(points), BASE.signed_distance(points), atol=1e-15)
+    assert abs(patch.right @ BASE.normal) < 1e-15
+    # u to the right, v upward.
+    assert patch.right[0] > 0.9
+    assert patch.up[2] > 0.9
+    assert patch.packed().shape == (16,)
+
+
+@pytest.mark.parametrize("bend", [(1.0, 0.0, 0.0), (-0.8, 0.0, 0.4), (0.0, 0.1, -0.6)])
+def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> None:
+    true = patch_of(0.002, 0.01, -0.02, *bend)
+    seen = observed(true, wrong=12)
+    fit = fit_patch(seen, BASE, SHARED)
+    assert fit is not None
+    sigma = np.sqrt(np.diag(fit.covariance))
+    # Five standard deviations: 18 comparisons in all must hold.
+    assert np.all(np.abs(fit.patch.coefficients - true.coefficients) < 5.0 * sigma)
+    assert sigma[3:].max() < 0.1
+    assert np.count_nonzero(fit.weights == 0.0) >= 12
+
+
+def test_a_plane_is_left_a_plane() -> None:
+    seen = observed(patch_of(*FLAT))
+    assert fit_patch(seen, BASE, SHARED) is None
+    assert not hints_at_curvature(seen, np.ones(len(seen.laser)), BASE)
+
+
+def test_a_bend_is_hinted_at() -> None:
+    seen = observed(patch_of(0.0, 0.0, 0.0, 0.2, 0.0, 0.0))
+    assert hints_at_curvature(seen, np.ones(len(seen.laser)), BASE)
+
+
+@pytest.mark.parametrize("bend", [(1.0, 0.0, 0.0), (-0.8, 0.1, 0.4), (0.0, 0.0, 0.0)])
+def test_the_nearest_tangent_touches_at_the_nearest_point(
+    bend: tuple[float, float, float],
+) -> None:
+    patch = patch_of(0.003, 0.05, -0.04, *bend)
+    m = nearest_tangent(patch)
+    assert m is not None
+    distance = 1.0 / np.linalg.norm(m)
+    # Every point of a fine grid on the patch is as far away or farther.
+    u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(-0.3, 0.3, 601)] * 2))
+    a, b, c, p, q, r = patch.coefficients
+    h = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
+    away = np.sqrt(u**2 + v**2 + (BASE.offset + h) ** 2)
+    assert distance == pytest.approx(away.min(), abs=1e-6)
+    assert np.all(away > distance - 1e-12)
+
+
+def test_a_net_that_curls_around_the_vehicle_has_no_nearest_point() -> None:
+    assert nearest_tangent(patch_of(0.0, 0.0, 0.0, -1.9, 0.0, 0.0)) is None
+
+
+def test_the_covariance_of_the_tangent_follows_the_scatter() -> None:
+    true = patch_of(0.0, 0.01, 0.0, 0.8, 0.0, 0.2)
+    fit = fit_patch(observed(true), BASE, SHARED)
+    assert fit is not None
+    m = nearest_tangent(fit.patch)
+    expected = nearest_tangent(true)
+    assert m is not None
+    assert expected is not None
+    sigma = np.sqrt(np.diag(tangent_covariance(fit, m)))
+    assert np.all(sigma > 0.0)
+    assert np.all(np.abs(m - expected) < 5.0 * sigma)

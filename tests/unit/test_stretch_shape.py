@@ -1,0 +1,59 @@
+"""Shapes of single stretches, on exact stripes in one laser plane."""
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.stretch_shape import StretchShapes, stretch_shapes
+
+_PX = 0.7e-3  # a pixel on the target, in metres
+
+
+def shapes_of(*depths: FloatArray, width: float = 5.0, height: float = 100.0) -> StretchShapes:
+    """Describe stretches that run to the right and are so deep, in pixels of stripe."""
+    stretch = np.repeat(np.arange(len(depths)), [len(one) for one in depths])
+    line = np.concatenate([np.arange(len(one)) for one in depths])
+    depth = np.concatenate(depths)
+    n = len(line)
+    points = np.stack([_PX * line, 0.5 + _PX * depth, np.zeros(n)], axis=-1)
+    sensitivity = np.tile([0.0, _PX, 0.0], (n, 1))
+    return stretch_shapes(stretch, line, points, sensitivity, np.full(n, width), np.full(n, height))
+
+
+def test_a_straight_stretch_is_straight_however_it_slants() -> None:
+    rng = np.random.default_rng(1)
+    shapes = shapes_of(0.3 * np.arange(80.0) + rng.normal(0.0, 0.2, 80))
+    assert shapes.straight().tolist() == [True]
+    assert shapes.bent().tolist() == shapes.curved().tolist() == [False]
+    assert shapes.n_lines.tolist() == [80.0]
+    # The chord of 79 lines, slanted by 0.3.
+    np.testing.assert_allclose(shapes.size, 79 * _PX * np.hypot(1.0, 0.3), rtol=0.01)
+
+
+def test_a_flank_is_bent_and_a_corner_is_curved_but_not_bent() -> None:
+    x = np.arange(60.0)
+    flank = 6.0 * (1.0 - ((x - 29.5) / 29.5) ** 2)
+    corner = 24.0 - 0.8 * np.abs(x - 29.5)
+    shapes = shapes_of(flank, corner)
+    # The sagitta of the parabola is its height.
+    assert abs(shapes.sagitta_px[0] - 6.0) < 0.3
+    assert shapes.bent().tolist() == [True, False]
+    assert shapes.curved().tolist() == [True, True]
+    assert not shapes.straight().any()
+
+
+def test_short_pieces_have_no_shape() -> None:
+    shapes = shapes_of(np.array([0.0, 2.0, 3.0, 2.0, 0.0]))
+    assert not (shapes.bent() | shapes.straight() | shapes.curved()).any()
+
+
+def test_a_bright_spot_is_round_and_a_dim_or_long_one_is_not() -> None:
+    spot, long = np.zeros(8), np.zeros(30)
+    assert shapes_of(spot, long).round(bright=110.0).tolist() == [True, False]
+    assert not shapes_of(spot).round(bright=200.0).any()
+
+
+def test_nothing_has_no_shapes() -> None:
+    nothing, vectors = np.empty(0), np.empty((0, 3))
+    index = np.empty(0, np.int64)
+    shapes = stretch_shapes(index, index, vectors, vectors, nothing, nothing)
+    assert len(shapes.n_lines) == 0
