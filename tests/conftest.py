@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+# As the command line does it, and before any test imports NumPy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 
 @pytest.fixture(scope="session")
 def samples() -> Path:

@@ -4,6 +4,7 @@ Bodies live in their own modules and are imported when their command runs, so th
 neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,10 @@ import typer
 from aqualvs import __version__
 from aqualvs.app.cli_calibrate import board, calibrate
 from aqualvs.errors import AqualvsError
+
+# Matrices here are small: threads of the linear algebra gain nothing, and where another process
+# keeps the cores busy they wait for each other twenty times as long. Before NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="aqualvs",
