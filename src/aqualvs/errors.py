@@ -4,7 +4,7 @@
 
     AqualvsError                what a user can mend; the command line prints it and exits with 2
       RigError                  a rig file, or a rig that cannot exist
-      SourceError               a video or image folder that cannot be read
+      SourceError               a video, image folder, recording or log that cannot be read
       OutputError               a folder or file that cannot be written
       OptionError               an option, or a combination of them, that makes no sense
       CalibrationError          pictures, targets or poses from which nothing can be solved
@@ -25,7 +25,7 @@ class RigError(AqualvsError):
 
 
 class SourceError(AqualvsError):
-    """A source of frames that cannot be opened or decoded."""
+    """A source of frames, or a vehicle's log, that cannot be opened or decoded."""
 
 
 class OutputError(AqualvsError):

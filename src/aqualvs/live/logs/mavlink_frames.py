@@ -1,0 +1,300 @@
+"""MAVLink frames out of a telemetry log, without parsing those that nobody asks for.
+
+A telemetry log is a chain of records: the time of receipt (UTC, microseconds, big-endian, 8 bytes)
+and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The chain is followed
+from header to header; only frames of wanted messages are checked and decoded, all of one kind at
+once.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, IntArray
+
+MAGIC_1, MAGIC_2 = 0xFE, 0xFD
+_STAMP = 8
+_HEADER = {MAGIC_1: 6, MAGIC_2: 10}
+_SIGNATURE = 13
+_SIGNED = 0x01
+_CHECKSUM = 2
+_SHORTEST = _STAMP + 6 + _CHECKSUM
+_LATEST = 0x0E
+"""Second byte of the microseconds since 1970 in the year 2100; the first is 0."""
+_RECORD = re.compile(rb"\x00[\x00-\x0e].{6}[\xfd\xfe]", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """Wire layout of one message: fields in the order of their transfer, little-endian.
+
+    Attributes
+    ----------
+    name : str
+        As in MAVLink's definitions.
+    fields : tuple of (str, str)
+        Name and NumPy type; extensions are left out.
+    crc_extra : int
+        Seed that guards against other definitions of the message.
+    """
+
+    name: str
+    fields: tuple[tuple[str, str], ...]
+    crc_extra: int
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """The payload as a NumPy type."""
+        return np.dtype(list(self.fields))
+
+
+def _floats(names: str) -> tuple[tuple[str, str], ...]:
+    return tuple((name, "<f4") for name in names.split())
+
+
+_BOOT = ("time_boot_ms", "<u4")
+_PRESSURE = (_BOOT, *_floats("press_abs press_diff"), ("temperature", "<i2"))
+MESSAGES: Mapping[int, Message] = {
+    0: Message(
+        "HEARTBEAT",
+        (
+            ("custom_mode", "<u4"),
+            ("type", "u1"),
+            ("autopilot", "u1"),
+            ("base_mode", "u1"),
+            ("system_status", "u1"),
+            ("mavlink_version", "u1"),
+        ),
+        50,
+    ),
+    30: Message("ATTITUDE", (_BOOT, *_floats("roll pitch yaw rollspeed pitchspeed yawspeed")), 39),
+    32: Message("LOCAL_POSITION_NED", (_BOOT, *_floats("x y z vx vy vz")), 185),
+    33: Message(
+        "GLOBAL_POSITION_INT",
+        (
+            _BOOT,
+            *((name, "<i4") for name in ("lat", "lon", "alt", "relative_alt")),
+            *((name, "<i2") for name in ("vx", "vy", "vz")),
+            ("hdg", "<u2"),
+        ),
+        104,
+    ),
+    74: Message(
+        "VFR_HUD",
+        (*_floats("airspeed groundspeed alt climb"), ("heading", "<i2"), ("throttle", "<u2")),
+        20,
+    ),
+    137: Message("SCALED_PRESSURE2", _PRESSURE, 195),
+    178: Message(
+        "AHRS2", (*_floats("roll pitch yaw altitude"), ("lat", "<i4"), ("lng", "<i4")), 47
+    ),
+}
+"""The messages that are read (message_definitions: common.xml, ardupilotmega.xml)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """All sound frames of one message, in the order of the file.
+
+    Attributes
+    ----------
+    at : array, shape (n,)
+        Places in the file.
+    received_us : array, shape (n,)
+        Time of receipt, UTC, in microseconds.
+    source : array, shape (n,)
+        Sender: 256 times the system's number plus the component's.
+    payload : structured array, shape (n,)
+        Fields as in `MESSAGES`.
+    """
+
+    at: IntArray
+    received_us: IntArray
+    source: IntArray
+    payload: np.ndarray
+
+    def __getitem__(self, chosen: BoolArray) -> "Table":
+        """Return the chosen frames."""
+        return Table(
+            self.at[chosen], self.received_us[chosen], self.source[chosen], self.payload[chosen]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """What a telemetry log holds of the wanted messages.
+
+    Attributes
+    ----------
+    tables : mapping of str to Table
+        By message name; messages that did not come are missing.
+    n_frames : int
+        Frames of any kind.
+    n_failed : int
+        Wanted frames whose checksum is wrong; they are left out.
+    skipped : tuple of (int, int)
+        Stretches that hold no frames: place in the file, and length in bytes.
+    """
+
+    tables: Mapping[str, Table]
+    n_frames: int
+    n_failed: int
+    skipped: tuple[tuple[int, int], ...]
+
+
+def looks_like_frames(head: bytes) -> bool:
+    """Return whether the begin of a file holds two records in a row."""
+    return _next_record(head, 0) is not None
+
+
+def read_frames(data: bytes) -> Frames:
+    """Read the wanted messages of a telemetry log.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole file.
+    """
+    places, n_frames, skipped = _scan(data)
+    octets = np.frombuffer(data, np.uint8)
+    tables: dict[str, Table] = {}
+    n_failed = 0
+    for (number, magic), starts in places.items():
+        at = np.array(starts, np.int64)
+        table, sound = _decode(octets, at, MESSAGES[number], magic)
+        n_failed += int(np.count_nonzero(~sound))
+        _merge(tables, MESSAGES[number].name, table[sound])
+    return Frames(tables, n_frames, n_failed, tuple(skipped))
+
+
+def _scan(
+    data: bytes,
+) -> tuple[dict[tuple[int, int], list[int]], int, list[tuple[int, int]]]:
+    """Follow the chain; return the places of wanted frames by message and version of MAVLink."""
+    places: dict[tuple[int, int], list[int]] = defaultdict(list)
+    skipped: list[tuple[int, int]] = []
+    size, n_frames, last, at = len(data), 0, 0, 0
+    while at + _SHORTEST <= size:
+        end = _record_end(data, at)
+        if end is None:
+            # A record that lost bytes swallows the next ones, so the search begins within it.
+            found = _next_record(data, last + 1 if n_frames else 0)
+            begin = at if found is None or found >= at else last
+            skipped.append((begin, (size if found is None else found) - begin))
+            if found is None:
+                return places, n_frames, skipped
+            last = at = found
+            continue
+        if end > size:
+            break
+        n_frames += 1
+        magic = data[at + _STAMP]
+        number = data[at + 13]
+        if magic == MAGIC_2:
+            number = data[at + 15] | data[at + 16] << 8 | data[at + 17] << 16
+        if number in MESSAGES:
+            places[number, magic].append(at)
+        last, at = at, end
+    if at < size:
+        skipped.append((at, size - at))
+    return places, n_frames, skipped
+
+
+def _record_end(data: bytes, start: int) -> int | None:
+    """Return where the record that starts here ends; None if none starts here."""
+    magic = data[start + _STAMP]
+    if (magic != MAGIC_2 and magic != MAGIC_1) or data[start] or data[start + 1] > _LATEST:
+        return None
+    if magic == MAGIC_1:
+        return start + _STAMP + 6 + _CHECKSUM + data[start + 9]
+    flags = data[start + 10]
+    if flags > _SIGNED:
+        return None
+    return start + _STAMP + 10 + _CHECKSUM + data[start + 9] + flags * _SIGNATURE
+
+
+def _next_record(data: bytes, start: int) -> int | None:
+    """Return where the first record starts that another, or the end of the file, follows."""
+    for match in _RECORD.finditer(data, start):
+        at = match.start()
+        if at + _SHORTEST > len(data):
+            break
+        end = _record_end(data, at)
+        if end is None or end > len(data):
+            continue
+        if end + _SHORTEST > len(data) or _record_end(data, end) is not None:
+            return at
+    return None
+
+
+def _decode(
+    octets: np.ndarray, at: IntArray, message: Message, magic: int
+) -> tuple[Table, BoolArray]:
+    """Decode frames of one message and version; return them, and which have a right checksum."""
+    header = _HEADER[magic]
+    frame = at + _STAMP
+    length = octets[frame + 1].astype(np.int64)
+    size = message.dtype.itemsize
+    # MAVLink 2 cuts zeros off the end; they read as zeros again.
+    column = np.arange(size)
+    inside = column < length[:, None]
+    places = np.where(inside, frame[:, None] + header + column, 0)
+    payload = np.where(inside, octets[places], 0).astype(np.uint8)
+    stamps = octets[at[:, None] + np.arange(_STAMP)].astype(np.int64)
+    received_us = (stamps << (8 * np.arange(_STAMP)[::-1])).sum(axis=1)
+    sender = frame + (5 if magic == MAGIC_2 else 3)
+    source = octets[sender].astype(np.int64) * 256 + octets[sender + 1]
+    sound = _checksums_agree(octets, frame, header - 1 + length, message.crc_extra)
+    if magic == MAGIC_1:
+        sound &= length >= size
+    table = Table(at, received_us, source, np.ascontiguousarray(payload).view(message.dtype)[:, 0])
+    return table, sound
+
+
+def _checksums_agree(
+    octets: np.ndarray, frame: IntArray, length: IntArray, crc_extra: int
+) -> BoolArray:
+    """Check CRC-16/MCRF4XX over all but the magic, with the message's seed at the end."""
+    crc = np.full(len(frame), 0xFFFF, np.uint16)
+    for i in range(int(length.max(initial=0))):
+        going = i < length
+        crc[going] = _fed(crc[going], octets[frame[going] + 1 + i])
+    crc = _fed(crc, np.full(len(frame), crc_extra, np.uint8))
+    end = frame + 1 + length
+    agree: BoolArray = (crc & 0xFF == octets[end]) & (crc >> 8 == octets[end + 1])
+    return agree
+
+
+def _fed(crc: np.ndarray, octet: np.ndarray) -> np.ndarray:
+    fed: np.ndarray = _CRC[(crc ^ octet) & 0xFF] ^ (crc >> 8)
+    return fed
+
+
+def _crc_table() -> np.ndarray:
+    table = np.arange(256, dtype=np.uint16)
+    for _ in range(8):
+        table = np.where(table & 1, (table >> 1) ^ 0x8408, table >> 1).astype(np.uint16)
+    return table
+
+
+_CRC = _crc_table()
+
+
+def _merge(tables: dict[str, Table], name: str, table: Table) -> None:
+    """Add frames of the other version of MAVLink, in the order of the file."""
+    if not len(table.at):
+        return
+    known = tables.get(name)
+    if known is None:
+        tables[name] = table
+        return
+    order = np.argsort(np.concatenate([known.at, table.at]), kind="stable")
+    tables[name] = Table(
+        np.concatenate([known.at, table.at])[order],
+        np.concatenate([known.received_us, table.received_us])[order],
+        np.concatenate([known.source, table.source])[order],
+        np.concatenate([known.payload, table.payload])[order],
+    )
