@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
-CODE := src tests tools benchmarks
+CODE := src tests tools benchmarks ros2
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint format bench clean
@@ -35,7 +35,7 @@ bench: $(STAMP) ## Measure speed and accuracy; one table
 
 clean: ## Remove what these tasks made
 	rm -rf $(VENV) out dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find src tests tools benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Debian's Python comes without the module that puts pip into a new venv; pip outside reaches in.
 $(STAMP): pyproject.toml

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.app.pictures import bgr_of
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.live.colour import bgr_of
 from aqualvs.live.sources import open_source
 from aqualvs.optics.camera import DomeCamera
 from aqualvs.optics.rig import Rig

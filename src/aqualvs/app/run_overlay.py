@@ -9,7 +9,7 @@ import numpy as np
 from aqualvs.app.disk import writing
 from aqualvs.app.outputs import OVERLAY_MP4
 from aqualvs.app.overlay import OverlayWriter, draw_overlay
-from aqualvs.app.pictures import bgr_of
+from aqualvs.live.colour import bgr_of
 from aqualvs.live.sources import FrameSource
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Frame, Scan

@@ -14,8 +14,8 @@ from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.scanning.search import plan_searches, searched_range
-from aqualvs.scanning.stripe import StripeOptions
+from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
+from aqualvs.scanning.stripe import Returns, StripeOptions
 from aqualvs.scanning.surfaces import MIN_LINES_PER_LASER, Surface, find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
@@ -86,8 +86,30 @@ class Scanner:
         ValueError
             If the frame has another size than the rig's image.
         """
-        # Sub-pixel returns along the search lines, within the lasers' bands.
-        returns = self._detector.detect(frame)
+        return self.measure(frame.index, frame.time_s, self.detect(frame))
+
+    def detect(self, frame: Frame) -> dict[SearchAxis, Returns]:
+        """Find the sub-pixel returns along the search lines, within the lasers' bands.
+
+        Raises
+        ------
+        ValueError
+            If the frame has another size than the rig's image.
+        """
+        return self._detector.detect(frame)
+
+    def measure(self, index: int, time_s: float, returns: dict[SearchAxis, Returns]) -> Scan:
+        """Measure the posture from the returns of one frame.
+
+        Parameters
+        ----------
+        index : int
+            Of the frame.
+        time_s : float
+            Of the frame.
+        returns : dict
+            From `detect`; as they were recorded, they give what the frame gave.
+        """
         # Each return read as a point of every laser that could have made it.
         readings = self._filtered(read_returns(returns, self._searches, self._triangulator))
         # Planes that several lasers agree on, and the one that is the target.
@@ -109,7 +131,7 @@ class Scanner:
         points = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
-        return Scan(frame.index, frame.time_s, found.posture, points, self.rig.n_water)
+        return Scan(index, time_s, found.posture, points, self.rig.n_water)
 
     def _filtered(self, readings: Readings) -> Readings:
         if self.options.mesh_filter is None or not len(readings):

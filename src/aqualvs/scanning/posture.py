@@ -39,6 +39,10 @@ class Reason(StrEnum):
     """A plane, but outside the working range."""
     CORRUPT_FRAME = "corrupt_frame"
     """The picture could not be decoded."""
+    WRONG_SIZE = "wrong_size"
+    """The picture has another size than the rig's."""
+    NO_FRAMES = "no_frames"
+    """A live stream is silent: there is no picture to measure in."""
 
 
 @dataclass(frozen=True, slots=True)

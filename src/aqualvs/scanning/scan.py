@@ -90,6 +90,22 @@ class ScanPoints:
     label: NDArray[np.uint8]
     used: BoolArray
 
+    @classmethod
+    def none(cls) -> "ScanPoints":
+        """Return no points."""
+        nothing = np.empty(0)
+        return cls(
+            laser=np.empty(0, np.int8),
+            pixels=np.empty((0, 2)),
+            points_in_dome=np.empty((0, 3)),
+            sigma=nothing,
+            intensity=nothing,
+            width=nothing,
+            quality=nothing,
+            label=np.empty(0, np.uint8),
+            used=np.empty(0, np.bool_),
+        )
+
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.laser)

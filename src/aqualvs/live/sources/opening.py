@@ -2,53 +2,146 @@
 
 from pathlib import Path
 
+import av
+from av.container import InputContainer
+
 from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.sources.bag_images import is_bag, open_bag
 from aqualvs.live.sources.base import FrameSource
+from aqualvs.live.sources.camera import CameraFeed, CameraOptions, is_camera
+from aqualvs.live.sources.datagrams import UdpAddress, parse_udp
+from aqualvs.live.sources.feed import Feed
 from aqualvs.live.sources.images import IMAGE_SUFFIXES, ImageSource
+from aqualvs.live.sources.mcap_images import open_mcap
+from aqualvs.live.sources.paced import PacedFeed
+from aqualvs.live.sources.remote import RemoteFeed, Transport, remote_feed
+from aqualvs.live.sources.sdp import read_sdp
+from aqualvs.live.sources.udp import UdpFeed
 from aqualvs.live.sources.video import VideoSource
 
-STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "srt", "tcp", "udp")
-"""Addresses that FFmpeg opens; everything else is a path."""
+STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "rtsps", "srt", "tcp", "udp")
+"""Addresses of streams; everything else is a path."""
+
+BLUEROV = UdpAddress("", 5600)
+"""Where BlueOS and ArduSub send the main camera, and QGroundControl listens."""
 
 
-def open_source(where: str | Path, *, fps: float | None = None) -> FrameSource:
+def open_source(
+    where: str | Path, *, fps: float | None = None, topic: str | None = None
+) -> FrameSource:
     """Open a source of frames.
 
-    =====================================  ===============
+    =====================================  ====================
     `where`                                source
-    =====================================  ===============
+    =====================================  ====================
     address, `scheme://...`                `VideoSource`
+    ROS bag (`.bag`, `.db3`, or a folder
+    with `metadata.yaml`)                  images of a topic
+    `.mcap`                                images of a topic
     folder                                 `ImageSource`
     one image (suffix `IMAGE_SUFFIXES`)    `ImageSource`
     any other file                         `VideoSource`
-    =====================================  ===============
+    =====================================  ====================
 
     Parameters
     ----------
     where : str or Path
-        Path of a file or folder, or an address.
+        Path of a file or folder, or an address. `PATH#TOPIC` names the topic of a recording.
     fps : float or None
-        Frame rate of images (1 if None); videos have their own clock.
+        Frame rate of images (1 if None); everything else has its own clock.
+    topic : str or None
+        Of a bag or MCAP file, where it holds images on several.
 
     Raises
     ------
     SourceError
         If there is nothing at `where`, or it cannot be read.
     OptionError
-        If `fps` is given for a video, or is not positive.
+        If `fps` is given for a video or is not positive; if `topic` is missing, wrong, or given
+        for what has none; if a package is missing.
     """
     if fps is not None and not fps > 0:
         raise OptionError(f"frame rate {fps:g}: must be positive")
     if is_address(where):
+        _no(topic, where, "a stream has no topics; leave the topic out")
         return _video(str(where), fps)
-    path = Path(where)
+    path, topic = _split_topic(where, topic)
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder; check the path")
+    if path.suffix.lower() == ".mcap" or is_bag(path):
+        _no(fps, path, "a recording has its own clock; leave the frame rate out")
+        return open_bag(path, topic) if is_bag(path) else open_mcap(path, topic)
+    _no(topic, path, "only bags and MCAP files have topics; leave the topic out")
     if path.is_dir():
         return ImageSource(path, fps=fps or 1.0)
     if path.suffix.lower() in IMAGE_SUFFIXES:
         return ImageSource([path], fps=fps or 1.0)
+    if path.suffix.lower() == ".sdp":
+        raise SourceError(f"{path}: describes a live stream; give it to aqualvs live")
     return _video(str(path), fps)
+
+
+def open_feed(
+    where: str | Path,
+    *,
+    realtime: bool = True,
+    fps: float | None = None,
+    size_px: tuple[int, int] | None = None,
+    pixel_format: str | None = None,
+    transport: Transport | None = None,
+    topic: str | None = None,
+) -> Feed:
+    """Open a source for a live run.
+
+    =====================================  =================================================
+    `where`                                feed
+    =====================================  =================================================
+    `bluerov`                              `UdpFeed` on port 5600
+    `udp://...`, `rtp://...`               `UdpFeed`: RTP H.264, MPEG-TS or bare H.264
+    `.sdp` file, H.264                     `UdpFeed` on its port
+    `.sdp` file, other codecs              `RemoteFeed` by FFmpeg
+    `rtsp://...` and other addresses       `RemoteFeed` by FFmpeg
+    `camera:0`, `/dev/video0`              `CameraFeed`
+    whatever `open_source` takes           `PacedFeed`
+    =====================================  =================================================
+
+    Parameters
+    ----------
+    where : str or Path
+    realtime : bool
+        Whether a recording is played at its own pace, or as fast as it is taken. Streams and
+        cameras have one pace only.
+    fps : float or None
+        Of images, or asked of a camera.
+    size_px : (int, int) or None
+        Width and height asked of a camera.
+    pixel_format : str or None
+        Asked of a camera: `h264`, `mjpeg`, `yuyv422`.
+    transport : {"tcp", "udp"} or None
+        How RTSP shall send; TCP if None.
+    topic : str or None
+        Of a bag or MCAP file.
+
+    Raises
+    ------
+    SourceError
+        If it can never work: no such file, an address without port.
+    OptionError
+        If an option does not go with the source.
+    """
+    text = str(where)
+    if fps is not None and not fps > 0:
+        raise OptionError(f"frame rate {fps:g}: must be positive")
+    if is_camera(text):
+        _no(transport or topic, text, "a camera has neither transport nor topic; leave it out")
+        return CameraFeed(text, CameraOptions(size_px=size_px, fps=fps, pixel_format=pixel_format))
+    _no(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
+    if not text.lower().startswith("rtsp"):
+        _no(transport, text, "only RTSP has a choice of transport; leave it out")
+    if not _is_stream(text):
+        return PacedFeed(open_source(where, fps=fps, topic=topic), realtime=realtime)
+    _no(fps or topic, text, "a stream has its own clock and no topics; leave that out")
+    return _stream(text, transport or "tcp")
 
 
 def is_address(where: str | Path) -> bool:
@@ -56,7 +149,51 @@ def is_address(where: str | Path) -> bool:
     return isinstance(where, str) and where.partition("://")[0].lower() in STREAM_SCHEMES
 
 
+def _is_stream(where: str) -> bool:
+    return where == "bluerov" or is_address(where) or where.lower().endswith(".sdp")
+
+
+def _stream(where: str, transport: Transport) -> Feed:
+    if where == "bluerov":
+        return UdpFeed(where, BLUEROV)
+    if where.lower().endswith(".sdp"):
+        return _described(Path(where))
+    if where.lower().startswith(("udp://", "rtp://")):
+        return UdpFeed(where, parse_udp(where))
+    return remote_feed(where, transport=transport)
+
+
+def _described(path: Path) -> Feed:
+    video = read_sdp(path)
+    if video.codec == "H264":
+        return UdpFeed(
+            str(path),
+            video.address,
+            parameter_sets=video.parameter_sets,
+            payload_type=video.payload_type,
+        )
+
+    def opener() -> InputContainer:
+        allowed = {"protocol_whitelist": "file,udp,rtp"}
+        return av.open(str(path), "r", format="sdp", options=allowed, timeout=(5.0, 2.0))
+
+    return RemoteFeed(str(path), opener, content=f"RTP {video.codec}")
+
+
+def _split_topic(where: str | Path, topic: str | None) -> tuple[Path, str | None]:
+    """Return path and topic of `PATH#TOPIC`; a path that exists is taken as it is."""
+    path, mark, name = str(where).rpartition("#")
+    if topic is not None or not mark or Path(where).exists():
+        return Path(where), topic
+    return Path(path), name
+
+
+def _no(value: object, where: str | Path, words: str) -> None:
+    """Refuse an option that does not go with a source."""
+    if value:
+        raise OptionError(f"{where}: {words}")
+
+
 def _video(where: str, fps: float | None) -> VideoSource:
-    if fps is not None:
-        raise OptionError(f"{where}: a video has its own clock; leave the frame rate out")
+    _no(fps, where, "a video has its own clock; leave the frame rate out")
     return VideoSource(where)

@@ -1,6 +1,5 @@
 """Frames from a video file or stream, decoded by FFmpeg through PyAV."""
 
-import heapq
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -14,6 +13,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from aqualvs.errors import SourceError
+from aqualvs.live.sources.ledger import Ledger
 from aqualvs.live.sources.planes import planes_of
 from aqualvs.scanning.scan import Frame
 
@@ -71,9 +71,7 @@ class VideoSource:
         self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
         self._promised_s = _promised_duration(self._stream)
         self.n_frames = self._stream.frames or self._estimated_frames()
-        self._ledger = _Ledger(
-            counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
-        )
+        self._ledger = Ledger(counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the sound frames; lost ones leave a gap in the index.
@@ -182,43 +180,6 @@ class VideoSource:
     ) -> None:
         """Close the file."""
         self.close()
-
-
-class _Ledger:
-    """Numbers pictures by the packets that announced them, so that lost ones leave a gap."""
-
-    def __init__(self, *, counts_packets: bool) -> None:
-        self.first_pts: int | None = None
-        self.n_packets = 0
-        self._counts_packets = counts_packets
-        self._pending: list[int] = []
-        self._next = 0
-
-    @property
-    def n_known(self) -> int:
-        """Pictures numbered so far and announced ones that have not come."""
-        return self._next + len(self._pending)
-
-    def expect(self, packet: "Packet[VideoStream]") -> None:
-        """Note a packet; the empty one that flushes the decoder does not count."""
-        if packet.size == 0:
-            return
-        self.n_packets += 1
-        if packet.pts is None or packet.is_discard or not self._counts_packets:
-            return
-        heapq.heappush(self._pending, packet.pts)
-
-    def number(self, pts: int | None) -> int:
-        """Return the number of a picture, counting those lost before it."""
-        if self.first_pts is None and pts is not None:
-            self.first_pts = min(pts, *self._pending[:1])
-        while pts is not None and self._pending and self._pending[0] < pts:
-            heapq.heappop(self._pending)
-            self._next += 1
-        while pts is not None and self._pending and self._pending[0] == pts:
-            heapq.heappop(self._pending)
-        self._next += 1
-        return self._next - 1
 
 
 def _open(where: str) -> InputContainer:

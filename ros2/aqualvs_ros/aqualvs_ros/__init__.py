@@ -1,0 +1,1 @@
+"""Underwater laser vision as a ROS 2 node."""

@@ -1,0 +1,333 @@
+"""One MAVLink connection, kept alive: shared by all that talk to the autopilot."""
+
+import contextlib
+import importlib
+import selectors
+import struct
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from aqualvs.errors import OptionError
+from aqualvs.live.health import PartHealth, State
+from aqualvs.live.outputs.mavlink_address import SerialAddress, parse_address
+from aqualvs.live.outputs.mavlink_ports import Port, check_address, open_port, why
+
+MAV_COMP_ID_ONBOARD_COMPUTER = 191
+HEARTBEAT_EVERY_S = 1.0
+SILENT_AFTER_S = 5.0
+"""A peer without a heartbeat for so long counts as gone."""
+
+_LOOK_EVERY_S = 0.1
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
+# A connection that lasts so long was a good one: the next attempt follows quickly again.
+_LASTING_S = 2.0
+# A peer that was heard and falls silent may have moved to another address.
+_REOPEN_AFTER_S = 10.0
+_REFUSED_FOR_S = 3.0
+_MAX_KINDS = 1024
+# What a serial driver already holds delays a message by so much at most; beyond, it is dropped.
+_PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
+_ARDUPILOT, _NO_AUTOPILOT = 3, 8
+_ARDUPILOT_NAMES = {1: "ArduPlane", 2: "ArduCopter", 10: "ArduRover", 11: "ArduBoat", 12: "ArduSub"}
+_AUTOPILOT_NAMES = {_ARDUPILOT: "ArduPilot", 12: "PX4"}
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A message that came in.
+
+    Attributes
+    ----------
+    message : object
+        As pymavlink decodes it.
+    received_ns : int
+        By `time.monotonic_ns`.
+    system, component : int
+        Who sent it.
+    """
+
+    message: Any
+    received_ns: int
+    system: int
+    component: int
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it came."""
+        return 1e-9 * (time.monotonic_ns() - self.received_ns)
+
+
+class MavlinkLink:
+    """Sends and receives MAVLink 2 as an onboard computer.
+
+    The constructor returns at once. A thread opens the connection, sends a heartbeat every second,
+    takes in what comes, and opens the connection again whenever it breaks, a little later each time
+    up to four seconds. `send` never waits and never raises for the state of the connection.
+
+    Parameters
+    ----------
+    url : str
+        See `parse_address`.
+    system : int
+        Own system id; that of the vehicle, whose part this computer is.
+    component : int
+        Own component id.
+
+    Attributes
+    ----------
+    dialect : module
+        pymavlink's messages and constants (ardupilotmega, which holds all common ones).
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
+    """
+
+    def __init__(
+        self, url: str, *, system: int = 1, component: int = MAV_COMP_ID_ONBOARD_COMPUTER
+    ) -> None:
+        _check_id("system", system)
+        _check_id("component", component)
+        self.url = url
+        self.system = system
+        self.dialect: Any = _dialect()
+        self._address = parse_address(url)
+        check_address(self._address)
+        self._packer = self.dialect.MAVLink(None, system, component)
+        self._heartbeat = self.dialect.MAVLink_heartbeat_message(
+            self.dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+            self.dialect.MAV_AUTOPILOT_INVALID,
+            0,
+            0,
+            self.dialect.MAV_STATE_ACTIVE,
+            3,
+        )
+        # Guards the port and the packer, and is only held for calls that never wait.
+        self._sending = threading.Lock()
+        self._port: Port | None = None
+        self._broken: OSError | None = None
+        self._fault = "not open yet"
+        self._n_unsent = 0
+        self._receiving = threading.Lock()
+        self._inbox: dict[tuple[str, int, int], Received] = {}
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"mavlink {url}", daemon=True)
+        self._thread.start()
+
+    def send(self, *messages: Any, urgent: bool = False) -> bool:
+        """Send messages together, in one datagram where there are datagrams; never waits.
+
+        Parameters
+        ----------
+        *messages
+            pymavlink's message objects, made from `dialect`; may be changed and sent again.
+        urgent : bool
+            On a serial line, may be delayed a little where others are dropped.
+
+        Returns
+        -------
+        sent : bool
+            False if there is no connection, nobody to send to, or no room; they are dropped then.
+
+        Raises
+        ------
+        struct.error
+            If a field does not fit into its type.
+        """
+        patience_s = _URGENT_PATIENCE_S if urgent else _PATIENCE_S
+        with self._sending:
+            sent = self._send(messages, patience_s)
+            self._n_unsent += not sent
+        return sent
+
+    @property
+    def n_unsent(self) -> int:
+        """Calls of `send` that found no connection or no room."""
+        return self._n_unsent
+
+    def latest(
+        self, kind: str, *, system: int | None = None, component: int | None = None
+    ) -> Received | None:
+        """Return the last message of a kind (such as `ATTITUDE`), None if none has come.
+
+        Parameters
+        ----------
+        kind : str
+            Name of the message.
+        system, component : int or None
+            Only from these; from any if None.
+        """
+        with self._receiving:
+            found = [
+                entry
+                for (name, of_system, of_component), entry in self._inbox.items()
+                if name == kind
+                and system in (None, of_system)
+                and component in (None, of_component)
+            ]
+        return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def autopilot(self) -> Received | None:
+        """Return the last heartbeat of the own vehicle's autopilot, None if none has come."""
+        beats = [beat for beat in self._autopilots() if beat.system == self.system]
+        return max(beats, key=lambda beat: beat.received_ns, default=None)
+
+    def health(self) -> PartHealth:
+        """Return how the connection is."""
+        state, detail = self._state()
+        return PartHealth(f"mavlink {self.url}", state, detail, self._n_unsent)
+
+    def close(self) -> None:
+        """End the thread and free the port; further calls do nothing."""
+        self._closing.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+
+    def _state(self) -> tuple[State, str]:
+        port = self._port
+        if self._closing.is_set():
+            return State.OFF, "closed"
+        if port is None:
+            return State.FAULT, self._fault
+        refused_s = port.refused_s
+        beat = self.autopilot()
+        age_s = beat.age_s if beat else float("inf")
+        if refused_s is not None and time.monotonic() - refused_s < min(_REFUSED_FOR_S, age_s):
+            return State.FAULT, f"nobody listens at {self._address}"
+        if beat is None:
+            return State.WARN, self._waiting_for()
+        if age_s > SILENT_AFTER_S:
+            return State.WARN, f"no heartbeat for {age_s:.0f} s"
+        return State.OK, f"autopilot {_name(beat)} seen {age_s:.1f} s ago"
+
+    def _waiting_for(self) -> str:
+        others = [beat for beat in self._autopilots() if beat.age_s < SILENT_AFTER_S]
+        if others:
+            return f"no heartbeat of sysid {self.system}, but of {_name(others[-1])}"
+        return f"no heartbeat of sysid {self.system} yet"
+
+    def _autopilots(self) -> list[Received]:
+        with self._receiving:
+            beats = [entry for (name, _, _), entry in self._inbox.items() if name == "HEARTBEAT"]
+        return [beat for beat in beats if beat.message.autopilot != _NO_AUTOPILOT]
+
+    def _send(self, messages: tuple[Any, ...], patience_s: float) -> bool:
+        port = self._port
+        if port is None or self._broken is not None:
+            return False
+        try:
+            if port.lag_s > patience_s:
+                return False
+            return port.write(b"".join([self._packed(message) for message in messages]))
+        except OSError as fault:
+            self._broken = fault
+            return False
+
+    def _packed(self, message: Any) -> bytes:
+        frame: bytes = message.pack(self._packer)
+        self._packer.seq = (self._packer.seq + 1) % 256
+        return frame
+
+    def _run(self) -> None:
+        wait_s = _FIRST_WAIT_S
+        while not self._closing.is_set():
+            began_s = time.monotonic()
+            try:
+                self._serve(open_port(self._address))
+            except (OSError, ValueError) as fault:
+                # A name that cannot be one is a ValueError.
+                if time.monotonic() - began_s > _LASTING_S:
+                    wait_s = _FIRST_WAIT_S
+                again = f"tried again every {wait_s:.2g} s"
+                self._fault = f"{self._address}: {why(fault)}; {again}"
+                self._closing.wait(wait_s)
+                wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+
+    def _serve(self, port: Port) -> None:
+        """Use an open port until it breaks or `close` is called."""
+        with contextlib.closing(port), selectors.DefaultSelector() as selector:
+            selector.register(port, selectors.EVENT_READ)
+            with self._sending:
+                self._port, self._broken = port, None
+            try:
+                self._pump(port, selector)
+            finally:
+                with self._sending:
+                    self._port = None
+
+    def _pump(self, port: Port, selector: selectors.BaseSelector) -> None:
+        parser = self.dialect.MAVLink(None)
+        parser.robust_parsing = True
+        opened_s = beat_s = time.monotonic()
+        while not self._closing.is_set():
+            now_s = time.monotonic()
+            if now_s >= beat_s:
+                beat_s = now_s + HEARTBEAT_EVERY_S
+                with self._sending:
+                    self._send((self._heartbeat,), _URGENT_PATIENCE_S)
+            events = selectors.EVENT_READ | (selectors.EVENT_WRITE if port.unsent else 0)
+            selector.modify(port, events)
+            for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):
+                if ready & selectors.EVENT_READ:
+                    self._take_in(parser, port.read())
+            self._flush(port)
+            self._check_silence(opened_s)
+
+    def _flush(self, port: Port) -> None:
+        with self._sending:
+            port.flush()
+            if self._broken is not None:
+                raise self._broken
+
+    def _check_silence(self, opened_s: float) -> None:
+        """Raise if the peer was heard once and has been silent long, to look it up anew."""
+        beat = self.autopilot()
+        if beat is None or isinstance(self._address, SerialAddress):
+            return
+        if self._address.kind == "udpin":
+            return
+        if min(beat.age_s, time.monotonic() - opened_s) > _REOPEN_AFTER_S:
+            raise TimeoutError(0, f"no heartbeat for {beat.age_s:.0f} s")
+
+    def _take_in(self, parser: Any, data: bytes) -> None:
+        """Decode what came; whatever cannot be decoded is left out."""
+        try:
+            messages = parser.parse_buffer(data) if data else None
+        except (self.dialect.MAVError, struct.error, IndexError, ValueError):
+            parser.buf, parser.buf_index = bytearray(), 0
+            return
+        received_ns = time.monotonic_ns()
+        for message in messages or ():
+            kind = message.get_type()
+            if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
+                continue
+            system, component = message.get_srcSystem(), message.get_srcComponent()
+            entry = Received(message, received_ns, system, component)
+            with self._receiving:
+                self._inbox[kind, system, component] = entry
+                if len(self._inbox) > _MAX_KINDS:
+                    del self._inbox[next(iter(self._inbox))]
+
+
+def _check_id(name: str, value: int) -> None:
+    if not 1 <= value <= 255:
+        raise OptionError(f"MAVLink {name} id {value}: must lie between 1 and 255")
+
+
+def _dialect() -> Any:
+    """Import pymavlink's messages; version 2, whatever the environment says."""
+    try:
+        return importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
+    except ImportError as fault:
+        raise OptionError("MAVLink needs pymavlink: pip install 'aqualvs[mavlink]'") from fault
+
+
+def _name(beat: Received) -> str:
+    kind, autopilot = beat.message.type, beat.message.autopilot
+    name = _AUTOPILOT_NAMES.get(autopilot, f"of type {autopilot}")
+    if autopilot == _ARDUPILOT:
+        name = _ARDUPILOT_NAMES.get(kind, name)
+    return f"sysid {beat.system} {name}"

@@ -1,0 +1,1 @@
+"""Where a live run's answers go: autopilot, ROS, Foxglove, plain JSON."""

@@ -1,0 +1,52 @@
+"""What every output of a live run offers."""
+
+from typing import Protocol
+
+from aqualvs.live.health import PartHealth
+from aqualvs.live.sample import LiveSample
+
+
+class Output(Protocol):
+    """Takes samples; one small class for each kind of receiver.
+
+    Made by its constructor without waiting for a peer; a peer that is not there, goes or returns is
+    no exception but told by `health`.
+
+    Attributes
+    ----------
+    name : str
+        How health and messages call it.
+    inline : bool
+        Whether `send` never waits (a datagram), so that it may run between two frames. Others get
+        a thread of their own.
+    keeps_all : bool
+        Whether samples may wait in a queue for their turn (a recorder). For others a newer sample
+        replaces one that is still waiting.
+    """
+
+    @property
+    def name(self) -> str:
+        """How health and messages call it."""
+
+    @property
+    def inline(self) -> bool:
+        """Whether `send` never waits."""
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether samples may wait in a queue for their turn."""
+
+    def send(self, sample: LiveSample) -> None:
+        """Send one sample.
+
+        Raises
+        ------
+        OSError, RuntimeError
+            If it could not be sent; the next one is tried all the same.
+        """
+
+    def health(self) -> PartHealth:
+        """Return how the link is; called from another thread."""
+
+    def close(self) -> None:
+        """Say good-bye and free everything; further calls do nothing."""

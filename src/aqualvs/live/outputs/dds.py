@@ -1,0 +1,248 @@
+"""To ROS 2 without ROS: a publisher by Cyclone DDS that its subscribers take for one of theirs."""
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from aqualvs.errors import OptionError
+from aqualvs.live.health import PartHealth, State
+from aqualvs.live.outputs.dds_types import dds_types, type_hash
+from aqualvs.live.outputs.ros2_messages import (
+    TYPE_NAMES,
+    Ros2Types,
+    distro_of_this_machine,
+    to_ros2,
+)
+from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
+from aqualvs.live.sample import LiveSample
+
+_DEPTH = 5
+# A reader that cannot keep up holds a reliable writer for no longer.
+_MAX_BLOCKING_NS = 50_000_000
+_MAX_DOMAIN = 232
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
+_SLOW_FOR_S = 2.0
+
+_LOCALHOST = (
+    "<CycloneDDS><Domain><General><Interfaces>"
+    '<NetworkInterface address="127.0.0.1"/></Interfaces></General>'
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+# By default every topic waits for a second, when it is closed, for subscribers that died.
+_SHORT_FAREWELL = (
+    "<CycloneDDS><Domain><Internal><WriterLingerDuration>100 ms</WriterLingerDuration>"
+    "</Internal></Domain></CycloneDDS>"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """What Cyclone DDS needs to be kept alive while it publishes."""
+
+    domain: Any
+    participant: Any
+    writers: dict[Topic, Any]
+
+    def wanted(self) -> frozenset[Topic]:
+        """Return the topics that somebody listens to."""
+        return frozenset(
+            topic
+            for topic, writer in self.writers.items()
+            if writer.get_publication_matched_status().current_count
+        )
+
+
+class DdsOutput:
+    """Publishes as ROS 2 does, whether ROS 2 is installed or not.
+
+    Parameters
+    ----------
+    options : RosOptions, optional
+        Defaults if left out.
+    domain_id : int or None
+        None for `ROS_DOMAIN_ID`, 0 where that is not set.
+    distro : str or None
+        Release of ROS 2 of the subscribers, such as `humble`: `Range` has changed. None for
+        `ROS_DISTRO`, Jazzy where that is not set.
+
+    Raises
+    ------
+    OptionError
+        If cyclonedds is not installed, or the domain is none.
+    """
+
+    name = "ros2"
+    inline = False
+    keeps_all = False
+
+    def __init__(
+        self,
+        options: RosOptions | None = None,
+        *,
+        domain_id: int | None = None,
+        distro: str | None = None,
+    ) -> None:
+        self._options = options or RosOptions()
+        self._domain_id = domain_of_this_machine() if domain_id is None else domain_id
+        _check_domain(self._domain_id)
+        self._types = dds_types(distro or distro_of_this_machine())
+        self._maker = MessageMaker(self._options)
+        self._link: _Link | None = None
+        self._closed = False
+        self._wait_s, self._retry_s = _FIRST_WAIT_S, 0.0
+        self._n_dropped = 0
+        self._slow_until_s = 0.0
+        self._health = PartHealth(self.name, State.WARN, "not connected yet")
+
+    def send(self, sample: LiveSample) -> None:
+        """Publish what a sample has to say, on the topics that somebody listens to.
+
+        A network that is not there is looked for again after half a second, then less and less
+        often, up to every eight seconds.
+        """
+        from cyclonedds.core import DDSException
+
+        try:
+            link = self._link or self._connect()
+            if link is None:
+                self._n_dropped += 1
+                return
+            wanted = link.wanted()
+            for topic, message in self._maker.messages(sample, wanted):
+                self._write(link.writers[topic], to_ros2(self._types, message))
+        except DDSException as fault:
+            self._give_up(fault)
+        else:
+            self._health = self._well(len(wanted))
+
+    def health(self) -> PartHealth:
+        """Return how the link is."""
+        return self._health
+
+    def close(self) -> None:
+        """Leave the domain; further samples are ignored."""
+        self._closed = True
+        self._drop_link()
+        self._health = PartHealth(self.name, State.OFF, "closed", self._n_dropped)
+
+    def _connect(self) -> _Link | None:
+        """Return a link; None while there is reason to wait."""
+        if self._closed or time.monotonic() < self._retry_s:
+            return None
+        self._link = _join(self._domain_id, self._options, self._types)
+        self._wait_s = _FIRST_WAIT_S
+        return self._link
+
+    def _write(self, writer: Any, message: Any) -> None:
+        from cyclonedds.core import DDSException
+
+        try:
+            writer.write(message)
+        except DDSException as fault:
+            if fault.code != DDSException.DDS_RETCODE_TIMEOUT:
+                raise
+            self._n_dropped += 1
+            self._slow_until_s = time.monotonic() + _SLOW_FOR_S
+
+    def _well(self, n_topics: int) -> PartHealth:
+        where = f"domain {self._domain_id}"
+        if time.monotonic() < self._slow_until_s:
+            told = f"{where}: a reliable subscriber is too slow"
+            return PartHealth(self.name, State.WARN, told, self._n_dropped)
+        told = f"{where}: {n_topics or 'no'} topic{'s' * (n_topics != 1)} listened to"
+        return PartHealth(self.name, State.OK, told, self._n_dropped)
+
+    def _give_up(self, fault: Exception) -> None:
+        self._drop_link()
+        self._n_dropped += 1
+        self._retry_s = time.monotonic() + self._wait_s
+        told = f"domain {self._domain_id}: {fault}; tried again in {self._wait_s:g} s"
+        self._wait_s = min(2.0 * self._wait_s, _LONGEST_WAIT_S)
+        self._health = PartHealth(self.name, State.FAULT, told, self._n_dropped)
+
+    def _drop_link(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.writers.clear()
+
+
+def domain_of_this_machine(environment: Mapping[str, str] = os.environ) -> int:
+    """Return the domain that `ROS_DOMAIN_ID` names, 0 without.
+
+    Raises
+    ------
+    OptionError
+        If it is no number.
+    """
+    text = environment.get("ROS_DOMAIN_ID", "").strip()
+    try:
+        return int(text or "0")
+    except ValueError:
+        raise OptionError(
+            f"ROS_DOMAIN_ID {text!r} is no number; unset it or use 0 to {_MAX_DOMAIN}"
+        ) from None
+
+
+def stays_on_this_machine(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether ROS 2 is told not to use the network, and Cyclone DDS nothing else."""
+    local = (
+        environment.get("ROS_LOCALHOST_ONLY", "") == "1"
+        or environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
+    )
+    return local and not environment.get("CYCLONEDDS_URI")
+
+
+def _check_domain(domain_id: int) -> None:
+    if not 0 <= domain_id <= _MAX_DOMAIN:
+        raise OptionError(f"ROS domain {domain_id}: must be 0 to {_MAX_DOMAIN}")
+
+
+def _join(domain_id: int, options: RosOptions, types: Ros2Types) -> _Link:
+    """Enter the domain and offer all topics."""
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic as DdsTopic
+
+    domain = _domain(domain_id)
+    participant = DomainParticipant(domain_id)
+    writers = {}
+    for topic in Topic:
+        kind = types.classes[TYPE_NAMES[topic]]
+        offered = DdsTopic(participant, f"rt{options.topic_name(topic)}", kind)
+        writers[topic] = DataWriter(participant, offered, _quality(topic, options, types))
+    return _Link(domain, participant, writers)
+
+
+def _domain(domain_id: int) -> Any:
+    """Return a domain as the environment wants it; None where the process has it already."""
+    from cyclonedds.core import DDSException
+    from cyclonedds.domain import Domain
+
+    wishes = _LOCALHOST if stays_on_this_machine() else os.environ.get("CYCLONEDDS_URI", "")
+    try:
+        return Domain(domain_id, ",".join(filter(None, (wishes, _SHORT_FAREWELL))))
+    except DDSException as fault:
+        if fault.code == DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
+            return None
+        raise
+
+
+def _quality(topic: Topic, options: RosOptions, types: Ros2Types) -> Any:
+    from cyclonedds.qos import Policy, Qos
+
+    reliable = options.reliable or topic is Topic.DIAGNOSTICS
+    policies = [
+        Policy.Reliability.Reliable(max_blocking_time=_MAX_BLOCKING_NS)
+        if reliable
+        else Policy.Reliability.BestEffort,
+        Policy.Durability.Volatile,
+        Policy.History.KeepLast(_DEPTH),
+        Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
+    ]
+    if types.range_has_variance:
+        # Releases before Iron know no hashes, and have another Range.
+        policies.append(Policy.Userdata(type_hash(topic)))
+    return Qos(*policies)

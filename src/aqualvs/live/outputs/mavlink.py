@@ -1,0 +1,219 @@
+"""Posture to the autopilot and the pilot's station by MAVLink."""
+
+import math
+from typing import Any
+
+from aqualvs.live.health import PartHealth
+from aqualvs.live.mavlink_link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink
+from aqualvs.live.sample import LiveSample
+from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.scan import ScanPoints
+
+# The scanner believes a range that is beyond the working range by one part in a hundred.
+_RANGE_TOLERANCE = 0.01
+_MAX_CM = 65_535
+_UNKNOWN_VARIANCE = 255
+_UNKNOWN_QUALITY, _INVALID_QUALITY, _WORST_QUALITY, _BEST_QUALITY = 0, 1, 2, 100
+_INVALID_CM = 0
+"""Below any least distance: ArduPilot and PX4 then have no distance, while one that is too large
+would mean to PX4 that the way is free."""
+
+_FLOAT_MAX = 3.4e38
+_NAN = float("nan")
+
+NAMES = (
+    "aq_valid",
+    "aq_range",
+    "aq_pitch",
+    "aq_yaw",
+    "aq_s_range",
+    "aq_s_pitch",
+    "aq_s_yaw",
+    "aq_n",
+)
+"""`NAMED_VALUE_FLOAT` of every sample: 1 or 0; range (mm) and angles (degrees), their standard
+deviations, and the water's refractive index. NaN where there is no posture."""
+
+FILTERED_NAMES = ("aqf_valid", "aqf_range", "aqf_pitch", "aqf_yaw", "aqf_speed")
+"""The same from the time filter, while it is switched on: 1 or 0, mm, degrees, and the rate of the
+range in mm/s. NaN where the filter has nothing to say."""
+
+
+class MavlinkOutput:
+    """Sends `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
+
+    Parameters
+    ----------
+    link : str or MavlinkLink
+        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
+    system, component : int
+        Own ids, where the link is made here.
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
+    """
+
+    inline = True
+    keeps_all = False
+
+    def __init__(
+        self,
+        link: str | MavlinkLink,
+        *,
+        system: int = 1,
+        component: int = MAV_COMP_ID_ONBOARD_COMPUTER,
+    ) -> None:
+        self._owns_link = isinstance(link, str)
+        if isinstance(link, str):
+            link = MavlinkLink(link, system=system, component=component)
+        self.link = link
+        self.name = f"mavlink {link.url}"
+        self._n_dropped = 0
+        self._distance = _distance_message(link.dialect)
+        self._values = _value_messages(link.dialect, NAMES)
+        self._filtered_values = _value_messages(link.dialect, FILTERED_NAMES)
+        self._was_filtered = False
+
+    def send(self, sample: LiveSample) -> None:
+        """Send one sample; never waits, and what cannot be sent is dropped."""
+        time_boot_ms = boot_ms(sample.instants.arrived_ns)
+        _fill_distance(self._distance, time_boot_ms, sample)
+        numbers = _numbers(sample.scan.posture, sample.scan.n_water)
+        messages = _fill(self._values, time_boot_ms, numbers)
+        self._was_filtered |= sample.filtered is not None
+        if self._was_filtered:
+            filtered = _filtered_numbers(sample.filtered)
+            messages = messages + _fill(self._filtered_values, time_boot_ms, filtered)
+        # The autopilot's distance goes first, and even where a slow line has no room for the rest.
+        sent = self.link.send(self._distance, urgent=True)
+        sent &= self.link.send(*messages)
+        self._n_dropped += not sent
+
+    def health(self) -> PartHealth:
+        """Return how the link is, and how many samples did not go out as a whole."""
+        found = self.link.health()
+        return PartHealth(self.name, found.state, found.detail, self._n_dropped)
+
+    def close(self) -> None:
+        """Close the link if it was made here; further calls do nothing."""
+        if self._owns_link:
+            self.link.close()
+
+
+def boot_ms(monotonic_ns: int) -> int:
+    """Return milliseconds since the start of the system, as 32 bits: they wrap after 49.7 days."""
+    return (monotonic_ns // 1_000_000) & 0xFFFF_FFFF
+
+
+def distance_limits_cm(working_range: tuple[float, float]) -> tuple[int, int]:
+    """Return the least and greatest distance that is ever sent, in whole centimetres outwards.
+
+    Parameters
+    ----------
+    working_range : (float, float)
+        In metres.
+    """
+    near, far = working_range
+    least = math.floor(100.0 * near * (1.0 - _RANGE_TOLERANCE))
+    most = math.ceil(100.0 * far * (1.0 + _RANGE_TOLERANCE))
+    return min(max(1, least), _MAX_CM), min(max(1, most), _MAX_CM)
+
+
+def variance_cm2(variance: float) -> int:
+    """Return a variance in m² as `DISTANCE_SENSOR` wants it: whole cm², never less than it is.
+
+    255, which means unknown, where the number has no room for it.
+    """
+    if not 0.0 <= variance < 0.0255:
+        return _UNKNOWN_VARIANCE
+    return math.ceil(1e4 * variance)
+
+
+def signal_quality(points: ScanPoints) -> int:
+    """Return the mean quality of the stripes that a posture rests on, from 2 to 100; 0 if unknown.
+
+    1 is left to invalid measurements.
+    """
+    qualities = points.quality[points.used]
+    mean = float(qualities.mean()) if len(qualities) else _NAN
+    if not math.isfinite(mean):
+        return _UNKNOWN_QUALITY
+    return min(max(_WORST_QUALITY, round(100.0 * mean)), _BEST_QUALITY)
+
+
+def _distance_message(dialect: Any) -> Any:
+    return dialect.MAVLink_distance_sensor_message(
+        time_boot_ms=0,
+        min_distance=1,
+        max_distance=1,
+        current_distance=_INVALID_CM,
+        type=dialect.MAV_DISTANCE_SENSOR_LASER,
+        id=0,
+        orientation=dialect.MAV_SENSOR_ROTATION_NONE,
+        covariance=_UNKNOWN_VARIANCE,
+        signal_quality=_INVALID_QUALITY,
+    )
+
+
+def _fill_distance(message: Any, time_boot_ms: int, sample: LiveSample) -> None:
+    message.time_boot_ms = time_boot_ms
+    message.min_distance, message.max_distance = distance_limits_cm(sample.rig.working_range)
+    posture = sample.scan.posture
+    current_cm = round(100.0 * posture.range) if posture and math.isfinite(posture.range) else 0
+    if posture and 0 < current_cm <= _MAX_CM:
+        message.current_distance = current_cm
+        message.covariance = variance_cm2(float(posture.covariance[0, 0]))
+        message.signal_quality = signal_quality(sample.scan.points)
+        return
+    message.current_distance = _INVALID_CM
+    message.covariance = _UNKNOWN_VARIANCE
+    message.signal_quality = _INVALID_QUALITY
+
+
+def _value_messages(dialect: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
+    kind = dialect.MAVLink_named_value_float_message
+    return tuple(kind(0, name.encode("ascii"), _NAN) for name in names)
+
+
+def _fill(messages: tuple[Any, ...], time_boot_ms: int, numbers: tuple[float, ...]) -> Any:
+    for message, number in zip(messages, numbers, strict=True):
+        message.time_boot_ms = time_boot_ms
+        message.value = number if -_FLOAT_MAX < number < _FLOAT_MAX else _NAN
+    return messages
+
+
+def _numbers(posture: Posture | Refusal, n_water: float) -> tuple[float, ...]:
+    """Return what `NAMES` names."""
+    if not isinstance(posture, Posture):
+        return (0.0, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, n_water)
+    variance = posture.covariance
+    return (
+        1.0,
+        1e3 * posture.range,
+        math.degrees(posture.pitch),
+        math.degrees(posture.yaw),
+        1e3 * _root(variance[0, 0]),
+        math.degrees(_root(variance[1, 1])),
+        math.degrees(_root(variance[2, 2])),
+        n_water,
+    )
+
+
+def _filtered_numbers(filtered: FilteredPosture | None) -> tuple[float, ...]:
+    """Return what `FILTERED_NAMES` names."""
+    if filtered is None:
+        return (0.0, _NAN, _NAN, _NAN, _NAN)
+    return (
+        1.0,
+        1e3 * filtered.range,
+        math.degrees(filtered.pitch),
+        math.degrees(filtered.yaw),
+        1e3 * float(filtered.rates[0]),
+    )
+
+
+def _root(variance: float) -> float:
+    return math.sqrt(variance) if variance >= 0.0 else _NAN

@@ -1,0 +1,306 @@
+"""Ways to a MAVLink peer: UDP, TCP and serial ports that never wait."""
+
+import errno
+import socket
+import time
+from typing import Protocol
+
+from aqualvs.errors import OptionError
+from aqualvs.live.outputs.mavlink_address import Address, NetAddress, SerialAddress
+
+_DATAGRAM = 65_535
+_CHUNK = 4096
+_CONNECT_S = 1.0
+# A stream that takes nothing for so long leads nowhere.
+_STALLED_S = 5.0
+_SEND_BUFFER = 16_384
+# Peers of a listening port are forgotten after so long, and are so many at most.
+_PEER_S = 10.0
+_MAX_PEERS = 8
+_NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
+
+
+class Port(Protocol):
+    """An open way to a peer. Whatever shows that it is broken is raised as OSError."""
+
+    @property
+    def refused_s(self) -> float | None:
+        """When the peer's computer said that nobody listens (`time.monotonic`), if ever."""
+
+    @property
+    def unsent(self) -> bool:
+        """Whether the end of a message waits for room."""
+
+    @property
+    def lag_s(self) -> float:
+        """How long the driver is going to send what it holds already."""
+
+    def fileno(self) -> int:
+        """Return the number to wait on."""
+
+    def read(self) -> bytes:
+        """Return what has come, empty if nothing."""
+
+    def write(self, frames: bytes) -> bool:
+        """Send all of it, or nothing if there is no room; return whether it went."""
+
+    def flush(self) -> None:
+        """Send what waits, as far as there is room."""
+
+    def close(self) -> None:
+        """Free the port at once; what waits is lost."""
+
+
+def open_port(address: Address) -> Port:
+    """Open the way to a peer; may take a second for TCP, and longer for names.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened now; later it may.
+    """
+    if isinstance(address, SerialAddress):
+        from aqualvs.live.outputs.mavlink_serial import SerialPort
+
+        return SerialPort(address)
+    if address.kind == "tcp":
+        return _TcpPort(address)
+    return _UdpListener(address) if address.kind == "udpin" else _UdpSender(address)
+
+
+def check_address(address: Address) -> None:
+    """Raise if this computer can never open such an address.
+
+    Raises
+    ------
+    OptionError
+        For a serial port where there are none, or at a speed that it does not know.
+    """
+    if not isinstance(address, SerialAddress):
+        return
+    try:
+        from aqualvs.live.outputs.mavlink_serial import speed_of
+    except ImportError as fault:
+        raise OptionError(
+            f"MAVLink connection {address.device}: serial ports need Linux or macOS; let MAVProxy "
+            "or BlueOS forward it, and use udpin:"
+        ) from fault
+    speed_of(address)
+
+
+def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tuple[object, ...]]:
+    """Return a socket that never waits, and the address as the system writes it."""
+    flags = socket.AI_PASSIVE if passive else 0
+    found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=flags)
+    # Autopilots and their routers listen to IPv4, also where the name has both.
+    family, kind, protocol, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
+    made = socket.socket(family, kind, protocol)
+    made.setblocking(False)
+    return made, where
+
+
+class _UdpPort:
+    """What both directions of UDP share: a datagram goes at once or not at all."""
+
+    unsent = False
+    lag_s = 0.0
+
+    def __init__(self, made: socket.socket) -> None:
+        self._socket = made
+        self.refused_s: float | None = None
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def flush(self) -> None:
+        """Do nothing: nothing ever waits."""
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _sent(self, frames: bytes, where: tuple[object, ...] | None) -> bool:
+        """Send a datagram to an address, or to the connected peer."""
+        # A refusal belongs to an earlier datagram; this one has not been tried yet.
+        for _ in range(2):
+            try:
+                if where is None:
+                    self._socket.send(frames)
+                else:
+                    self._socket.sendto(frames, where)
+            except (ConnectionRefusedError, ConnectionResetError):
+                self.refused_s = time.monotonic()
+            except OSError as fault:
+                if fault.errno in _NOT_NOW:
+                    return False
+                raise
+            else:
+                return True
+        return False
+
+    def _received(self) -> tuple[bytes, tuple[object, ...] | None]:
+        try:
+            return self._socket.recvfrom(_DATAGRAM)
+        except (ConnectionRefusedError, ConnectionResetError):
+            self.refused_s = time.monotonic()
+        except OSError as fault:
+            if fault.errno not in _NOT_NOW:
+                raise
+        return b"", None
+
+
+class _UdpSender(_UdpPort):
+    """Sends to one address; hears whoever answers."""
+
+    def __init__(self, address: NetAddress) -> None:
+        made, where = _open_udp(address, passive=False)
+        super().__init__(made)
+        try:
+            if address.kind == "udpbcast":
+                made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+                # Bound, so that it can be read before the first datagram goes out.
+                made.bind(("", 0))
+            else:
+                # Connected, so that the system tells when nobody listens.
+                made.connect(where)
+        except OSError:
+            made.close()
+            raise
+        self._where = where if address.kind == "udpbcast" else None
+
+    def read(self) -> bytes:
+        return self._received()[0]
+
+    def write(self, frames: bytes) -> bool:
+        return self._sent(frames, self._where)
+
+
+class _UdpListener(_UdpPort):
+    """Listens, and sends to those it has heard lately."""
+
+    def __init__(self, address: NetAddress) -> None:
+        made, where = _open_udp(address, passive=True)
+        super().__init__(made)
+        try:
+            made.bind(where)
+        except OSError as fault:
+            made.close()
+            if fault.errno == errno.EADDRNOTAVAIL:
+                raise OSError(
+                    fault.errno,
+                    f"{address.host} is no address of this computer; to send there use udpout:",
+                ) from fault
+            raise
+        self._heard_s: dict[tuple[object, ...], float] = {}
+
+    def read(self) -> bytes:
+        data, where = self._received()
+        if where is not None:
+            self._heard_s.pop(where, None)
+            self._heard_s[where] = time.monotonic()
+            if len(self._heard_s) > _MAX_PEERS:
+                self._heard_s.pop(next(iter(self._heard_s)))
+        return data
+
+    def write(self, frames: bytes) -> bool:
+        now = time.monotonic()
+        peers = [where for where, heard in tuple(self._heard_s.items()) if now - heard < _PEER_S]
+        sent = [self._sent_to(frames, where) for where in peers]
+        return any(sent)
+
+    def _sent_to(self, frames: bytes, where: tuple[object, ...]) -> bool:
+        """Send to one peer; one that cannot be reached must not keep it from the others."""
+        try:
+            return self._sent(frames, where)
+        except OSError:
+            return False
+
+
+class StreamPort:
+    """What TCP and serial share: a message may go in parts, and the rest goes before the next."""
+
+    refused_s: float | None = None
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._moved_s = time.monotonic()
+
+    @property
+    def unsent(self) -> bool:
+        """Whether the end of a message waits for room."""
+        return bool(self._rest)
+
+    @property
+    def lag_s(self) -> float:
+        """How long the driver is going to send what it holds already."""
+        return 0.0
+
+    def read(self) -> bytes:
+        """Return what has come, empty if nothing."""
+        try:
+            data = self._take()
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise ConnectionResetError(errno.ECONNRESET, "the peer has gone")
+        return data
+
+    def write(self, frames: bytes) -> bool:
+        """Send all of it, or nothing if there is no room; return whether it went."""
+        self.flush()
+        if self._rest:
+            return False
+        self._rest = frames
+        self.flush()
+        return True
+
+    def flush(self) -> None:
+        """Send what waits, as far as there is room."""
+        if not self._rest:
+            self._moved_s = time.monotonic()
+            return
+        try:
+            n_sent = self._give(self._rest)
+        except BlockingIOError:
+            n_sent = 0
+        if n_sent:
+            self._rest = self._rest[n_sent:]
+            self._moved_s = time.monotonic()
+        elif time.monotonic() - self._moved_s > _STALLED_S:
+            raise TimeoutError(errno.ETIMEDOUT, "the peer takes nothing any more")
+
+    def _take(self) -> bytes:
+        raise NotImplementedError
+
+    def _give(self, data: bytes) -> int:
+        raise NotImplementedError
+
+
+class _TcpPort(StreamPort):
+    """A TCP connection to a server."""
+
+    def __init__(self, address: NetAddress) -> None:
+        super().__init__()
+        self._socket = socket.create_connection((address.host, address.port), _CONNECT_S)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # What waits longer than this holds is too old to be sent.
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+
+    def fileno(self) -> int:
+        """Return the number to wait on."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Free the port at once; what waits is lost."""
+        self._socket.close()
+
+    def _take(self) -> bytes:
+        return self._socket.recv(_CHUNK)
+
+    def _give(self, data: bytes) -> int:
+        return self._socket.send(data)
+
+
+def why(fault: Exception) -> str:
+    """Return the cause of a fault in a few words."""
+    return (fault.strerror if isinstance(fault, OSError) else None) or str(fault)

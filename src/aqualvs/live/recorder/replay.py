@@ -1,0 +1,162 @@
+"""A recorded dive, frame by frame, as the scanner found it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from aqualvs.errors import AqualvsError, SourceError
+from aqualvs.live.recorder import messages, pictures, schemas
+from aqualvs.live.recorder.reader import McapFile, StoredMessage
+from aqualvs.live.recorder.rig_record import options_from_text, rig_from_record
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.pipeline import ScannerOptions
+from aqualvs.scanning.posture import Refusal
+from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.search import SearchAxis
+from aqualvs.scanning.stripe import Returns
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFrame:
+    """What a recording holds of a frame.
+
+    Attributes
+    ----------
+    index, time_s
+        As in the `Frame`.
+    n_water : float
+        Index that it was measured with.
+    returns : dict
+        Stripes as detected.
+    refusal : Refusal or None
+        Why it was not measured at all.
+    picture : Frame or None
+        None where there is none, or it was not asked for.
+    """
+
+    index: int
+    time_s: float
+    n_water: float
+    returns: dict[SearchAxis, Returns]
+    refusal: Refusal | None
+    picture: Frame | None
+
+
+class DiveRecording:
+    """A recording of a dive.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path : Path
+    rig : Rig
+        That the dive was measured with at its beginning.
+    options : ScannerOptions
+        As the dive was measured.
+    n_frames : int or None
+        None where a torn file does not say.
+    fps : float or None
+        Mean rate.
+    has_pictures : bool
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read, or holds no stripes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = McapFile(path)
+        stored = next(self._file.messages([schemas.RIG.name]), None)
+        if stored is None or schemas.STRIPES.name not in self._file.topics:
+            raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
+        try:
+            text, exact, options = messages.rig_texts_of(stored.data)
+            self.rig: Rig = rig_from_record(text, exact, str(path))
+            self.options: ScannerOptions = options_from_text(options)
+        except (ValueError, KeyError, TypeError) as fault:
+            raise SourceError(
+                f"{path}: its rig cannot be understood ({fault}); "
+                "was it written by a later version?"
+            ) from fault
+        self.n_frames = self._file.count(schemas.STRIPES.name)
+        self.has_pictures = next(self._file.messages([schemas.PICTURE.name]), None) is not None
+        self.fps = self._mean_rate()
+
+    @property
+    def n_torn(self) -> int:
+        """Chunks of about half a second that were torn and left out so far."""
+        return self._file.n_torn
+
+    def frames(self, *, with_pictures: bool) -> Iterator[RecordedFrame]:
+        """Yield the frames in the order of their recording.
+
+        Parameters
+        ----------
+        with_pictures : bool
+            Whether to decode pictures, where there are any.
+
+        Raises
+        ------
+        SourceError
+            If a message cannot be understood.
+        """
+        wanted = [schemas.STRIPES.name]
+        if with_pictures:
+            wanted += [schemas.PICTURE.name, schemas.CHROMA.name]
+        parts: dict[str, StoredMessage] = {}
+        for message in self._file.messages(wanted):
+            parts[message.topic] = message
+            if message.topic == schemas.STRIPES.name:
+                yield self._frame(parts)
+                parts = {}
+
+    def _frame(self, parts: dict[str, StoredMessage]) -> RecordedFrame:
+        stripes = parts[schemas.STRIPES.name]
+        try:
+            index, time_s, n_water, returns, refusal = messages.stripes_of(stripes.data)
+            picture = _picture(index, time_s, parts)
+        except (ValueError, AqualvsError) as fault:
+            raise SourceError(
+                f"{self.path}: a message cannot be understood ({fault}); "
+                "was it written by a later version?"
+            ) from fault
+        return RecordedFrame(index, time_s, n_water, returns, refusal, picture)
+
+    def _mean_rate(self) -> float | None:
+        """Return frames per second over the first few of them."""
+        first = last = None
+        for n, frame in enumerate(self.frames(with_pictures=False)):
+            first, last = first or frame, frame
+            if n == 50:
+                break
+        if first is None or last is None or last.time_s <= first.time_s:
+            return None
+        return (last.index - first.index) / (last.time_s - first.time_s)
+
+
+def is_recording(path: Path) -> bool:
+    """Return whether a file is a recording of stripes."""
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
+    try:
+        return schemas.STRIPES.name in McapFile(path).topics
+    except SourceError:
+        return False
+
+
+def _picture(index: int, time_s: float, parts: dict[str, StoredMessage]) -> Frame | None:
+    """Return the picture that came with the stripes."""
+    picture, chroma = parts.get(schemas.PICTURE.name), parts.get(schemas.CHROMA.name)
+    stamp_ns = parts[schemas.STRIPES.name].log_ns
+    if picture is None or picture.log_ns != stamp_ns:
+        return None
+    kind, data = messages.image_of(picture.data)
+    own_chroma = None
+    if chroma is not None and chroma.log_ns == stamp_ns:
+        own_chroma = messages.image_of(chroma.data)[1]
+    return pictures.frame_of(index, time_s, kind, data, own_chroma)

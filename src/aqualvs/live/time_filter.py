@@ -1,0 +1,266 @@
+"""Smoothing of range, pitch and yaw over time; optional, raw values stay available."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.posture import Posture, Refusal
+
+# A micrometre and a microradian: keeps a measurement that claims to be exact invertible.
+_LEAST_VARIANCE = 1e-12 * np.eye(3)
+
+
+@dataclass(frozen=True, slots=True)
+class FilteredPosture:
+    """State of the time filter.
+
+    Attributes
+    ----------
+    range, pitch, yaw : float
+        Metres and radians, as in `Posture`.
+    rates : array, shape (3,)
+        Their time derivatives, in m/s and rad/s.
+    covariance : array, shape (6, 6)
+        Of (range, pitch, yaw) and the rates.
+    age_s : float
+        Time since the last measurement that entered.
+    accepted : bool
+        Whether this frame's measurement entered; False where it was refused by the gate, or there
+        was none.
+    """
+
+    range: float
+    pitch: float
+    yaw: float
+    rates: FloatArray
+    covariance: FloatArray
+    age_s: float
+    accepted: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PostureFilterOptions:
+    """How the vehicle moves, and what the filter believes.
+
+    Attributes
+    ----------
+    range_acceleration : float
+        Random acceleration towards and from the target, in m/s², that acts for about a second: the
+        speed a second ahead is uncertain by so many m/s.
+    pitch_acceleration, yaw_acceleration : float
+        The same for the angles, in rad/s².
+    initial_speed, initial_turn_rate : float
+        Standard deviation of the rates when the filter starts, in m/s and rad/s.
+    gate_probability : float
+        Share of sound measurements that pass the gate.
+    n_rejected : int
+        Rejected measurements in a row that agree with each other, after which the filter believes
+        them: the target itself is elsewhere.
+    max_coast : float
+        Seconds without an accepted measurement after which there is no filtered posture.
+    """
+
+    range_acceleration: float = 0.2
+    pitch_acceleration: float = 0.3
+    yaw_acceleration: float = 0.5
+    initial_speed: float = 0.5
+    initial_turn_rate: float = 0.5
+    gate_probability: float = 0.9999
+    n_rejected: int = 5
+    max_coast: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        names = ("range_acceleration", "pitch_acceleration", "yaw_acceleration")
+        for name in (*names, "initial_speed", "initial_turn_rate", "max_coast"):
+            value = getattr(self, name)
+            if not (value > 0.0 and math.isfinite(value)):
+                raise OptionError(f"time filter, {name} {value:g}: must be positive")
+        if not 0.0 < self.gate_probability < 1.0:
+            raise OptionError(
+                f"time filter, gate_probability {self.gate_probability:g}: must lie between 0 and 1"
+            )
+        if self.n_rejected < 1:
+            raise OptionError(f"time filter, n_rejected {self.n_rejected}: must be at least 1")
+
+
+class PostureFilter:
+    """Kalman filter for range, pitch and yaw at constant rates, with a gate.
+
+    Parameters
+    ----------
+    options : PostureFilterOptions, optional
+        Defaults, for a small vehicle, if left out.
+
+    Notes
+    -----
+    White-noise acceleration (Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2) in continuous
+    time, so that the frame rate does not matter. Only measurements move the state; what `update`
+    returns between them is a forecast. A measurement beyond the gate starts a rival track; the
+    rival replaces the track once enough measurements in a row have agreed with it.
+
+    Pitch and yaw stay within 90 degrees of the target's normal by their definition, so that no
+    angle wraps. Errors of the rig are constant in time; no filter reduces them, and the covariance
+    does not hold them.
+    """
+
+    def __init__(self, options: PostureFilterOptions | None = None) -> None:
+        self.options = options or PostureFilterOptions()
+        self._motion = _Motion(self.options)
+        self._track: _Track | None = None
+        self._rival: _Track | None = None
+
+    def update(self, time_s: float, posture: Posture | Refusal) -> FilteredPosture | None:
+        """Take in what one frame gave, and return the state at its time.
+
+        Parameters
+        ----------
+        time_s : float
+            Of the frame, by the stream's clock. Where no frames come the caller lets it advance. A
+            measurement older than the last accepted one is left out; one older by more than
+            `max_coast` is that of another stream, and starts the filter anew.
+        posture : Posture or Refusal
+            As measured; never changed.
+
+        Returns
+        -------
+        filtered : FilteredPosture or None
+            None before the first measurement, and when none has been accepted for `max_coast`.
+        """
+        self._track = self._still_known(self._track, time_s)
+        self._rival = self._still_known(self._rival, time_s)
+        accepted = False
+        measured = _measurement(posture) if math.isfinite(time_s) else None
+        if measured is not None:
+            accepted = self._take(time_s, *measured)
+        if self._track is None:
+            return None
+        return self._motion.forecast(self._track, time_s).as_filtered(self._track, time_s, accepted)
+
+    def _still_known(self, track: "_Track | None", time_s: float) -> "_Track | None":
+        """Return the track unless it is too old, or from another stream."""
+        if track is None or abs(time_s - track.time_s) > self.options.max_coast:
+            return None
+        return track
+
+    def _take(self, time_s: float, measured: FloatArray, cov: FloatArray) -> bool:
+        """Update the track by a measurement that fits, else its rival; tell whether it entered."""
+        if self._track is None:
+            self._track = self._motion.started(time_s, measured, cov)
+            return True
+        if time_s < self._track.time_s:
+            return False
+        updated = self._motion.updated(self._track, time_s, measured, cov)
+        if updated is not None:
+            self._track, self._rival = updated, None
+            return True
+        self._rival = self._rival_with(time_s, measured, cov)
+        if self._rival.n_measurements < self.options.n_rejected:
+            return False
+        self._track, self._rival = self._rival, None
+        return True
+
+    def _rival_with(self, time_s: float, measured: FloatArray, cov: FloatArray) -> "_Track":
+        """Return the rival track with a measurement that did not fit the track."""
+        if self._rival is not None and time_s >= self._rival.time_s:
+            updated = self._motion.updated(self._rival, time_s, measured, cov)
+            if updated is not None:
+                return updated
+        return self._motion.started(time_s, measured, cov)
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """State (6,) = (range, pitch, yaw, rates) and its covariance at the last measurement."""
+
+    time_s: float
+    state: FloatArray
+    cov: FloatArray
+    n_measurements: int
+
+    def as_filtered(self, known: "_Track", time_s: float, accepted: bool) -> FilteredPosture:
+        """Return this forecast in the words of the outputs."""
+        distance, pitch, yaw = self.state[:3].tolist()
+        age_s = max(0.0, time_s - known.time_s)
+        return FilteredPosture(
+            distance, pitch, yaw, self.state[3:].copy(), self.cov.copy(), age_s, accepted
+        )
+
+
+class _Motion:
+    """How a track moves on and takes measurements in."""
+
+    def __init__(self, options: PostureFilterOptions) -> None:
+        accelerations = (
+            options.range_acceleration,
+            options.pitch_acceleration,
+            options.yaw_acceleration,
+        )
+        self._noise = np.diag(np.square(accelerations))
+        turn = options.initial_turn_rate
+        self._initial_rates = np.diag(np.square((options.initial_speed, turn, turn)))
+        # Below this squared Mahalanobis distance lies the share of three normal variables.
+        self._gate = float(chdtri(3.0, 1.0 - options.gate_probability))
+
+    def started(self, time_s: float, measured: FloatArray, cov: FloatArray) -> _Track:
+        """Return a track from its first measurement: its rates are unknown."""
+        full = np.zeros((6, 6))
+        full[:3, :3], full[3:, 3:] = cov, self._initial_rates
+        return _Track(time_s, np.concatenate((measured, np.zeros(3))), full, 1)
+
+    def forecast(self, track: _Track, time_s: float) -> _Track:
+        """Return the track at a later time; at an earlier one, as it is."""
+        dt = time_s - track.time_s
+        if not dt > 0.0:
+            return track
+        move = np.eye(6)
+        move[:3, 3:] = dt * np.eye(3)
+        cov = move @ track.cov @ move.T
+        cov[:3, :3] += self._noise * (dt**3 / 3.0)
+        cov[:3, 3:] += self._noise * (dt**2 / 2.0)
+        cov[3:, :3] += self._noise * (dt**2 / 2.0)
+        cov[3:, 3:] += self._noise * dt
+        return _Track(time_s, move @ track.state, cov, track.n_measurements)
+
+    def updated(
+        self, track: _Track, time_s: float, measured: FloatArray, cov: FloatArray
+    ) -> _Track | None:
+        """Return the track after a measurement, None if that lies beyond the gate."""
+        ahead = self.forecast(track, time_s)
+        surprise = measured - ahead.state[:3]
+        of_surprise = ahead.cov[:3, :3] + cov
+        weight = np.linalg.inv(of_surprise)
+        if surprise @ weight @ surprise > self._gate:
+            return None
+        gain = ahead.cov[:, :3] @ weight
+        # Joseph's form stays positive whatever rounding does.
+        keep = np.eye(6)
+        keep[:, :3] -= gain
+        after = keep @ ahead.cov @ keep.T + gain @ cov @ gain.T
+        state = ahead.state + gain @ surprise
+        return _Track(time_s, state, 0.5 * (after + after.T), track.n_measurements + 1)
+
+
+def _measurement(posture: Posture | Refusal) -> tuple[FloatArray, FloatArray] | None:
+    """Return (range, pitch, yaw) and their covariance, None where there is nothing to use."""
+    if not isinstance(posture, Posture):
+        return None
+    measured = np.array([posture.range, posture.pitch, posture.yaw])
+    cov = 0.5 * (posture.covariance + posture.covariance.T) + _LEAST_VARIANCE
+    if not (np.isfinite(measured).all() and np.isfinite(cov).all()):
+        return None
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return None
+    return measured, cov

@@ -1,0 +1,274 @@
+"""Sends a clip of H.264 as vehicles do; a program of its own, so that the tests hear a real stream.
+
+RTP and MPEG-TS are made by FFmpeg's muxers, and pass through a relay that loses, damages or
+renumbers datagrams by a fixed seed.
+"""
+
+import argparse
+import contextlib
+import json
+import random
+import socket
+import struct
+import threading
+import time
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.video.frame import VideoFrame
+
+LOOPBACK = "127.0.0.1"
+
+
+def make_clip(path, size, n_frames, *, gop=25, bitrate=2_000_000, content=None, **options):
+    """Encode moving pictures at 25 frames a second, key frame first; returns the path."""
+    fps = 25
+    codec = av.CodecContext.create("libx264", "w")
+    codec.width, codec.height = size
+    codec.pix_fmt = "yuv420p"
+    codec.time_base, codec.framerate = Fraction(1, fps), fps
+    codec.bit_rate, codec.gop_size = bitrate, gop
+    codec.options = {"preset": "ultrafast", "tune": "zerolatency", **options}
+    packets = []
+    for i, image in enumerate((content or moving_pattern)(size, n_frames)):
+        frame = VideoFrame.from_ndarray(image, format="bgr24")
+        frame.pts = i
+        packets += codec.encode(frame)
+    packets += codec.encode(None)
+    lengths = [packet.size for packet in packets]
+    head = json.dumps({"size": size, "fps": fps, "lengths": lengths})
+    path.write_bytes(head.encode() + b"\n" + b"".join(bytes(p) for p in packets))
+    return path
+
+
+def read_clip(path):
+    """Return the head of a clip and its pictures."""
+    head, _, body = path.read_bytes().partition(b"\n")
+    head = json.loads(head)
+    ends = np.cumsum(head["lengths"]).tolist()
+    return head, [body[end - n : end] for end, n in zip(ends, head["lengths"], strict=True)]
+
+
+def moving_pattern(size, n_frames):
+    """Yield coarse noise that slides, so that every picture differs and predicts the next one."""
+    import cv2
+
+    width, height = size
+    rng = np.random.default_rng(1)
+    coarse = rng.integers(0, 256, (height // 16 + 20, width // 16 + 40, 3), dtype=np.uint8)
+    board = cv2.resize(coarse, None, fx=16, fy=16, interpolation=cv2.INTER_CUBIC)
+    for i in range(n_frames):
+        x, y = (5 * i) % 500, (2 * i) % 200
+        yield np.ascontiguousarray(board[y : y + height, x : x + width])
+
+
+def moving_stripes(size, n_frames):
+    """Yield dark pictures with three bright stripes that turn, like those of lasers."""
+    import cv2
+
+    width, height = size
+    rng = np.random.default_rng(2)
+    dark = cv2.resize(rng.integers(8, 24, (height // 32, width // 32, 3), dtype=np.uint8), size)
+    for i in range(n_frames):
+        image = dark.copy()
+        for k in (1, 2, 3):
+            y = k * height // 4 + (3 * i) % 40
+            cv2.line(image, (0, y), (width, y + 4 * k - 2 * i % 30), (40, 250, 40), 3)
+        yield image
+
+
+class Relay:
+    """Passes on datagrams, all but those it loses."""
+
+    def __init__(self, send, options):
+        self.inlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.inlet.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        self.inlet.bind((LOOPBACK, 0))
+        self.port = self.inlet.getsockname()[1]
+        self.n_sent = self.n_lost = self.n_damaged = 0
+        self._send = send
+        self._options = options
+        self._random = random.Random(options.seed)
+        self._shift = None
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self):
+        while True:
+            datagram = self.inlet.recv(65536)
+            if self._random.random() < self._options.loss:
+                self.n_lost += 1
+                continue
+            self._send(self._spoilt(datagram))
+            self.n_sent += 1
+
+    def _spoilt(self, datagram):
+        data = bytearray(datagram)
+        if self._options.first_time is not None:
+            stamp = int.from_bytes(data[4:8], "big")
+            if self._shift is None:
+                self._shift = self._options.first_time - stamp
+            data[4:8] = ((stamp + self._shift) % 2**32).to_bytes(4, "big")
+        if self._random.random() < self._options.damage and len(data) > 100:
+            self.n_damaged += 1
+            for _ in range(8):
+                data[self._random.randrange(20, len(data))] ^= 1 << self._random.randrange(8)
+        return bytes(data)
+
+
+class Muxer:
+    """FFmpeg's packing into RTP or MPEG-TS; or none."""
+
+    def __init__(self, kind, port, head, ssrc):
+        self._bare = None
+        if kind == "bare":
+            self._bare = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._to = (LOOPBACK, port)
+            return
+        if kind == "rtp":
+            where, form = f"rtp://{LOOPBACK}:{port}?pkt_size=1200", "rtp"
+            options = {"payload_type": "96", "ssrc": str(ssrc)}
+        else:
+            where, form, options = f"udp://{LOOPBACK}:{port}?pkt_size=1316", "mpegts", {}
+        self._container = av.open(where, "w", format=form, options=options)
+        self._stream = self._container.add_stream("libx264", rate=head["fps"])
+        self._stream.width, self._stream.height = head["size"]
+        self._stream.pix_fmt = "yuv420p"
+        self._fps = head["fps"]
+
+    def send(self, i, data, *, is_key):
+        if self._bare is not None:
+            for at in range(0, len(data), 1400):
+                self._bare.sendto(data[at : at + 1400], self._to)
+            return
+        packet = av.Packet(data)
+        packet.pts = packet.dts = i
+        packet.time_base = Fraction(1, self._fps)
+        packet.stream = self._stream
+        packet.is_keyframe = is_key
+        self._container.mux(packet)
+
+    def close(self):
+        if self._bare is None:
+            self._container.close()
+
+
+def send_clips(options, send):
+    """Send the clips one after the other, in real time."""
+    relay = Relay(send, options)
+    n_frames, began, late = 0, time.monotonic(), 0.0
+    first = began
+    for repeat in range(options.repeat):
+        for path in options.clips:
+            head, pictures = read_clip(Path(path))
+            if n_frames == 0 or len(options.clips) > 1:
+                muxer = Muxer(options.kind, relay.port, head, options.ssrc + repeat)
+            for i, data in enumerate(pictures):
+                if n_frames in options.pause:
+                    time.sleep(options.pause_s)
+                    began += options.pause_s
+                due = began + n_frames / (head["fps"] * options.speed)
+                time.sleep(max(0.0, due - time.monotonic()))
+                late = max(late, time.monotonic() - due)
+                muxer.send(n_frames, data, is_key=i == 0)
+                n_frames += 1
+    muxer.close()
+    time.sleep(0.1)
+    return {
+        "began": first,
+        "frames": n_frames,
+        "packets": relay.n_sent,
+        "lost": relay.n_lost,
+        "damaged": relay.n_damaged,
+        "late_s": late,
+    }
+
+
+def to_port(port):
+    outlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def send(datagram):
+        with contextlib.suppress(ConnectionRefusedError):
+            outlet.sendto(datagram, (LOOPBACK, port))
+
+    return send
+
+
+class RtspServer:
+    """The least of RTSP (RFC 2326): one client at a time, RTP interleaved in its connection."""
+
+    def __init__(self, options):
+        self._options = options
+        self._listener = socket.create_server((LOOPBACK, options.port))
+
+    def serve(self):
+        connection, _ = self._listener.accept()
+        with connection, connection.makefile("rb") as lines:
+            while self._answer(connection, lines) != "PLAY":
+                pass
+            return send_clips(self._options, self._interleaved(connection))
+
+    def _answer(self, connection, lines):
+        method = lines.readline().split()[0].decode()
+        fields = {}
+        while line := lines.readline().strip():
+            key, _, value = line.decode().partition(":")
+            fields[key.lower()] = value.strip()
+        extra, body = {}, ""
+        if method == "OPTIONS":
+            extra["Public"] = "OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN"
+        elif method == "DESCRIBE":
+            body = (
+                "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=test\r\nt=0 0\r\n"
+                "m=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000\r\n"
+                "a=fmtp:96 packetization-mode=1\r\na=control:track1\r\n"
+            )
+            extra["Content-Type"] = "application/sdp"
+        elif method == "SETUP":
+            extra["Transport"] = "RTP/AVP/TCP;unicast;interleaved=0-1"
+        answer = f"RTSP/1.0 200 OK\r\nCSeq: {fields['cseq']}\r\nSession: 1\r\n"
+        answer += "".join(f"{k}: {v}\r\n" for k, v in extra.items())
+        connection.sendall(f"{answer}Content-Length: {len(body)}\r\n\r\n{body}".encode())
+        return method
+
+    def _interleaved(self, connection):
+        def send(datagram):
+            channel = 1 if 200 <= datagram[1] <= 211 else 0
+            with contextlib.suppress(OSError):
+                connection.sendall(struct.pack("!BBH", 0x24, channel, len(datagram)) + datagram)
+
+        return send
+
+
+def parse_options():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("clips", nargs="+")
+    parser.add_argument("--kind", choices=("rtp", "mpegts", "bare"), default="rtp")
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--rtsp", action="store_true", help="serve on the port, do not send to it")
+    parser.add_argument("--repeat", type=int, default=1)
+    parser.add_argument("--speed", type=float, default=1.0)
+    parser.add_argument("--loss", type=float, default=0.0)
+    parser.add_argument("--damage", type=float, default=0.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ssrc", type=int, default=1000)
+    parser.add_argument("--first-time", type=int, default=None, help="of RTP, 32 bits")
+    parser.add_argument("--pause", type=int, nargs="*", default=[], help="before these frames")
+    parser.add_argument("--pause-s", type=float, default=1.0)
+    return parser.parse_args()
+
+
+def main():
+    options = parse_options()
+    if options.rtsp:
+        server = RtspServer(options)
+        print("ready", flush=True)
+        print(json.dumps(server.serve()), flush=True)
+    else:
+        print("ready", flush=True)
+        print(json.dumps(send_clips(options, to_port(options.port))), flush=True)
+
+
+if __name__ == "__main__":
+    main()

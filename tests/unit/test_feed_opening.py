@@ -1,0 +1,241 @@
+"""What a user types, and the feed that reads it."""
+
+import base64
+import sys
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.health import State
+from aqualvs.live.sources import ImageSource, open_feed, open_source
+from aqualvs.live.sources.camera import CameraFeed, CameraOptions, camera_device
+from aqualvs.live.sources.datagrams import UdpAddress, parse_udp
+from aqualvs.live.sources.paced import PacedFeed
+from aqualvs.live.sources.remote import RemoteFeed
+from aqualvs.live.sources.sdp import read_sdp
+from aqualvs.live.sources.udp import UdpFeed
+from shell_cases import cut_after, picture, write_video
+
+SDP = """v=0
+o=- 1188340656180883 1 IN IP4 192.168.2.2
+s=BlueROV2
+t=0 0
+m=audio 5000 RTP/AVP 97
+m=video 5600 RTP/AVP 96
+c=IN IP4 {host}
+a=rtpmap:96 {codec}/90000
+a=fmtp:96 packetization-mode=1; sprop-parameter-sets={sets}
+"""
+
+
+@pytest.mark.parametrize(
+    ("where", "kind"),
+    [
+        ("bluerov", UdpFeed),
+        ("udp://:5600", UdpFeed),
+        ("udp://@:5600", UdpFeed),
+        ("UDP://0.0.0.0:5600?overrun_nonfatal=1", UdpFeed),
+        ("rtp://239.1.2.3:5600", UdpFeed),
+        ("rtsp://192.168.2.2:8554/video", RemoteFeed),
+        ("srt://192.168.2.2:7000", RemoteFeed),
+        ("tcp://192.168.2.2:7000", RemoteFeed),
+        ("camera:0", CameraFeed),
+        ("/dev/video3", CameraFeed),
+        ("/dev/v4l/by-id/usb-camera", CameraFeed),
+    ],
+)
+def test_the_table_of_feeds(where, kind):
+    feed = open_feed(where)
+    assert type(feed) is kind
+    assert feed.health().state is State.FAULT
+    feed.close()
+    assert (feed.health().state, feed.name) == (State.OFF, feed.health().name)
+
+
+@pytest.mark.parametrize(
+    ("where", "host", "port"),
+    [
+        ("udp://:5600", "", 5600),
+        ("udp://@:5600", "", 5600),
+        ("udp://@239.255.1.2:1234", "239.255.1.2", 1234),
+        ("udp://0.0.0.0:5600", "0.0.0.0", 5600),
+        ("rtp://localhost:5004", "127.0.0.1", 5004),
+        ("udp://[::]:5600", "::", 5600),
+    ],
+)
+def test_addresses_to_listen_on(where, host, port):
+    assert parse_udp(where) == UdpAddress(host, port)
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ("udp://192.168.2.1", "no port"),
+        ("udp://:99999", "no port"),
+        ("udp://blueos.local:5600", r"numeric address.*udp://:5600"),
+    ],
+)
+def test_addresses_that_cannot_work_are_refused_in_one_line(where, words):
+    with pytest.raises(SourceError, match=words) as fault:
+        open_feed(where)
+    assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    ("where", "options", "words"),
+    [
+        ("udp://:5600", {"transport": "tcp"}, "only RTSP"),
+        ("udp://:5600", {"fps": 25.0}, "own clock"),
+        ("rtsp://a/b", {"topic": "/camera"}, "no topics"),
+        ("rtsp://a/b", {"size_px": (640, 480)}, "only a camera"),
+        ("camera:0", {"topic": "/camera"}, "neither transport nor topic"),
+        ("camera:0", {"fps": -1.0}, "must be positive"),
+    ],
+)
+def test_options_that_do_not_go_with_a_source_are_refused(where, options, words):
+    with pytest.raises(OptionError, match=words):
+        open_feed(where, **options)
+
+
+def sdp_file(tmp_path, *, host="192.168.2.1", codec="H264", sets=""):
+    path = tmp_path / "camera.sdp"
+    path.write_text(SDP.format(host=host, codec=codec, sets=sets).replace("\n", "\r\n"))
+    return path
+
+
+def test_a_session_description_gives_port_type_and_parameter_sets(tmp_path):
+    sets = b"\x67\x42\x00\x1e", b"\x68\xce\x38\x80"
+    text = ",".join(base64.b64encode(each).decode() for each in sets)
+    video = read_sdp(sdp_file(tmp_path, sets=text))
+    assert (video.address, video.payload_type, video.codec) == (UdpAddress("", 5600), 96, "H264")
+    assert video.parameter_sets == b"".join(b"\x00\x00\x00\x01" + each for each in sets)
+    feed = open_feed(tmp_path / "camera.sdp")
+    assert type(feed) is UdpFeed
+    assert feed.port == 5600
+
+
+def test_a_session_of_a_group_or_of_another_codec(tmp_path):
+    assert read_sdp(sdp_file(tmp_path, host="239.1.2.3/64")).address.host == "239.1.2.3"
+    assert type(open_feed(sdp_file(tmp_path, codec="H265"))) is RemoteFeed
+
+
+def test_a_session_without_video_is_refused(tmp_path):
+    path = tmp_path / "sound.sdp"
+    path.write_text("v=0\nm=audio 5000 RTP/AVP 97\n")
+    with pytest.raises(SourceError, match="announces no video"):
+        open_feed(path)
+    with pytest.raises(SourceError, match="cannot be read"):
+        open_feed(tmp_path / "missing.sdp")
+    with pytest.raises(SourceError, match="aqualvs live"):
+        open_source(path)
+
+
+@pytest.mark.parametrize(
+    ("where", "device"),
+    [
+        ("camera:2", "/dev/video2"),
+        ("/dev/video0", "/dev/video0"),
+        ("camera:/dev/v4l/by-id/usb", "/dev/v4l/by-id/usb"),
+    ],
+)
+def test_names_of_cameras(where, device):
+    assert camera_device(where) == device
+
+
+def test_what_is_asked_of_a_camera():
+    options = CameraOptions(size_px=(1920, 1080), fps=29.97, pixel_format="h264")
+    assert options.for_ffmpeg() == {
+        "video_size": "1920x1080",
+        "framerate": "29.97",
+        "input_format": "h264",
+    }
+    assert CameraOptions().for_ffmpeg() == {}
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Video4Linux")
+def test_a_missing_camera_is_said_in_one_line():
+    with pytest.raises(SourceError, match=r"/dev/video987: no such camera") as fault:
+        next(iter(open_feed("camera:987")))
+    assert "\n" not in str(fault.value)
+    with pytest.raises(SourceError, match="names no camera"):
+        open_feed("camera:")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Video4Linux")
+def test_a_device_that_is_no_camera_is_tried_again(tmp_path):
+    """A file stands for a camera that another program holds: it exists and cannot be opened."""
+    path = tmp_path / "video0"
+    path.write_bytes(b"")
+    feed = CameraFeed(f"camera:{path}", CameraOptions())
+    thread = threading.Thread(target=lambda: list(feed), daemon=True)
+    thread.start()
+    end = time.monotonic() + 10
+    while "no connection" not in feed.health().detail and time.monotonic() < end:
+        time.sleep(0.01)
+    assert feed.health().state is State.FAULT
+    feed.close()
+    thread.join(1.0)
+    assert not thread.is_alive()
+
+
+def images(folder, n):
+    for i in range(n):
+        cv2.imwrite(str(folder / f"{i}.png"), picture(i, (96, 64)))
+    return folder
+
+
+def test_a_recording_comes_at_its_own_pace_or_as_fast_as_it_is_taken(tmp_path):
+    images(tmp_path, 5)
+    spans = {}
+    for realtime in (True, False):
+        feed = open_feed(tmp_path, realtime=realtime, fps=20.0)
+        began = time.monotonic()
+        frames = list(feed)
+        spans[realtime] = time.monotonic() - began
+        assert [f.index for f in frames] == list(range(5))
+        assert [f.time_s for f in frames] == pytest.approx([0, 0.05, 0.1, 0.15, 0.2])
+        assert feed.health().state is State.OFF
+    # Reading five tiny pictures takes a hundredth of the time that the first run waits.
+    assert spans[True] >= 0.2
+    assert spans[False] < 0.2
+
+
+def test_a_paced_recording_can_be_closed_while_it_waits(tmp_path):
+    feed = open_feed(images(tmp_path, 2), fps=0.01)
+    frames = iter(feed)
+    next(frames)
+    threading.Timer(0.1, feed.close).start()
+    began = time.monotonic()
+    assert list(frames) == []
+    assert time.monotonic() - began < 1.0
+    assert feed.health().detail == "closed"
+
+
+def test_lost_frames_of_a_recording_are_counted_and_its_faults_told(tmp_path):
+    images(tmp_path, 5)
+    (tmp_path / "2.png").write_bytes(b"broken")
+    feed = PacedFeed(ImageSource(tmp_path, fps=1000.0), realtime=False)
+    assert [f.index for f in feed] == [0, 1, 3, 4]
+    assert feed.health().n_dropped == 1
+    mux = {"movflags": "faststart"}
+    path = write_video(tmp_path / "a.mp4", 20, size=(96, 64), mux=mux)
+    cut_after(path, 9)
+    with pytest.raises(SourceError, match="of 20 frames"):
+        list(open_feed(path, realtime=False))
+
+
+def test_a_missing_file_is_refused_at_once(tmp_path):
+    with pytest.raises(SourceError, match="no such file"):
+        open_feed(tmp_path / "missing.mp4")
+
+
+def test_pictures_of_a_paced_video_are_those_of_the_source(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 6, size=(96, 64))
+    with open_source(path) as source:
+        true = [f.luma for f in source]
+    found = [f.luma for f in open_feed(str(path), realtime=False)]
+    assert all(np.array_equal(a, b) for a, b in zip(found, true, strict=True))

@@ -1,0 +1,412 @@
+"""What ROS is told, and the bytes it takes: against the serialiser of rosbags."""
+
+import dataclasses
+import functools
+import math
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from aqualvs.errors import OptionError
+from aqualvs.live.health import Health, PartHealth, StageDelay, State
+from aqualvs.live.outputs.axes import FLU_FROM_DOME, plane_pose
+from aqualvs.live.outputs.dds_types import dds_types, type_hash
+from aqualvs.live.outputs.ros1_messages import ROS1_TYPES, to_ros1
+from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, range_has_variance, to_ros2
+from aqualvs.live.outputs.ros_messages import (
+    POINT_FIELDS,
+    POINT_TYPE,
+    CloudMessage,
+    Message,
+    MessageMaker,
+    PoseMessage,
+    RangeMessage,
+    RosOptions,
+    Topic,
+)
+from aqualvs.live.outputs.ros_messages_diagnostics import DiagnosticsMessage, Level, Status
+from aqualvs.live.sample import LiveSample
+from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.scanning.scan import ScanPoints
+from live_cases import demo_samples
+
+STORES = {
+    "humble": Stores.ROS2_HUMBLE,
+    "iron": Stores.ROS2_IRON,
+    "jazzy": Stores.ROS2_JAZZY,
+    "kilted": Stores.ROS2_KILTED,
+}
+
+names = st.text(max_size=12)
+stamps = st.integers(0, 2**31 * 10**9 - 1)
+reals = st.floats(allow_nan=False)
+singles = st.floats(width=32)
+
+
+def real_arrays(size: int) -> st.SearchStrategy[np.ndarray]:
+    return st.lists(reals, min_size=size, max_size=size).map(np.array)
+
+
+statuses = st.builds(
+    Status,
+    level=st.sampled_from(Level),
+    name=names,
+    message=names,
+    hardware_id=names,
+    values=st.lists(st.tuples(names, names), max_size=4).map(tuple),
+)
+messages = st.one_of(
+    st.builds(
+        PoseMessage,
+        stamp_ns=stamps,
+        frame_id=names,
+        position=real_arrays(3),
+        quaternion=real_arrays(4),
+        covariance=real_arrays(36),
+    ),
+    st.builds(
+        RangeMessage,
+        stamp_ns=stamps,
+        frame_id=names,
+        field_of_view=singles,
+        min_range=singles,
+        max_range=singles,
+        range=singles,
+        variance=singles,
+    ),
+    st.integers(0, 9).flatmap(
+        lambda n: st.builds(
+            CloudMessage,
+            stamp_ns=stamps,
+            frame_id=names,
+            width=st.just(n),
+            data=st.binary(min_size=24 * n, max_size=24 * n),
+            is_dense=st.booleans(),
+        )
+    ),
+    st.builds(
+        DiagnosticsMessage, stamp_ns=stamps, statuses=st.lists(statuses, max_size=4).map(tuple)
+    ),
+)
+
+
+@functools.cache
+def sample() -> LiveSample:
+    found = demo_samples(2)[1]
+    assert found.scan.posture
+    return found
+
+
+def refused(reason: Reason) -> LiveSample:
+    """A sample without posture, its points kept."""
+    found = sample()
+    return replace(found, scan=replace(found.scan, posture=Refusal(reason, "because")))
+
+
+def shifted(found: LiveSample, forward: float) -> LiveSample:
+    points = found.scan.points
+    moved = points.points_in_dome + np.array([0.0, forward, 0.0])
+    scan = replace(found.scan, points=replace(points, points_in_dome=moved))
+    return replace(found, scan=scan)
+
+
+def told(found: LiveSample, options: RosOptions | None = None) -> dict[Topic, Any]:
+    return dict(MessageMaker(options or RosOptions()).messages(found, set(Topic)))
+
+
+def topic_of(message: Message) -> Topic:
+    return {
+        PoseMessage: Topic.POSTURE,
+        RangeMessage: Topic.RANGE,
+        CloudMessage: Topic.CLOUD,
+        DiagnosticsMessage: Topic.DIAGNOSTICS,
+    }[type(message)]
+
+
+@functools.cache
+def rosbags_types(distro: str) -> Ros2Types:
+    """The message classes of rosbags, which know nothing of ours."""
+    store = get_typestore(STORES[distro])
+
+    def pose(**fields: Any) -> Any:
+        fields["covariance"] = np.array(fields["covariance"])
+        return store.types["geometry_msgs/msg/PoseWithCovariance"](**fields)
+
+    return Ros2Types(
+        classes={**store.types, "geometry_msgs/msg/PoseWithCovariance": pose},
+        range_has_variance="variance" in store.types[TYPE_NAMES[Topic.RANGE]].__annotations__,
+        octet=int,
+        octets=lambda data: np.frombuffer(data, np.uint8),
+    )
+
+
+@pytest.mark.parametrize("distro", STORES)
+@settings(max_examples=40, deadline=None)
+@given(message=messages)
+def test_bytes_of_ros2_are_those_of_rosbags(distro: str, message: Message) -> None:
+    types = dds_types(distro)
+    own = to_ros2(types, message).serialize(use_version_2=False)
+    name = TYPE_NAMES[topic_of(message)]
+    expected = get_typestore(STORES[distro]).serialize_cdr(
+        to_ros2(rosbags_types(distro), message), name
+    )
+    assert own == bytes(expected)
+
+
+@settings(max_examples=40, deadline=None)
+@given(message=messages, seq=st.integers(0, 2**32 - 1))
+def test_bytes_of_ros1_are_those_of_rosbags(message: Message, seq: int) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    name = TYPE_NAMES[topic_of(message)]
+    expected = store.serialize_ros1(ros1_message(store, message, seq), name)
+    assert to_ros1(message, seq) == bytes(expected)
+
+
+def ros1_message(store: Any, message: Message, seq: int) -> Any:
+    """The message in the classes of rosbags: as for ROS 2, with a number in the header."""
+    kinds = dict(store.types)
+    header = kinds["std_msgs/msg/Header"]
+    types = replace(rosbags_types("humble"), classes=kinds)
+    kinds["std_msgs/msg/Header"] = lambda **fields: header(seq=seq, **fields)
+    made = to_ros2(types, message)
+    if isinstance(message, PoseMessage):
+        made.pose.covariance = np.array(made.pose.covariance)
+    return made
+
+
+@pytest.mark.parametrize("topic", Topic)
+def test_ros1_types_are_noetic_s(topic: Topic) -> None:
+    noetic, kind = get_typestore(Stores.ROS1_NOETIC), ROS1_TYPES[topic]
+    full = TYPE_NAMES[topic]
+    assert full.replace("/msg/", "/") == kind.name
+    assert noetic.generate_msgdef(full, ros_version=1)[1] == kind.md5sum
+    # The text alone says it all, and leads to the same checksum.
+    told_only = get_typestore(Stores.EMPTY)
+    told_only.register(get_types_from_msg(kind.definition, full))
+    assert told_only.generate_msgdef(full, ros_version=1)[1] == kind.md5sum
+
+
+@pytest.mark.parametrize("distro", ["iron", "jazzy", "kilted"])
+@pytest.mark.parametrize("topic", Topic)
+def test_type_hashes(topic: Topic, distro: str) -> None:
+    expected = get_typestore(STORES[distro]).hash_rihs01(TYPE_NAMES[topic])
+    assert type_hash(topic) == f"typehash={expected};".encode()
+
+
+@pytest.mark.parametrize("distro", STORES)
+def test_range_has_variance_since_iron(distro: str) -> None:
+    assert rosbags_types(distro).range_has_variance is range_has_variance(distro)
+
+
+def test_posture_is_told_as_pose() -> None:
+    found = sample()
+    posture = found.scan.posture
+    assert posture
+    pose = told(found)[Topic.POSTURE]
+    expected = plane_pose(posture.range, posture.pitch, posture.yaw, posture.covariance)
+    assert pose.stamp_ns == found.utc_ns
+    assert pose.frame_id == "aqualvs_dome"
+    np.testing.assert_allclose(
+        pose.position, posture.range * FLU_FROM_DOME @ posture.normal_in_dome, atol=1e-12
+    )
+    assert pose.quaternion.tolist() == expected.quaternion.tolist()
+    assert pose.covariance.tolist() == expected.covariance.ravel().tolist()
+
+
+def test_filtered_posture_has_its_own_topic() -> None:
+    cov = np.diag([1e-6, 1e-4, 4e-4, 1.0, 1.0, 1.0])
+    smooth = FilteredPosture(0.8, 0.0, 0.0, np.zeros(3), cov, 0.02, True)
+    pose = told(replace(sample(), filtered=smooth))[Topic.FILTERED]
+    assert pose.position.tolist() == pytest.approx([0.8, 0.0, 0.0])
+    assert pose.covariance.reshape(6, 6)[5, 5] == pytest.approx(4e-4)
+    assert Topic.FILTERED not in told(sample())
+
+
+def test_cloud_holds_every_point() -> None:
+    found = sample()
+    points, cloud = found.scan.points, told(found)[Topic.CLOUD]
+    rows = np.frombuffer(cloud.data, POINT_TYPE)
+    assert len(rows) == cloud.width == len(points) > 500
+    xyz = np.column_stack([rows["x"], rows["y"], rows["z"]])
+    # Single precision: 1e-7 of a metre.
+    np.testing.assert_allclose(xyz, points.points_in_dome @ FLU_FROM_DOME.T, atol=1e-6)
+    for name in ("intensity", "sigma", "laser", "label", "used"):
+        np.testing.assert_allclose(rows[name], getattr(points, name), rtol=1e-6)
+    assert cloud.is_dense
+
+
+def test_fields_describe_the_points() -> None:
+    datatypes = {1: np.int8, 2: np.uint8, 7: np.float32}
+    layout = {
+        "names": [field.name for field in POINT_FIELDS],
+        "formats": [datatypes[field.datatype] for field in POINT_FIELDS],
+        "offsets": [field.offset for field in POINT_FIELDS],
+        "itemsize": 24,
+    }
+    assert np.dtype(layout) == POINT_TYPE
+
+
+def test_cloud_says_that_a_point_is_missing() -> None:
+    assert not told(shifted(sample(), math.nan))[Topic.CLOUD].is_dense
+
+
+def test_no_points() -> None:
+    found = sample()
+    empty = replace(found, scan=replace(found.scan, points=ScanPoints.none()))
+    cloud = told(empty)[Topic.CLOUD]
+    assert (cloud.width, cloud.data, cloud.is_dense) == (0, b"", True)
+
+
+def test_range() -> None:
+    found = sample()
+    posture = found.scan.posture
+    assert posture
+    told_range = told(found)[Topic.RANGE]
+    assert told_range.range == posture.range
+    assert told_range.variance == posture.covariance[0, 0]
+    assert (told_range.min_range, told_range.max_range) == found.rig.working_range
+    # The demo's camera sees 36 degrees of water.
+    assert 0.6 < told_range.field_of_view < 0.66
+
+
+def test_a_range_that_is_believed_lies_between_the_limits() -> None:
+    found = sample()
+    posture = found.scan.posture
+    assert posture
+    near, far = found.rig.working_range
+    beyond = replace(posture, range=1.005 * far)
+    told_range = told(replace(found, scan=replace(found.scan, posture=beyond)))[Topic.RANGE]
+    assert told_range.min_range == near
+    assert told_range.max_range == told_range.range == 1.005 * far
+
+
+@pytest.mark.parametrize("reason", [r for r in Reason if r is not Reason.OUT_OF_RANGE])
+def test_without_posture(reason: Reason) -> None:
+    found = told(refused(reason))
+    assert Topic.POSTURE not in found
+    assert math.isnan(found[Topic.RANGE].range)
+    assert found[Topic.RANGE].min_range < found[Topic.RANGE].max_range
+    assert found[Topic.CLOUD].width > 0
+
+
+@pytest.mark.parametrize(("forward", "expected"), [(-0.5, -math.inf), (0.5, math.inf)])
+def test_too_near_and_too_far(forward: float, expected: float) -> None:
+    found = told(shifted(refused(Reason.OUT_OF_RANGE), forward))
+    assert found[Topic.RANGE].range == expected
+
+
+def test_out_of_range_without_points_is_unknown() -> None:
+    found = refused(Reason.OUT_OF_RANGE)
+    found = replace(found, scan=replace(found.scan, points=ScanPoints.none()))
+    assert math.isnan(told(found)[Topic.RANGE].range)
+
+
+def test_only_what_is_wanted_is_made() -> None:
+    maker = MessageMaker(RosOptions())
+    assert [topic for topic, _ in maker.messages(sample(), {Topic.RANGE})] == [Topic.RANGE]
+
+
+def test_diagnostics_come_once_a_second() -> None:
+    maker, found = MessageMaker(RosOptions()), sample()
+    count: Counter[Topic] = Counter()
+    for i in range(101):
+        at = replace(found.instants, scanned_ns=40_000_000 * i)
+        # The system's clock may jump; the pace must not.
+        jumping = replace(found, instants=at, utc_ns=found.utc_ns - 10**12 * (i % 2))
+        count.update(topic for topic, _ in maker.messages(jumping, set(Topic)))
+    assert count[Topic.RANGE] == 101
+    assert count[Topic.DIAGNOSTICS] == 5
+
+
+def test_diagnostics() -> None:
+    health = Health(
+        rate_hz=24.9,
+        valid_share=0.97,
+        n_frames=250,
+        n_dropped=3,
+        n_lost=1,
+        delays=(StageDelay("total", 0.0031, 0.0072),),
+        source=PartHealth("udp", State.WARN, "packets lost", 4),
+        lasers=(PartHealth("left", State.OK), PartHealth("right", State.OFF, "not seen yet")),
+        outputs=(PartHealth("mavlink", State.FAULT, "no peer", 2),),
+        quality=0.8,
+        n_water=1.339,
+    )
+    found = told(replace(sample(), health=health))[Topic.DIAGNOSTICS]
+    by_name = {status.name: status for status in found.statuses}
+    assert list(by_name) == [
+        "aqualvs: posture",
+        "aqualvs: pipeline",
+        "aqualvs: source",
+        "aqualvs: laser left",
+        "aqualvs: laser right",
+        "aqualvs: output mavlink",
+    ]
+    assert {status.hardware_id for status in found.statuses} == {sample().rig.name}
+    pipeline = by_name["aqualvs: pipeline"]
+    assert pipeline.message == "24.9 frames/s, 97% with a posture"
+    values = dict(pipeline.values)
+    assert values["rate_hz"] == "24.9"
+    assert values["n_dropped"] == "3"
+    assert values["n_water"] == "1.339"
+    assert values["sigma_n_water"] == "nan"
+    assert values["total_median_ms"] == "3.1"
+    assert values["total_p99_ms"] == "7.2"
+    assert by_name["aqualvs: source"].level is Level.WARN
+    assert dict(by_name["aqualvs: source"].values)["n_dropped"] == "4"
+    assert by_name["aqualvs: laser right"].message == "not in use: not seen yet"
+    assert by_name["aqualvs: laser right"].level is Level.OK
+    assert by_name["aqualvs: output mavlink"].level is Level.ERROR
+    posture = by_name["aqualvs: posture"]
+    assert posture.level is Level.OK
+    assert float(dict(posture.values)["range_m"]) == pytest.approx(
+        sample().scan.posture.range,  # type: ignore[union-attr]
+        rel=1e-5,
+    )
+
+
+def test_diagnostics_without_posture() -> None:
+    found = replace(refused(Reason.NO_STRIPES), health=Health())
+    posture, pipeline, *_ = told(found)[Topic.DIAGNOSTICS].statuses
+    assert (posture.level, posture.message) == (Level.WARN, "no_stripes: because")
+    assert (pipeline.level, pipeline.message) == (Level.WARN, "0.0 frames/s")
+
+
+def test_names() -> None:
+    options = RosOptions(namespace="rov1/aqualvs", frame_id="rov1/dome")
+    assert options.topic_name(Topic.CLOUD) == "/rov1/aqualvs/cloud"
+    assert options.topic_name(Topic.DIAGNOSTICS) == "/diagnostics"
+    assert told(sample(), options)[Topic.RANGE].frame_id == "rov1/dome"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"namespace": "/aqualvs"},
+        {"namespace": "2nd"},
+        {"namespace": "rov 1"},
+        {"namespace": ""},
+        {"frame_id": "/dome"},
+        {"frame_id": ""},
+        {"diagnostics_period_s": 0.0},
+        {"diagnostics_period_s": math.nan},
+    ],
+)
+def test_wrong_options(wrong: dict[str, Any]) -> None:
+    with pytest.raises(OptionError):
+        RosOptions(**wrong)
+
+
+def test_dds_types_hold_their_fields() -> None:
+    # Guards against two releases sharing the types of one.
+    humble, jazzy = dds_types("humble"), dds_types("jazzy")
+    name = TYPE_NAMES[Topic.RANGE]
+    fields = {field.name for field in dataclasses.fields(jazzy.classes[name])}
+    assert fields - {f.name for f in dataclasses.fields(humble.classes[name])} == {"variance"}

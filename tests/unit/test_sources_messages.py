@@ -1,0 +1,403 @@
+"""Images in MCAP files and ROS bags, written by the projects' own writers."""
+
+import base64
+import json
+import struct
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.sources import open_feed, open_source
+from aqualvs.live.sources.image_messages import ImageMessage, planes_of_message
+from aqualvs.live.sources.image_schemas import protobuf_fields
+from shell_cases import luma_level, picture
+
+mcap_writer = pytest.importorskip("mcap.writer")
+rosbag1 = pytest.importorskip("rosbags.rosbag1")
+rosbag2 = pytest.importorskip("rosbags.rosbag2")
+typesys = pytest.importorskip("rosbags.typesys")
+
+SIZE = (96, 64)
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 40_000_000
+
+# JPEG and BT.601 round to a level or two; pictures differ by ten.
+LEVEL_TOLERANCE = 3.0
+
+
+def stamp(i):
+    return divmod(START_NS + i * STEP_NS, 1_000_000_000)
+
+
+def jpeg(i):
+    return cv2.imencode(".jpg", picture(i, SIZE))[1].tobytes()
+
+
+def check(source, n=6):
+    with source:
+        assert source.size_px == SIZE
+        assert source.n_frames in (n, None)
+        assert source.fps == pytest.approx(25.0)
+        frames = list(source)
+    assert [f.index for f in frames] == list(range(n))
+    assert [f.time_s for f in frames] == pytest.approx([0.04 * i for i in range(n)], abs=1e-6)
+    for i, frame in enumerate(frames):
+        assert frame.luma.mean() == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
+
+
+def varint(value):
+    found = bytearray()
+    while value > 0x7F:
+        found.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*found, value])
+
+
+def protobuf(**fields):
+    """A message of Protobuf; names are letters and field numbers, `f` for fixed 32 bits."""
+    found = b""
+    for name, value in fields.items():
+        number = int(name[1:])
+        if name[0] == "f":
+            found += varint(number << 3 | 5) + struct.pack("<I", value)
+        elif isinstance(value, int):
+            found += varint(number << 3) + varint(value)
+        else:
+            found += varint(number << 3 | 2) + varint(len(value)) + value
+    return found
+
+
+def protobuf_stamp(i):
+    seconds, nanoseconds = stamp(i)
+    return protobuf(n1=seconds, n2=nanoseconds)
+
+
+def write_mcap(path, topics, *, finish=True):
+    """Write topics: name, schema name, schema encoding and text, message encoding, messages."""
+    with path.open("wb") as stream:
+        writer = mcap_writer.Writer(stream, chunk_size=20_000)
+        writer.start()
+        for name, schema, (kind, text), encoding, messages in topics:
+            schema_id = writer.register_schema(schema, kind, text)
+            channel = writer.register_channel(name, encoding, schema_id)
+            for i, data in enumerate(messages):
+                at = START_NS + i * STEP_NS + 3_000_000
+                writer.add_message(channel, at, data, at)
+        if finish:
+            writer.finish()
+    return path
+
+
+def compressed_image(n=6, name="/camera", start=0):
+    messages = [
+        protobuf(n1=protobuf_stamp(i), n2=jpeg(start + i), n3=b"jpeg", n4=b"cam") for i in range(n)
+    ]
+    return name, "foxglove.CompressedImage", ("protobuf", b""), "protobuf", messages
+
+
+def raw_image():
+    messages = [
+        protobuf(
+            n1=protobuf_stamp(i),
+            f2=SIZE[0],
+            f3=SIZE[1],
+            n4=b"bgr8",
+            f5=3 * SIZE[0],
+            n6=picture(i, SIZE).tobytes(),
+        )
+        for i in range(6)
+    ]
+    return "/camera", "foxglove.RawImage", ("protobuf", b""), "protobuf", messages
+
+
+def json_image():
+    messages = []
+    for i in range(6):
+        seconds, nanoseconds = stamp(i)
+        data = base64.b64encode(jpeg(i)).decode()
+        message = {"timestamp": {"sec": seconds, "nsec": nanoseconds}, "data": data}
+        messages.append(json.dumps({**message, "frame_id": "", "format": "jpeg"}).encode())
+    return "/camera", "foxglove.CompressedImage", ("jsonschema", b"{}"), "json", messages
+
+
+def video_packets(n=6, gop=3):
+    codec = av.CodecContext.create("libx264", "w")
+    codec.width, codec.height = SIZE
+    codec.pix_fmt, codec.time_base, codec.gop_size = "yuv420p", Fraction(1, 25), gop
+    codec.options = {"preset": "ultrafast", "tune": "zerolatency"}
+    packets = []
+    for i in range(n):
+        frame = av.VideoFrame.from_ndarray(picture(i, SIZE), format="bgr24")
+        frame.pts = i
+        packets += codec.encode(frame)
+    return [bytes(p) for p in packets + codec.encode(None)]
+
+
+def compressed_video(packets=None):
+    messages = [
+        protobuf(n1=protobuf_stamp(i), n2=b"cam", n3=data, n4=b"h264")
+        for i, data in enumerate(packets or video_packets())
+    ]
+    return "/video", "foxglove.CompressedVideo", ("protobuf", b""), "protobuf", messages
+
+
+def ros_image(store, i, *, ros1=False):
+    """Serialised `sensor_msgs/Image` of a picture, grey."""
+    types = store.types
+    seconds, nanoseconds = stamp(i)
+    header = {"seq": i} if ros1 else {}
+    image = cv2.cvtColor(picture(i, SIZE), cv2.COLOR_BGR2YUV_I420)[: SIZE[1]]
+    return types["sensor_msgs/msg/Image"](
+        header=types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds),
+            frame_id="cam",
+            **header,
+        ),
+        height=SIZE[1],
+        width=SIZE[0],
+        encoding="mono8",
+        is_bigendian=0,
+        step=SIZE[0],
+        data=image.reshape(-1),
+    )
+
+
+def ros2_topic(name="/camera/image"):
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/Image"
+    text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+    messages = [bytes(store.serialize_cdr(ros_image(store, i), kind)) for i in range(6)]
+    return name, kind, ("ros2msg", text), "cdr", messages
+
+
+@pytest.mark.parametrize("make", [compressed_image, raw_image, json_image, ros2_topic])
+def test_images_of_an_mcap_file(tmp_path, make):
+    check(open_source(write_mcap(tmp_path / "a.mcap", [make()])))
+
+
+def test_video_of_an_mcap_file(tmp_path):
+    check(open_source(write_mcap(tmp_path / "a.mcap", [compressed_video()])))
+
+
+def test_video_with_a_lost_packet_waits_for_the_next_key_frame(tmp_path):
+    packets = video_packets(9)
+    packets[4] = b""
+    path = write_mcap(tmp_path / "a.mcap", [compressed_video(packets)])
+    with open_source(path) as source:
+        assert [f.index for f in source] == [0, 1, 2, 3, 6, 7, 8]
+
+
+def bag1(path):
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    kind = "sensor_msgs/msg/Image"
+    with rosbag1.Writer(path) as writer:
+        connection = writer.add_connection("/camera/image", kind, typestore=store)
+        for i in range(6):
+            data = store.serialize_ros1(ros_image(store, i, ros1=True), kind)
+            writer.write(connection, START_NS + i * STEP_NS, data)
+    return path
+
+
+def bag2(path, plugin):
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/Image"
+    with rosbag2.Writer(path, version=8, storage_plugin=plugin) as writer:
+        connection = writer.add_connection("/camera/image", kind, typestore=store)
+        for i in range(6):
+            data = store.serialize_cdr(ros_image(store, i), kind)
+            writer.write(connection, START_NS + i * STEP_NS, data)
+    return path
+
+
+def test_images_of_a_bag_of_ros_1(tmp_path):
+    check(open_source(bag1(tmp_path / "dive.bag")))
+
+
+@pytest.mark.parametrize("plugin", list(rosbag2.StoragePlugin))
+def test_images_of_a_bag_of_ros_2(tmp_path, plugin):
+    folder = bag2(tmp_path / "dive", plugin)
+    check(open_source(folder))
+    file = next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
+    check(open_source(file))
+
+
+def test_one_of_several_topics_must_be_named(tmp_path):
+    topics = [compressed_image(), compressed_image(name="/rear/camera", start=3)]
+    path = write_mcap(tmp_path / "a.mcap", topics)
+    with pytest.raises(OptionError, match=r"/camera, /rear/camera.*a\.mcap#") as fault:
+        open_source(path)
+    assert "\n" not in str(fault.value)
+    for source in (
+        open_source(f"{path}#/rear/camera"),
+        open_source(f"{path}#rear/camera"),
+        open_source(path, topic="/rear/camera"),
+    ):
+        with source:
+            first = next(iter(source))
+        assert first.luma.mean() == pytest.approx(luma_level(3), abs=LEVEL_TOLERANCE)
+    with pytest.raises(OptionError, match="no images on topic /sonar; there is"):
+        open_source(path, topic="/sonar")
+
+
+def test_a_topic_for_what_has_none_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), picture(0, SIZE))
+    with pytest.raises(OptionError, match="topic"):
+        open_source(tmp_path, topic="/camera")
+    with pytest.raises(OptionError, match="frame rate"):
+        open_source(write_mcap(tmp_path / "a.mcap", [compressed_image()]), fps=3.0)
+
+
+def test_a_file_without_images_is_refused(tmp_path):
+    topic = "/depth", "foxglove.Log", ("protobuf", b""), "protobuf", [b""]
+    with pytest.raises(SourceError, match="holds no images"):
+        open_source(write_mcap(tmp_path / "a.mcap", [topic]))
+
+
+def test_a_file_cut_short_gives_what_it_has(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", [compressed_image(60)])
+    data = path.read_bytes()
+    path.write_bytes(data[: int(0.6 * len(data))])
+    delivered = []
+    with open_source(path) as source, pytest.raises(SourceError, match="cut short"):
+        delivered.extend(source)
+    assert [f.index for f in delivered] == list(range(len(delivered)))
+    assert 20 < len(delivered) < 60
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.db3"])
+@pytest.mark.parametrize("content", [b"", b"nothing of the kind\n" * 20])
+def test_what_is_no_recording_is_refused_in_one_line(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(SourceError) as fault:
+        open_source(path)
+    assert str(path) in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_a_damaged_message_leaves_a_gap_and_a_damaged_end_is_said(tmp_path):
+    topic = compressed_image(8)
+    topic[-1][3] = b"\x0a\xff\xff\xff"
+    topic[-1][5] = protobuf(n1=protobuf_stamp(5), n2=b"no picture", n3=b"jpeg")
+    with open_source(write_mcap(tmp_path / "a.mcap", [topic])) as source:
+        assert [f.index for f in source] == [0, 1, 2, 4, 6, 7]
+    topic[-1][7] = b""
+    delivered = []
+    path = write_mcap(tmp_path / "b.mcap", [topic])
+    with open_source(path) as source, pytest.raises(SourceError, match="last 1 of 8 images"):
+        delivered.extend(source)
+    assert len(delivered) == 5
+
+
+def test_a_change_of_size_is_refused(tmp_path):
+    topic = compressed_image(3)
+    small = cv2.imencode(".jpg", picture(0, (32, 32)))[1].tobytes()
+    topic[-1][2] = protobuf(n1=protobuf_stamp(2), n2=small, n3=b"jpeg")
+    with (
+        open_source(write_mcap(tmp_path / "a.mcap", [topic])) as source,
+        pytest.raises(SourceError, match="changes from 96x64 to 32x32 px at frame 2"),
+    ):
+        list(source)
+
+
+def test_a_recording_as_a_live_feed(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", [compressed_image()])
+    assert len(list(open_feed(path, realtime=False))) == 6
+
+
+RNG = np.random.default_rng(8)
+BGR = RNG.integers(0, 256, (4, 6, 3), dtype=np.uint8)
+GREY = RNG.integers(0, 256, (4, 6), dtype=np.uint8)
+
+
+def raw(encoding, image, **more):
+    size = (image.shape[1], image.shape[0])
+    return ImageMessage(stamp_ns=0, encoding=encoding, data=image.tobytes(), size_px=size, **more)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "image"),
+    [
+        ("bgr8", BGR),
+        ("8UC3", BGR),
+        ("rgb8", BGR[..., ::-1]),
+        ("bgra8", np.dstack([BGR, GREY])),
+        ("rgba8", np.dstack([BGR[..., ::-1], GREY])),
+    ],
+)
+def test_orders_of_colours(encoding, image):
+    luma, _ = planes_of_message(raw(encoding, image))
+    true, _ = planes_of_message(raw("bgr8", BGR))
+    np.testing.assert_array_equal(luma, true)
+
+
+def test_grey_and_its_deeper_forms():
+    for message in (
+        raw("mono8", GREY),
+        raw("mono16", GREY.astype("<u2") * 256 + 7),
+        raw("16UC1", (GREY.astype("u2") * 256 + 7).astype(">u2"), is_big_endian=True),
+        raw("mono8", np.pad(GREY, ((0, 0), (0, 3)))[:, :9], step=9),
+    ):
+        if message.step:
+            message = ImageMessage(
+                stamp_ns=0, encoding="mono8", data=message.data, size_px=(6, 4), step=9
+            )
+        luma, chroma = planes_of_message(message)
+        np.testing.assert_array_equal(luma, GREY)
+        assert chroma is None
+
+
+@pytest.mark.parametrize(("encoding", "first"), [("yuv422_yuy2", 0), ("yuv422", 1), ("uyvy", 1)])
+def test_packed_colour_keeps_luma(encoding, first):
+    packed = RNG.integers(0, 256, (4, 6, 2), dtype=np.uint8)
+    luma, (u, v) = planes_of_message(raw(encoding, packed))
+    np.testing.assert_array_equal(luma, packed[..., first])
+    both = packed[..., 1 - first].astype(int)
+    mean = (both[0::2] + both[1::2] + 1) // 2
+    np.testing.assert_array_equal(u, mean[:, 0::2])
+    np.testing.assert_array_equal(v, mean[:, 1::2])
+
+
+@pytest.mark.parametrize(
+    ("encoding", "red_at"),
+    [
+        ("bayer_rggb8", (0, 0)),
+        ("bayer_bggr8", (1, 1)),
+        ("bayer_gbrg8", (1, 0)),
+        ("bayer_grbg8", (0, 1)),
+    ],
+)
+def test_colour_filters(encoding, red_at):
+    """A red scene: only the red pixels of the pattern are bright."""
+    mosaic = np.zeros((16, 16), np.uint8)
+    mosaic[red_at[0] :: 2, red_at[1] :: 2] = 200
+    luma, (_, v) = planes_of_message(raw(encoding, mosaic))
+    # BT.601: red of 200 has luma 67 and a V far above grey.
+    assert luma[4:12, 4:12].mean() == pytest.approx(16 + 200 * 65.481 / 255, abs=2)
+    assert v[2:6, 2:6].min() > 190
+
+
+def test_too_few_pixels_are_no_picture():
+    assert planes_of_message(raw("bgr8", BGR[:3], step=18)) is not None
+    short = ImageMessage(stamp_ns=0, encoding="bgr8", data=bytes(20), size_px=(6, 4))
+    assert planes_of_message(short) is None
+
+
+def test_an_unknown_encoding_is_refused_with_those_known(tmp_path):
+    name, schema, text, encoding, messages = raw_image()
+    messages = [m.replace(b"bgr8", b"xyz9") for m in messages]
+    path = write_mcap(tmp_path / "a.mcap", [(name, schema, text, encoding, messages)])
+    with pytest.raises(SourceError, match=r"encoding 'xyz9'.*mono8"):
+        open_source(path)
+
+
+def test_protobuf_fields():
+    content = protobuf(n1=300, n2=b"abc", f3=7) + varint(4 << 3 | 1) + struct.pack("<Q", 2**40)
+    assert protobuf_fields(content) == {1: 300, 2: b"abc", 3: 7, 4: 2**40}
+    for cut in (b"\x0a", b"\x0a\x05ab", b"\xff" * 12, b"\x0b"):
+        with pytest.raises(ValueError, match=r"cut short|wire type"):
+            protobuf_fields(cut)
