@@ -1,0 +1,256 @@
+"""The page's web server, in a thread of its own."""
+
+import asyncio
+import importlib.resources
+import logging
+import socket
+import threading
+import time
+
+import uvicorn
+from pydantic import ValidationError
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from aqualvs import __version__
+from aqualvs.app.dashboard.access import Access
+from aqualvs.app.dashboard.commands import (
+    MAX_MESSAGE_BYTES,
+    Controls,
+    Hello,
+    Shown,
+    parse_message,
+)
+from aqualvs.app.dashboard.hub import Hub, Watcher
+from aqualvs.app.dashboard.state import rig_state
+from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.optics.rig import Rig
+
+_ASSETS = {
+    "": ("dashboard.html", "text/html; charset=utf-8"),
+    "dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
+    "dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
+    "views.js": ("views.js", "text/javascript; charset=utf-8"),
+    "uPlot.iife.min.js": ("uPlot.iife.min.js", "text/javascript; charset=utf-8"),
+    "uPlot.min.css": ("uPlot.min.css", "text/css; charset=utf-8"),
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+}
+# Whoever guesses tokens has to wait; whoever says nothing is shown the door.
+_WRONG_TOKEN_S, _HELLO_S, _START_S, _STOP_S = 1.0, 5.0, 10.0, 3.0
+_REFUSED = 1008
+_log = logging.getLogger(__name__)
+
+
+class DashboardServer:
+    """Serves page and data until it is closed.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0 takes any that is free.
+    access : Access
+    rig : Rig
+    controls : Controls
+
+    Attributes
+    ----------
+    port : int
+        Where it listens.
+    hub : Hub
+
+    Raises
+    ------
+    OptionError
+        If the address cannot be listened to.
+    """
+
+    def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
+        self.hub = Hub()
+        self._access, self._rig, self._controls = access, rig, controls
+        self._socket = _listening(host, port)
+        self.port: int = self._socket.getsockname()[1]
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                self._app(),
+                log_level="warning",
+                access_log=False,
+                ws_max_size=MAX_MESSAGE_BYTES,
+                ws_ping_interval=5.0,
+                ws_ping_timeout=10.0,
+                limit_concurrency=32,
+                timeout_graceful_shutdown=1,
+            )
+        )
+        self._thread = threading.Thread(target=self._serve, name="dashboard", daemon=True)
+        self._thread.start()
+        if not self._started():
+            raise OptionError(f"dashboard: {host}:{self.port} did not start; try another port")
+
+    def publish(self, state: str, picture: bytes | None) -> None:
+        """Hand the latest to the pages; called from any thread."""
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self.hub.publish, state, picture)
+
+    def close(self) -> None:
+        """Close all connections and end the thread; further calls do nothing."""
+        self._server.should_exit = True
+        self._thread.join(_STOP_S)
+        self._socket.close()
+
+    def _started(self) -> bool:
+        end = time.monotonic() + _START_S
+        while self._thread.is_alive() and time.monotonic() < end:
+            if self._server.started:
+                return True
+            time.sleep(0.01)
+        return False
+
+    def _serve(self) -> None:
+        asyncio.run(self._serve_in_loop())
+
+    async def _serve_in_loop(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        await self._server.serve(sockets=[self._socket])
+
+    def _app(self) -> Starlette:
+        return Starlette(
+            routes=[
+                Route("/register_service", _blueos, methods=["GET"]),
+                Route("/{name:path}", _asset, methods=["GET"]),
+                WebSocketRoute("/live", self._talk),
+            ]
+        )
+
+    async def _talk(self, socket: WebSocket) -> None:
+        peer = f"{socket.client.host if socket.client else 'unknown'}"
+        headers = socket.headers
+        if not self._access.is_own_page(headers.get("origin"), headers.get("host", "")):
+            _log.warning("dashboard: %s refused: foreign page %s", peer, headers.get("origin"))
+            await socket.close(_REFUSED)
+            return
+        await socket.accept()
+        try:
+            watcher = await self._welcome(socket, peer)
+            if watcher is not None:
+                await self._attend(socket, watcher, peer)
+        except (WebSocketDisconnect, RuntimeError, OSError):
+            # The page has gone; that is its right.
+            return
+
+    async def _welcome(self, socket: WebSocket, peer: str) -> Watcher | None:
+        """Read the greeting; None if the page may not stay."""
+        try:
+            hello = parse_message(await asyncio.wait_for(socket.receive_text(), _HELLO_S))
+        except (TimeoutError, ValidationError, KeyError) as fault:
+            await _refuse(socket, peer, f"no greeting: {type(fault).__name__}")
+            return None
+        token = hello.token if isinstance(hello, Hello) else ""
+        known = self._access.may_command(token)
+        if token and not known:
+            await asyncio.sleep(_WRONG_TOKEN_S)
+        watcher = Watcher(may_command=known)
+        why = self._why_not(token, watcher)
+        if why:
+            await _refuse(socket, peer, why)
+            return None
+        await socket.send_text(rig_state(self._rig, may_command=known))
+        return watcher
+
+    def _why_not(self, token: str, watcher: Watcher) -> str:
+        """Let a page in, or return why not."""
+        if token and not watcher.may_command:
+            return "wrong token"
+        if not self._access.may_watch(token):
+            return "no token"
+        return "" if self.hub.join(watcher) else "too many pages are open"
+
+    async def _attend(self, socket: WebSocket, watcher: Watcher, peer: str) -> None:
+        """Send what is new and listen, until the page goes."""
+        sending = asyncio.create_task(_send_news(socket, watcher))
+        try:
+            while True:
+                await self._hear(socket, watcher, peer, await socket.receive_text())
+        except (ValidationError, KeyError):
+            await _refuse(socket, peer, "message not understood")
+        finally:
+            self.hub.leave(watcher)
+            sending.cancel()
+
+    async def _hear(self, socket: WebSocket, watcher: Watcher, peer: str, text: str) -> None:
+        message = parse_message(text)
+        if isinstance(message, Shown):
+            watcher.shown()
+        elif isinstance(message, Hello):
+            return
+        elif not watcher.may_command:
+            _log.warning("dashboard: %s: %s refused: no token", peer, message.kind)
+            await socket.send_json({"kind": "refused", "why": "open the page with its token"})
+        else:
+            try:
+                await asyncio.to_thread(self._controls.carry_out, message)
+                _log.info("dashboard: %s: %s", peer, message)
+            except AqualvsError as fault:
+                await socket.send_json({"kind": "refused", "why": str(fault)})
+
+
+async def _send_news(socket: WebSocket, watcher: Watcher) -> None:
+    while True:
+        state, picture = await watcher.next()
+        if state is not None:
+            await socket.send_text(state)
+        if picture is not None:
+            await socket.send_bytes(picture)
+
+
+async def _refuse(socket: WebSocket, peer: str, why: str) -> None:
+    _log.warning("dashboard: %s refused: %s", peer, why)
+    await socket.close(_REFUSED, why)
+
+
+async def _blueos(_request: Request) -> Response:
+    """Tell BlueOS, which looks for it at every port, what is served here."""
+    return JSONResponse(
+        {
+            "name": "aqualvs",
+            "description": "Range, pitch and yaw to a net or wall from laser lines.",
+            "icon": "mdi-laser-pointer",
+            "company": "aqualvs",
+            "version": __version__,
+            "webpage": "/",
+            "api": "",
+        },
+        headers=_HEADERS,
+    )
+
+
+async def _asset(request: Request) -> Response:
+    found = _ASSETS.get(request.path_params["name"])
+    if found is None:
+        return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
+    folder = importlib.resources.files("aqualvs") / "app" / "dashboard" / "assets"
+    return Response((folder / found[0]).read_bytes(), media_type=found[1], headers=_HEADERS)
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as fault:
+        listener.close()
+        raise OptionError(
+            f"--dashboard-address {host}:{port}: {fault.strerror}; choose another address"
+        ) from fault
+    listener.listen(16)
+    return listener

@@ -1,0 +1,342 @@
+"""The pilot's page in a real browser, and what it refuses."""
+
+import asyncio
+import contextlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from aqualvs.app.dashboard.access import Access, make_access, token_fault
+from aqualvs.app.dashboard.commands import MAX_MESSAGE_BYTES, Controls
+from aqualvs.app.dashboard.hub import Hub, Watcher
+from aqualvs.app.dashboard.output import Dashboard
+from aqualvs.app.dashboard.picture import page_picture
+from aqualvs.app.dashboard.server import DashboardServer
+from aqualvs.app.live_outputs import host_and_port
+from aqualvs.app.posture_csv import POSTURE_COLUMNS, posture_row
+from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.errors import OptionError
+from browser import open_page
+from live_cases import demo_rig, demo_samples, of_size
+
+TOKEN = "let me steer"
+
+
+@dataclass
+class Button:
+    """Stands for a recorder."""
+
+    on: bool = False
+    pressed: list[bool] = field(default_factory=list)
+
+    def start(self) -> None:
+        self.on = True
+        self.pressed.append(True)
+
+    def stop(self) -> None:
+        self.on = False
+        self.pressed.append(False)
+
+    def facts(self) -> dict[str, Any]:
+        return {"on": self.on, "words": "dive.mcap" if self.on else ""}
+
+
+@dataclass
+class Bench:
+    server: DashboardServer
+    dashboard: Dashboard
+    controls: Controls
+    button: Button
+
+    @property
+    def address(self) -> str:
+        return f"127.0.0.1:{self.server.port}"
+
+    @contextlib.contextmanager
+    def connect(self, token: str = "") -> Iterator[ClientConnection]:
+        with connect(f"ws://{self.address}/live", max_size=None) as connection:
+            connection.send(json.dumps({"kind": "hello", "token": token}))
+            yield connection
+
+    def play(self, seconds: float = 0.3) -> None:
+        """Send samples for a while."""
+        end = time.monotonic() + seconds
+        for sample in demo_samples(4) * 1000:
+            if time.monotonic() > end:
+                return
+            self.dashboard.send(sample)
+            time.sleep(0.03)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    rig, button = demo_rig(), Button()
+    controls = Controls(SetpointHolder(rig.working_range), button)
+    server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", TOKEN), rig, controls)
+    dashboard = Dashboard(server, controls)
+    yield Bench(server, dashboard, controls, button)
+    dashboard.close()
+
+
+def state_of(connection: ClientConnection) -> dict[str, Any]:
+    while True:
+        message = connection.recv(timeout=5)
+        if isinstance(message, str) and (found := json.loads(message))["kind"] == "state":
+            return dict(found)
+
+
+def test_in_a_browser_it_shows_what_posture_csv_says_and_takes_commands(
+    bench: Bench, tmp_path: Path
+) -> None:
+    stop = threading.Event()
+    sample = demo_samples(4)[3]
+
+    def play() -> None:
+        # Only one frame, so that what is on the screen can be compared.
+        while not stop.wait(0.05):
+            bench.dashboard.send(sample)
+
+    player = threading.Thread(target=play)
+    player.start()
+    try:
+        with open_page(tmp_path / "profile") as page:
+            page.size(1280, 800)
+            page.call("Page.navigate", url=f"http://{bench.address}/#token={TOKEN}")
+            page.wait_for("document.getElementById('numbers').dataset.valid === '1'")
+            shown = page.evaluate("({...document.getElementById('numbers').dataset})")
+            row = dict(zip(POSTURE_COLUMNS, posture_row(sample.scan).split(","), strict=True))
+            assert shown["frame"] == row["frame"]
+            assert shown["range"] == row["range_m"]
+            assert shown["yaw"] == row["yaw_deg"]
+            assert shown["pitch"] == row["pitch_deg"]
+            assert page.evaluate("document.getElementById('range').textContent") == (
+                f"{float(row['range_m']):.3f}"
+            )
+            # The token has left the address bar, where screen recordings would show it.
+            assert page.evaluate("location.hash") == ""
+            page.evaluate("document.getElementById('record').click()")
+            page.wait_for("document.getElementById('record').textContent === 'Stop recording'")
+            page.evaluate("document.getElementById('set-range').value = '0.55'")
+            page.evaluate("document.getElementById('setpoint').requestSubmit()")
+            page.wait_for("document.getElementById('set-words').textContent.includes('0.55')")
+            page.wait_for(
+                "document.getElementById('video').getContext('2d')"
+                ".getImageData(300, 200, 1, 1).data[1] > 0"
+            )
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            page.screenshot(tmp_path / "page.png")
+            assert (tmp_path / "page.png").stat().st_size > 30_000
+            assert page.said == []
+    finally:
+        stop.set()
+        player.join()
+    assert bench.button.pressed == [True]
+    assert bench.controls.setpoint.setpoint == Setpoint(0.55, 0.0)
+
+
+def test_without_a_token_this_machine_may_watch_but_not_command(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    with bench.connect() as connection:
+        assert json.loads(connection.recv(timeout=5))["may_command"] is False
+        bench.play()
+        assert state_of(connection)["posture"]["valid"] == "1"
+        connection.send(json.dumps({"kind": "record", "on": True}))
+        answer = ""
+        while "refused" not in answer:
+            message = connection.recv(timeout=5)
+            answer = message if isinstance(message, str) else ""
+    assert bench.button.pressed == []
+    assert "record refused" in caplog.text
+
+
+def test_elsewhere_nothing_is_shown_without_the_token() -> None:
+    rig = demo_rig()
+    controls = Controls(SetpointHolder(rig.working_range), Button())
+    server = DashboardServer("127.0.0.1", 0, Access("0.0.0.0", TOKEN), rig, controls)
+    try:
+        for token, why in (("", "no token"), ("guess", "wrong token")):
+            with connect(f"ws://127.0.0.1:{server.port}/live") as connection:
+                connection.send(json.dumps({"kind": "hello", "token": token}))
+                with pytest.raises(ConnectionClosed) as closed:
+                    connection.recv(timeout=5)
+                assert closed.value.rcvd is not None
+                assert closed.value.rcvd.reason == why
+        with connect(f"ws://127.0.0.1:{server.port}/live") as connection:
+            connection.send(json.dumps({"kind": "hello", "token": TOKEN}))
+            assert json.loads(connection.recv(timeout=5))["may_command"] is True
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}],
+    ids=["foreign page", "page without origin", "foreign name for this machine"],
+)
+def test_foreign_pages_are_refused(bench: Bench, headers: dict[str, str]) -> None:
+    name = headers.get("Host", "127.0.0.1")
+    wire = socket.create_connection(("127.0.0.1", bench.server.port))
+    origin: Any = headers.get("Origin")
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://{name}:{bench.server.port}/live", sock=wire, origin=origin)
+    assert refused.value.response.status_code == 403
+
+
+def receive_until_closed(connection: ClientConnection) -> None:
+    while True:
+        connection.recv(timeout=5)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "not json",
+        "{}",
+        '{"kind":"arm"}',
+        '{"kind":"record","on":"yes"}',
+        '{"kind":"record","on":true,"also":1}',
+        '{"kind":"setpoint","range_m":1e999}',
+        "[" * 500,
+        b"\x00\x01",
+    ],
+)
+def test_malformed_messages_end_the_connection_and_nothing_else(
+    bench: Bench, message: str | bytes
+) -> None:
+    with bench.connect(TOKEN) as bad, bench.connect(TOKEN) as good:
+        bad.recv(timeout=5)
+        good.recv(timeout=5)
+        bad.send(message)
+        with pytest.raises(ConnectionClosed):
+            receive_until_closed(bad)
+        bench.play()
+        assert state_of(good)["posture"]["valid"] == "1"
+    assert bench.button.pressed == []
+    assert bench.controls.setpoint.setpoint is None
+
+
+def test_oversized_messages_end_the_connection(bench: Bench) -> None:
+    with bench.connect(TOKEN) as connection:
+        connection.recv(timeout=5)
+        connection.send("x" * (MAX_MESSAGE_BYTES + 1))
+        with pytest.raises(ConnectionClosed) as closed:
+            connection.recv(timeout=5)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1009
+
+
+def test_who_says_nothing_is_not_let_in(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aqualvs.app.dashboard.server._HELLO_S", 0.2)
+    with connect(f"ws://{bench.address}/live") as connection, pytest.raises(ConnectionClosed):
+        connection.recv(timeout=5)
+
+
+def test_a_setpoint_that_cannot_be_held_is_refused(bench: Bench) -> None:
+    with bench.connect(TOKEN) as connection:
+        connection.recv(timeout=5)
+        connection.send(json.dumps({"kind": "setpoint", "range_m": 5.0}))
+        answer = json.loads(connection.recv(timeout=5))
+        assert answer["kind"] == "refused"
+        assert "5 m" in answer["why"]
+        connection.send(json.dumps({"kind": "setpoint", "range_m": 0.6, "yaw_deg": 80.0}))
+        assert "80" in json.loads(connection.recv(timeout=5))["why"]
+    assert bench.controls.setpoint.setpoint is None
+
+
+def test_a_page_that_goes_leaves_nothing_behind(bench: Bench) -> None:
+    for _ in range(3 * Hub.MAX_WATCHERS):
+        with bench.connect() as connection:
+            connection.recv(timeout=5)
+            # As a browser that crashes: without saying good-bye.
+            connection.socket.close()
+        bench.play(0.1)
+    end = time.monotonic() + 10.0
+    while bench.server.hub.n_watchers and time.monotonic() < end:
+        bench.play(0.1)
+    assert bench.server.hub.n_watchers == 0
+
+
+def test_too_many_pages_are_refused(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        for _ in range(Hub.MAX_WATCHERS):
+            open_.enter_context(bench.connect()).recv(timeout=5)
+        late = open_.enter_context(bench.connect())
+        with pytest.raises(ConnectionClosed):
+            late.recv(timeout=5)
+
+
+def test_a_slow_page_gets_the_latest_and_few_pictures() -> None:
+    async def scene() -> tuple[list[str | None], list[bytes | None]]:
+        watcher = Watcher(may_command=False)
+        for i in range(10):
+            watcher.put(f"{i}", bytes([i]))
+        got = [await watcher.next()]
+        watcher.put("10", bytes([10]))
+        got.append(await watcher.next())
+        # Two pictures are on their way: none more until one has been shown.
+        watcher.put("11", bytes([11]))
+        got.append(await watcher.next())
+        watcher.shown()
+        got.append(await watcher.next())
+        return [state for state, _ in got], [picture for _, picture in got]
+
+    states, pictures = asyncio.run(scene())
+    assert states == ["9", "10", "11", None]
+    assert pictures == [b"\x09", b"\x0a", None, b"\x0b"]
+
+
+def test_an_address_in_use_is_told_in_one_line(bench: Bench) -> None:
+    with pytest.raises(OptionError, match="choose another address"):
+        DashboardServer(
+            "127.0.0.1", bench.server.port, make_access("127.0.0.1", None), demo_rig(),
+            bench.controls,
+        )  # fmt: skip
+
+
+def test_tokens_are_made_long_and_checked() -> None:
+    assert make_access("127.0.0.1", None).token != make_access("127.0.0.1", None).token
+    assert len(make_access("127.0.0.1", None).token) >= 12
+    assert token_fault("short")
+    assert not token_fault(None)
+    assert not token_fault("long enough")
+    assert Access("::1", TOKEN).is_local
+    assert Access("localhost", TOKEN).is_local
+    assert not Access("192.0.2.7", TOKEN).is_local
+    assert not Access("boat", TOKEN).is_local
+
+
+def test_addresses() -> None:
+    assert host_and_port("", 8100, "--x") == ("127.0.0.1", 8100)
+    assert host_and_port(":9000", 8100, "--x") == ("127.0.0.1", 9000)
+    assert host_and_port("0.0.0.0", 8100, "--x") == ("0.0.0.0", 8100)
+    assert host_and_port("[::1]:81", 8100, "--x") == ("::1", 81)
+    with pytest.raises(OptionError, match="port"):
+        host_and_port("boat:99999", 8100, "--x")
+
+
+def test_pictures_are_small_jpegs() -> None:
+    large = page_picture(of_size(1920, 1080, 0))
+    assert large.startswith(b"\xff\xd8")
+    sample = demo_samples(1)[0]
+    assert sample.frame is not None
+    assert len(page_picture(sample.frame)) < 120_000
+
+
+def test_what_is_no_number_becomes_null(bench: Bench) -> None:
+    silent = demo_samples(1)[0]
+    silent = replace(silent, health=replace(silent.health, quality=float("nan")))
+    with bench.connect() as connection:
+        connection.recv(timeout=5)
+        time.sleep(0.05)
+        bench.dashboard.send(silent)
+        assert state_of(connection)["health"]["quality"] is None
