@@ -1,0 +1,88 @@
+"""`aqualvs tune`: gains for a vehicle, with the margins they leave and a step in the simulator."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from aqualvs.control.gains_file import gains_text, save_gains
+from aqualvs.control.tune import Tuned, TuneOptions, tune
+from aqualvs.control.tune_margins import Margins
+from aqualvs.control.tune_step import StepOptions, simulate_step
+from aqualvs.errors import OptionError
+from aqualvs.simulation.vehicle_models import VEHICLES, VehicleModel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TuneRequest:
+    """What the command line asks for.
+
+    Attributes
+    ----------
+    model : str
+        Name of a vehicle model.
+    output : Path or None
+        Gains file; None prints the gains.
+    options : TuneOptions
+        What the loops must stand.
+    """
+
+    model: str
+    output: Path | None = None
+    options: TuneOptions = field(default_factory=TuneOptions)
+
+
+def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
+    """Tune, try a step, write or print the gains.
+
+    Raises
+    ------
+    OptionError
+        If the model is unknown, or nothing stands what is asked.
+    OutputError
+        If the file cannot be written.
+    """
+    model = VEHICLES.get(request.model)
+    if model is None:
+        raise OptionError(f"tune {request.model}: no such model; use one of {', '.join(VEHICLES)}")
+    tuned = tune(model, request.options)
+    for line in report(model, tuned, request.options):
+        tell(line)
+    if request.output is None:
+        tell(gains_text(tuned.gains))
+    else:
+        save_gains(tuned.gains, request.output)
+        tell(f"written to {request.output}")
+
+
+def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
+    """Return what to say of gains: margins at the usual delay and in the worst case, steps."""
+    usual, most = options.delay, options.greatest_delay
+    lines = [
+        f"{model.name}: margins at the usual delay, {1e3 * usual:.0f} ms, and in the worst corner "
+        f"(delay {1e3 * most:.0f} ms, mass x{options.mass_factor:g}, drag x{options.drag_factor:g} "
+        f"either way, current to {options.current:g} m/s)",
+        f"  {'':14}crossover    phase   gain   delay  modulus",
+    ]
+    rows = (
+        ("range, usual", tuned.range_usual),
+        ("range, worst", tuned.range_worst),
+        ("yaw, usual", tuned.yaw_usual),
+        ("yaw, worst", tuned.yaw_worst),
+    )
+    lines += [f"  {name:14}{_row(one)}" for name, one in rows]
+    for delay in (usual, most):
+        step = StepOptions(delay=delay, frame=options.frame)
+        answer = simulate_step(model, tuned.gains, step)
+        lines.append(
+            f"  step {step.begin:g} to {step.end:g} m in still water, delay {1e3 * delay:.0f} ms: "
+            f"overshoot {100.0 * answer.overshoot:.1f} %, within 5 % after {answer.settling:.1f} s"
+        )
+    return lines
+
+
+def _row(one: Margins) -> str:
+    return (
+        f"{one.crossover:5.2f} rad/s  {math.degrees(one.phase):4.0f}°  {one.gain:5.2f}  "
+        f"{1e3 * one.delay:4.0f} ms  {one.modulus:.2f}"
+    )

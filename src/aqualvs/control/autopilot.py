@@ -1,0 +1,245 @@
+"""Mission, controller and safety gate in one, fed frame by frame: no clock, no threads, no link."""
+
+import math
+from dataclasses import dataclass
+
+from aqualvs.control.controller import RangeYawController
+from aqualvs.control.mission import Guidance, Mission, Stage
+from aqualvs.control.safety import Reason, SafetyGate
+from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.scanning.posture import Posture, Refusal
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Range and yaw with their rates, as a time filter gives them.
+
+    Attributes
+    ----------
+    range, yaw : float
+        Metres and radians, as in `Posture`.
+    range_rate, yaw_rate : float
+        Per second.
+    """
+
+    range: float
+    yaw: float
+    range_rate: float
+    yaw_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What one step came to.
+
+    Attributes
+    ----------
+    effort : Effort
+        What may be sent; neutral unless engaged.
+    reason : Reason or None
+        Why it is not what the controller asked for.
+    guidance : Guidance
+        What the mission wanted.
+    engaged : bool
+        Whether efforts pass; False until `NetPilot.engage`.
+    """
+
+    effort: Effort
+    reason: Reason | None
+    guidance: Guidance
+    engaged: bool
+
+
+class NetPilot:
+    """Holds and follows by what the lasers see.
+
+    Parameters
+    ----------
+    mission : Mission
+        What to do.
+    controller : RangeYawController
+        Made for the vehicle.
+    gate : SafetyGate, optional
+        With default limits if left out.
+
+    Raises
+    ------
+    OptionError
+        If the mission moves sideways and the vehicle cannot.
+    """
+
+    def __init__(
+        self, mission: Mission, controller: RangeYawController, gate: SafetyGate | None = None
+    ) -> None:
+        if mission.sways and not controller.gains.vehicle.can_sway:
+            raise OptionError(
+                f"vehicle {controller.gains.vehicle.name}: cannot move sideways; choose a mission "
+                "that holds"
+            )
+        self.mission, self.controller = mission, controller
+        self.gate = gate or SafetyGate()
+        self._posture: Posture | None = None
+        self._seen_s = self._frame_s = -math.inf
+        self._asked: Effort | None = None
+
+    @property
+    def engaged(self) -> bool:
+        """Whether efforts pass."""
+        return self.gate.latched is None
+
+    def engage(self, now_s: float, state: VehicleState) -> Reason | None:
+        """Begin, or go on, as the pilot wants it; return why not, None if so."""
+        refused = self.gate.engage(now_s, state)
+        if refused is None:
+            self.mission.restart()
+            self.controller.reset()
+            self._asked = None
+        return refused
+
+    def disengage(self) -> None:
+        """Stop: neutral from the next step on, until `engage`."""
+        self.gate.stop()
+
+    def step(
+        self,
+        now_s: float,
+        time_s: float,
+        posture: Posture | Refusal | None,
+        filtered: Motion | None,
+        state: VehicleState,
+    ) -> Decision:
+        """Return what to send for one frame, or for a silent stream.
+
+        Parameters
+        ----------
+        now_s : float
+            By the clock of `VehicleState.heard_s`.
+        time_s : float
+            Of the frame, by the stream's clock.
+        posture : Posture or Refusal or None
+            As measured in the frame.
+        filtered : Motion or None
+            From the time filter, as of this frame, where there is one.
+        state : VehicleState
+            What the vehicle tells.
+        """
+        if self._other_stream(time_s):
+            _, reason = self.gate.check(now_s, math.inf, None, state, NEUTRAL)
+            stopped = reason if reason is not None and reason.takes_over else Reason.CLOCK
+            return Decision(NEUTRAL, stopped, _IDLE, self.engaged)
+        present = self._present(now_s, time_s, posture)
+        guidance = self._guide(now_s, present, state)
+        asked = self._ask(time_s, present, filtered, guidance)
+        effort, reason = self.gate.check(
+            now_s,
+            now_s - self._seen_s,
+            self._posture,
+            state,
+            asked or NEUTRAL,
+            range_rate=None if filtered is None else filtered.range_rate,
+        )
+        self._settle(asked, effort, reason)
+        reason = self._end(guidance) or reason or _mission_says(guidance)
+        return Decision(effort, reason, guidance, self.engaged)
+
+    def _end(self, guidance: Guidance) -> Reason | None:
+        """Give the vehicle back where the mission has ended; return why."""
+        ended = _ENDS.get(guidance.stage)
+        if ended is not None:
+            self.gate.stop(ended)
+        return ended
+
+    def _other_stream(self, time_s: float) -> bool:
+        """Return whether frame times have jumped back; then all that was seen is forgotten."""
+        if not time_s < self._frame_s - _LATE_S:
+            return False
+        self._frame_s = time_s
+        self._posture, self._seen_s, self._asked = None, -math.inf, None
+        self.controller.reset()
+        return True
+
+    def _present(
+        self, now_s: float, time_s: float, posture: Posture | Refusal | None
+    ) -> Posture | None:
+        """Return the posture of a new frame; a picture that stands still is none."""
+        if not (isinstance(posture, Posture) and time_s > self._frame_s):
+            return None
+        self._frame_s = time_s
+        self._posture, self._seen_s = posture, now_s
+        return posture
+
+    def _guide(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
+        """Ask the mission; it stands still while nobody steers."""
+        if not self.engaged:
+            return _IDLE
+        return self.mission.update(now_s, posture, state)
+
+    def _ask(
+        self,
+        time_s: float,
+        posture: Posture | None,
+        filtered: Motion | None,
+        guidance: Guidance,
+    ) -> Effort | None:
+        """Return what the controller wants; None, and the controller at rest, where it must not."""
+        motion = _motion(posture, filtered)
+        if guidance.setpoint is None or guidance.stage.halts:
+            return None
+        if motion is None:
+            # A frame or two without a posture: the gate limits for how long this goes on.
+            return self._asked
+        return self.controller.update(
+            time_s,
+            motion.range,
+            motion.yaw,
+            motion.range_rate,
+            motion.yaw_rate,
+            guidance.setpoint,
+            guidance.sway,
+            guidance.down,
+        )
+
+    def _settle(self, asked: Effort | None, effort: Effort, reason: Reason | None) -> None:
+        """Tell the controller what became of its effort."""
+        self._asked = asked
+        if asked is None or (reason is not None and effort == NEUTRAL):
+            self.controller.pause()
+            self._asked = None
+        elif reason is not None:
+            self.controller.applied(effort)
+
+
+# Frames that the network held up may be so late; older ones are of another stream.
+_LATE_S = 0.5
+_IDLE = Guidance(setpoint=None, stage=Stage.IDLE)
+_ENDS = {Stage.OVER: Reason.MISSION_OVER, Stage.GAVE_UP: Reason.GAVE_UP}
+
+
+def _mission_says(guidance: Guidance) -> Reason | None:
+    """Return why a mission asks for nothing."""
+    if guidance.stage is Stage.WAITING:
+        return Reason.NO_POSTURE
+    return Reason.NO_SETPOINT if guidance.setpoint is None else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the controller takes; rates are None where no filter knows them."""
+
+    range: float
+    yaw: float
+    range_rate: float | None
+    yaw_rate: float | None
+
+
+def _motion(posture: Posture | None, filtered: Motion | None) -> _Seen | None:
+    """Return the filter's view, else the raw one; None where either is not finite."""
+    if filtered is not None:
+        seen = _Seen(filtered.range, filtered.yaw, filtered.range_rate, filtered.yaw_rate)
+    elif posture is not None:
+        seen = _Seen(posture.range, posture.yaw, None, None)
+    else:
+        return None
+    known = (seen.range, seen.yaw, seen.range_rate or 0.0, seen.yaw_rate or 0.0)
+    return seen if all(map(math.isfinite, known)) else None

@@ -1,0 +1,202 @@
+"""The area that a dive has seen, as a map of cells that a picture can be made of.
+
+Down go depths. Across go bearings of the net, where the vehicle tells its heading: round a cage
+they are places. Else across go metres along the net by the speed asked for, which a current
+shifts.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from aqualvs.control.autopilot import Decision
+from aqualvs.control.missions_follow import bearing_of
+from aqualvs.control.vehicle import VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.posture import Posture, Refusal
+
+
+class Across(StrEnum):
+    """What counts along the net."""
+
+    BEARING = "bearing"
+    """Of the net's far normal, in radians."""
+    ALONG = "along"
+    """Metres to the right of the start, by the speed asked for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoverageOptions:
+    """How fine the map is.
+
+    Attributes
+    ----------
+    depth_cell : float
+        Height of a cell in metres.
+    bearing_cell, along_cell : float
+        Width in radians, or metres.
+    seen_up : float
+        How far above and below its own depth the vehicle sees the net at a range of 1 m, in metres;
+        grows with the range.
+    seen_aside : float
+        As much to either side; counts along metres, and for bearings as `radius` says.
+    radius : float or None
+        Of a round cage, in metres, to turn metres into bearings; None counts the middle alone.
+    """
+
+    depth_cell: float = 0.1
+    bearing_cell: float = math.radians(1.0)
+    along_cell: float = 0.1
+    seen_up: float = 0.2
+    seen_aside: float = 0.2
+    radius: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that are not positive.
+
+        Raises
+        ------
+        OptionError
+            Naming them.
+        """
+        sizes = (self.depth_cell, self.bearing_cell, self.along_cell)
+        if not min(sizes) > 0.0:
+            raise OptionError(f"coverage: cells of {sizes}; every size must be positive")
+        if not (min(self.seen_up, self.seen_aside) >= 0.0 and (self.radius or 1.0) > 0.0):
+            raise OptionError(
+                f"coverage: sees {self.seen_up:g} m up, {self.seen_aside:g} m aside, radius "
+                f"{self.radius}; the first two are 0 or more, a radius is positive"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageMap:
+    """What has been seen.
+
+    Attributes
+    ----------
+    across : Across
+        What counts from left to right.
+    depth_edges : array, shape (N + 1,)
+        Metres, downward.
+    across_edges : array, shape (M + 1,)
+        Radians, or metres. Bearings go on beyond a full turn where that joins them; those of more
+        than a turn are folded into 0 to 2 pi.
+    seconds : array, shape (N, M)
+        For how long each cell was in view; 0 is unseen.
+    path : array, shape (K, 3)
+        Time, place across and depth of the vehicle's foot on the net.
+    """
+
+    across: Across
+    depth_edges: FloatArray
+    across_edges: FloatArray
+    seconds: FloatArray
+    path: FloatArray
+
+    @property
+    def seen_share(self) -> float:
+        """Share of the map's cells that were seen; 0 without any."""
+        return float(np.mean(self.seconds > 0.0)) if self.seconds.size else 0.0
+
+
+class Coverage:
+    """Gathers what a dive sees.
+
+    Parameters
+    ----------
+    options : CoverageOptions, optional
+        Defaults if left out.
+    """
+
+    # Steps that are longer are gaps, in seconds.
+    LONGEST_STEP_S = 1.0
+
+    def __init__(self, options: CoverageOptions | None = None) -> None:
+        self.options = options or CoverageOptions()
+        self._last_s = math.nan
+        self._along = 0.0
+        self._rows: list[tuple[float, float, float, float, float, float]] = []
+
+    def add(
+        self,
+        now_s: float,
+        posture: Posture | Refusal | None,
+        decision: Decision,
+        state: VehicleState,
+    ) -> None:
+        """Take in one step; without a posture or a depth nothing is seen."""
+        step = now_s - self._last_s
+        step = step if 0.0 < step <= self.LONGEST_STEP_S else 0.0
+        self._last_s = now_s
+        if decision.engaged:
+            self._along += step * decision.guidance.sway
+        if not isinstance(posture, Posture) or state.depth is None:
+            return
+        bearing = bearing_of(posture, state)
+        place = math.nan if bearing is None else bearing
+        self._rows.append((now_s, step, place, self._along, state.depth, posture.range))
+
+    def map(self) -> CoverageMap:
+        """Return the map so far: by bearings if all are known, else along the net."""
+        rows = np.array(self._rows, dtype=np.float64).reshape(-1, 6)
+        rows = rows[np.isfinite(rows[:, [0, 3, 4, 5]]).all(axis=1)]
+        by_bearing = len(rows) > 0 and bool(np.isfinite(rows[:, 2]).all())
+        across = Across.BEARING if by_bearing else Across.ALONG
+        places = _joined(rows[:, 2]) if by_bearing else rows[:, 3]
+        aside = self._aside(rows[:, 5], across)
+        return _grid(rows, places, aside, across, self.options)
+
+    def _aside(self, ranges: FloatArray, across: Across) -> FloatArray:
+        """Return how far to either side is seen, in the unit of the map."""
+        metres = self.options.seen_aside * ranges
+        if across is Across.ALONG:
+            return metres
+        radius = self.options.radius
+        return np.zeros(len(ranges)) if radius is None else metres / radius
+
+
+def _joined(bearings: FloatArray) -> FloatArray:
+    """Return bearings without jumps, or folded if they go round more than once."""
+    joined = np.unwrap(bearings)
+    return joined if np.ptp(joined) <= 2.0 * np.pi else bearings % (2.0 * np.pi)
+
+
+def _grid(
+    rows: FloatArray,
+    places: FloatArray,
+    aside: FloatArray,
+    across: Across,
+    options: CoverageOptions,
+) -> CoverageMap:
+    up = options.seen_up * rows[:, 5]
+    width = options.bearing_cell if across is Across.BEARING else options.along_cell
+    down_edges = _edges(rows[:, 4] - up, rows[:, 4] + up, options.depth_cell)
+    across_edges = _edges(places - aside, places + aside, width)
+    seconds = np.zeros((max(len(down_edges) - 1, 0), max(len(across_edges) - 1, 0)))
+    for row, place, high, wide in zip(rows, places, up, aside, strict=True):
+        top, bottom = _cells(row[4] - high, row[4] + high, down_edges)
+        left, right = _cells(place - wide, place + wide, across_edges)
+        seconds[top:bottom, left:right] += row[1]
+    path = np.column_stack([rows[:, 0], places, rows[:, 4]])
+    return CoverageMap(across, down_edges, across_edges, seconds, path)
+
+
+def _edges(low: FloatArray, high: FloatArray, size: float) -> FloatArray:
+    """Return edges of whole cells from the lowest to the highest."""
+    if not len(low):
+        return np.zeros(0)
+    first = math.floor(float(low.min()) / size + 1e-9)
+    last = math.floor(float(high.max()) / size + 1e-9) + 1
+    return size * np.arange(first, last + 1, dtype=np.float64)
+
+
+def _cells(low: float, high: float, edges: FloatArray) -> tuple[int, int]:
+    """Return first and one past the last cell that hold any of a span."""
+    size = edges[1] - edges[0]
+    first = math.floor((low - edges[0]) / size + 1e-9)
+    last = math.floor((high - edges[0]) / size + 1e-9) + 1
+    return max(first, 0), min(last, len(edges) - 1)

@@ -1,0 +1,277 @@
+"""The gains file: a short YAML with unit suffixes (docs/control.md)."""
+
+import math
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import Field
+
+from aqualvs.control.gains import ControlGains, Drag, RangeGains, VehicleFacts, YawGains
+from aqualvs.control.gains_thrust import Layout, ThrustMap
+from aqualvs.control.settings_text import (
+    NotNegative,
+    Number,
+    Part,
+    Positive,
+    load_settings,
+    parse_settings,
+    write_settings,
+)
+from aqualvs.errors import OptionError
+
+VERSION = 1
+"""Version of the format that this package reads and writes."""
+VEHICLES = ("bluerov2_heavy", "bluerov2", "videoray")
+"""Vehicles whose gains come with the package."""
+_KEY = "aqualvs_gains"
+_HEADER = "# Gains of aqualvs for one vehicle (docs/control.md).\n"
+
+Share = Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)]
+PositiveShare = Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class DragPart(Part):
+    """Resistance along one axis."""
+
+    linear_n_s_m: NotNegative
+    quadratic_n_s2_m2: NotNegative
+
+
+class ThrustPart(Part):
+    """`thrust`: what an effort of 1 gives, and how it gets there."""
+
+    forward_n: Positive
+    backward_n: Positive
+    right_n: NotNegative
+    dead_band: Share = 0.0
+    linear: PositiveShare = 1.0
+    layout: Literal["vectored", "straight"] = "vectored"
+
+
+class VehiclePart(Part):
+    """`vehicle`: what is taken for granted."""
+
+    mass_kg: Positive
+    forward_drag: DragPart
+    right_drag: DragPart
+    thrust: ThrustPart
+    turning_rate_deg_s: Positive
+    climb_rate_m_s: Positive
+    dome_forward_m: Number = 0.0
+
+
+class RangePart(Part):
+    """`range`: the cascade that holds it."""
+
+    position_per_s: Positive
+    speed_per_s: Positive
+    integral_per_s2: NotNegative
+    lag_s: NotNegative
+    swell: NotNegative = 0.0
+    swell_period_s: Positive = 5.0
+    swell_damping: Positive = 0.15
+    greatest_speed_m_s: Positive = 0.25
+    ramp_speed_m_s: Positive = 0.15
+    ramp_acceleration_m_s2: Positive = 0.12
+    jerk_m_s3: Positive = 8.0
+
+
+class YawPart(Part):
+    """`yaw`: the loop that holds it."""
+
+    proportional_per_s: Positive
+    integral_per_s2: NotNegative
+    derivative: NotNegative = 0.0
+    lag_s: NotNegative
+    greatest_rate_deg_s: Positive = 30.0
+    ramp_rate_deg_s: Positive = 15.0
+    ramp_acceleration_deg_s2: Positive = 15.0
+    acceleration_deg_s2: Positive = 200.0
+
+
+class GainsFile(Part):
+    """A whole gains file."""
+
+    aqualvs_gains: int
+    name: Annotated[str, Field(min_length=1)]
+    vehicle: VehiclePart
+    range: RangePart
+    yaw: YawPart
+    rate_time_s: Positive = 0.1
+    memory_s: Positive = 10.0
+
+
+def load_gains(source: Path | str) -> ControlGains:
+    """Return gains from a file, or those that come with the package by a vehicle's name.
+
+    Raises
+    ------
+    OptionError
+        One line: file, place, value, remedy.
+    """
+    if str(source) in VEHICLES:
+        text = _packaged(str(source))
+        return _gains(parse_settings(yaml.safe_load(text), GainsFile, _KEY, VERSION, str(source)))
+    path = Path(source)
+    if path.suffix == "" and not path.exists():
+        raise OptionError(
+            f"{path}: neither a gains file nor one of {', '.join(VEHICLES)}; 'aqualvs tune' makes "
+            "such a file"
+        )
+    content = load_settings(path, GainsFile, _KEY, VERSION)
+    try:
+        return _gains(content)
+    except OptionError as fault:
+        raise OptionError(f"{path}: {fault}") from fault
+
+
+def save_gains(gains: ControlGains, path: Path) -> None:
+    """Write a gains file.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    write_settings(path, gains_text(gains))
+
+
+def gains_text(gains: ControlGains) -> str:
+    """Return gains as the text of a file."""
+    content = _content(gains).model_dump()
+    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return _HEADER + text
+
+
+def _packaged(name: str) -> str:
+    return (files("aqualvs") / "data" / "gains" / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def _gains(content: GainsFile) -> ControlGains:
+    return ControlGains(
+        vehicle=_vehicle(content),
+        range=_range(content.range),
+        yaw=_yaw(content.yaw),
+        rate_time=content.rate_time_s,
+        memory=content.memory_s,
+    )
+
+
+def _vehicle(content: GainsFile) -> VehicleFacts:
+    part = content.vehicle
+    thrust = part.thrust
+    return VehicleFacts(
+        name=content.name,
+        mass=part.mass_kg,
+        forward_drag=_drag(part.forward_drag),
+        right_drag=_drag(part.right_drag),
+        thrust=ThrustMap(
+            forward=thrust.forward_n,
+            backward=thrust.backward_n,
+            right=thrust.right_n,
+            dead_band=thrust.dead_band,
+            linear=thrust.linear,
+            layout=Layout(thrust.layout),
+        ),
+        turning_rate=math.radians(part.turning_rate_deg_s),
+        climb_rate=part.climb_rate_m_s,
+        dome_forward=part.dome_forward_m,
+    )
+
+
+def _drag(part: DragPart) -> Drag:
+    return Drag(part.linear_n_s_m, part.quadratic_n_s2_m2)
+
+
+def _range(part: RangePart) -> RangeGains:
+    return RangeGains(
+        position=part.position_per_s,
+        speed=part.speed_per_s,
+        integral=part.integral_per_s2,
+        lag=part.lag_s,
+        swell=part.swell,
+        swell_period=part.swell_period_s,
+        swell_damping=part.swell_damping,
+        greatest_speed=part.greatest_speed_m_s,
+        ramp_speed=part.ramp_speed_m_s,
+        ramp_acceleration=part.ramp_acceleration_m_s2,
+        jerk=part.jerk_m_s3,
+    )
+
+
+def _yaw(part: YawPart) -> YawGains:
+    return YawGains(
+        proportional=part.proportional_per_s,
+        integral=part.integral_per_s2,
+        derivative=part.derivative,
+        lag=part.lag_s,
+        greatest_rate=math.radians(part.greatest_rate_deg_s),
+        ramp_rate=math.radians(part.ramp_rate_deg_s),
+        ramp_acceleration=math.radians(part.ramp_acceleration_deg_s2),
+        acceleration=math.radians(part.acceleration_deg_s2),
+    )
+
+
+def _content(gains: ControlGains) -> GainsFile:
+    near, turn = gains.range, gains.yaw
+    return GainsFile(
+        aqualvs_gains=VERSION,
+        name=gains.vehicle.name,
+        vehicle=_vehicle_part(gains.vehicle),
+        range=RangePart(
+            position_per_s=near.position,
+            speed_per_s=near.speed,
+            integral_per_s2=near.integral,
+            lag_s=near.lag,
+            swell=near.swell,
+            swell_period_s=near.swell_period,
+            swell_damping=near.swell_damping,
+            greatest_speed_m_s=near.greatest_speed,
+            ramp_speed_m_s=near.ramp_speed,
+            ramp_acceleration_m_s2=near.ramp_acceleration,
+            jerk_m_s3=near.jerk,
+        ),
+        yaw=YawPart(
+            proportional_per_s=turn.proportional,
+            integral_per_s2=turn.integral,
+            derivative=turn.derivative,
+            lag_s=turn.lag,
+            greatest_rate_deg_s=_degrees(turn.greatest_rate),
+            ramp_rate_deg_s=_degrees(turn.ramp_rate),
+            ramp_acceleration_deg_s2=_degrees(turn.ramp_acceleration),
+            acceleration_deg_s2=_degrees(turn.acceleration),
+        ),
+        rate_time_s=gains.rate_time,
+        memory_s=gains.memory,
+    )
+
+
+def _vehicle_part(facts: VehicleFacts) -> VehiclePart:
+    thrust = facts.thrust
+    return VehiclePart(
+        mass_kg=facts.mass,
+        forward_drag=_drag_part(facts.forward_drag),
+        right_drag=_drag_part(facts.right_drag),
+        thrust=ThrustPart(
+            forward_n=thrust.forward,
+            backward_n=thrust.backward,
+            right_n=thrust.right,
+            dead_band=thrust.dead_band,
+            linear=thrust.linear,
+            layout=thrust.layout.value,
+        ),
+        turning_rate_deg_s=_degrees(facts.turning_rate),
+        climb_rate_m_s=facts.climb_rate,
+        dome_forward_m=facts.dome_forward,
+    )
+
+
+def _drag_part(drag: Drag) -> DragPart:
+    return DragPart(linear_n_s_m=drag.linear, quadratic_n_s2_m2=drag.quadratic)
+
+
+def _degrees(angle: float) -> float:
+    # More digits than anybody sets, fewer than rounding leaves.
+    return float(f"{math.degrees(angle):.10g}")

@@ -1,0 +1,114 @@
+"""From forces to efforts: thrusters have a dead band and a bent curve, controllers neither."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from aqualvs.errors import OptionError
+
+
+class Layout(StrEnum):
+    """How the level thrusters stand."""
+
+    VECTORED = "vectored"
+    """Askew, in two pairs: one does forward plus right, the other forward minus right."""
+    STRAIGHT = "straight"
+    """Forward and sideways have thrusters of their own, or there are none sideways."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThrustMap:
+    """Thrust over effort, and back.
+
+    Beyond the dead band thrust is full * (linear x + (1 - linear) x²), x being the rest of the
+    effort's travel.
+
+    Attributes
+    ----------
+    forward, backward, right : float
+        Thrust at effort 1 along the axis alone, in newtons; `right` is 0 where the vehicle cannot
+        move sideways.
+    dead_band : float
+        Effort below which nothing happens.
+    linear : float
+        Share of the curve that is straight.
+    layout : Layout
+        Of the level thrusters.
+    soft : float
+        Share of the full thrust below which the dead band is crossed gradually: noise about zero
+        then does not make thrusters chatter.
+    """
+
+    forward: float
+    backward: float
+    right: float
+    dead_band: float = 0.0
+    linear: float = 1.0
+    layout: Layout = Layout.VECTORED
+    soft: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be turned round.
+
+        Raises
+        ------
+        OptionError
+            If a thrust is not positive or a share none.
+        """
+        if not (min(self.forward, self.backward) > 0.0 and self.right >= 0.0):
+            raise OptionError(
+                f"thrust: forward {self.forward:g}, backward {self.backward:g}, right "
+                f"{self.right:g} N; the first two are positive, the last 0 or more"
+            )
+        if not (0.0 <= self.dead_band < 1.0 and 0.0 < self.linear <= 1.0 and 0.0 < self.soft < 1.0):
+            raise OptionError(
+                f"thrust: dead band {self.dead_band:g}, linear {self.linear:g}, soft "
+                f"{self.soft:g}; shares between 0 and 1"
+            )
+
+    def effort(self, share: float) -> float:
+        """Return the effort for a share of the full thrust, both -1 to 1."""
+        size = min(abs(share), 1.0)
+        return math.copysign(self._past_dead_band(size), share) if size > 0.0 else 0.0
+
+    def share(self, effort: float) -> float:
+        """Return the share of the full thrust that an effort gives, both -1 to 1."""
+        x = (min(abs(effort), 1.0) - self.dead_band) / (1.0 - self.dead_band)
+        if x <= 0.0:
+            return 0.0
+        return math.copysign(x * (self.linear + (1.0 - self.linear) * x), effort)
+
+    def efforts(self, forward: float, right: float) -> tuple[float, float]:
+        """Return efforts forward and right for forces in newtons.
+
+        What is beyond the thrusters is cut: sideways first, for distance matters more.
+        """
+        full = self.forward if forward > 0.0 else self.backward
+        ahead = _clipped(forward / full, 1.0)
+        aside = 0.0 if self.right == 0.0 else _clipped(right / self.right, 1.0)
+        if self.layout is Layout.STRAIGHT:
+            return self.effort(ahead), self.effort(aside)
+        aside = _clipped(aside, 1.0 - abs(ahead))
+        one, other = self.effort(ahead + aside), self.effort(ahead - aside)
+        return 0.5 * (one + other), 0.5 * (one - other)
+
+    def forces(self, forward: float, right: float) -> tuple[float, float]:
+        """Return the forces in newtons that two efforts give together."""
+        if self.layout is Layout.STRAIGHT:
+            ahead, aside = self.share(forward), self.share(right)
+        else:
+            one, other = self.share(forward + right), self.share(forward - right)
+            ahead, aside = 0.5 * (one + other), 0.5 * (one - other)
+        return ahead * (self.forward if ahead > 0.0 else self.backward), aside * self.right
+
+    def _past_dead_band(self, size: float) -> float:
+        if size < self.soft:
+            return size / self.soft * self._past_dead_band(self.soft)
+        bent = 1.0 - self.linear
+        # The root of bent x² + linear x = size in the form that holds for bent = 0.
+        x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
+        return self.dead_band + (1.0 - self.dead_band) * x
+
+
+def _clipped(value: float, most: float) -> float:
+    return min(max(value, -most), most)

@@ -1,0 +1,226 @@
+"""The plan file: what to do, how to stay safe, and what to do without the target."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from aqualvs.control.mission import HoldMission, LossOptions, Mission
+from aqualvs.control.missions_follow import FollowMission, LegOptions, Sector
+from aqualvs.control.missions_survey import SurveyMission, SurveyOptions, Turn
+from aqualvs.control.safety import SafetyLimits
+from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.control.settings_text import NotNegative, Number, Part, Positive, load_settings
+from aqualvs.errors import OptionError
+
+VERSION = 1
+"""Version of the format that is read."""
+_KEY = "aqualvs_plan"
+# A setpoint so near to the least range leaves no room to swing, in metres.
+_ROOM = 0.1
+# Depths of a survey, at most; more are a slip of the pen.
+_MOST_DEPTHS = 1000
+
+Two = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Speed = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+
+
+class LegPart(Part):
+    """`leg`: where one way along the net ends."""
+
+    time_s: Positive | None = None
+    distance_m: Positive | None = None
+    bearings_deg: Two | None = None
+
+
+class SurveyPart(Part):
+    """`survey`: the depths, and what happens between them."""
+
+    depths_m: Annotated[list[NotNegative], Field(min_length=1)]
+    step_m: Positive | None = None
+    turn: Literal["back", "on"] = "back"
+    descent_m_s: Positive = 0.1
+    patience_s: Positive = 20.0
+
+
+class LossPart(Part):
+    """`loss`: what to do without the target."""
+
+    after_s: Positive = 0.15
+    steady_s: NotNegative = 0.1
+    give_up_s: Positive = 10.0
+
+
+class SafetyPart(Part):
+    """`safety`: where the gate steps in."""
+
+    posture_age_s: Positive = 0.15
+    heartbeat_age_s: Positive = 1.0
+    least_range_m: Positive = 0.35
+    approach_speed_m_s: Positive = 0.3
+    stopping_time_s: Positive = 0.7
+    retreat_effort: Positive = 0.25
+    brake_effort: Positive = 0.5
+
+
+class PlanFile(Part):
+    """A whole plan file."""
+
+    aqualvs_plan: int
+    mission: Literal["hold", "follow", "survey"]
+    range_m: Positive
+    yaw_deg: Number = 0.0
+    sway_m_s: Speed | None = None
+    duration_s: Positive | None = None
+    leg: LegPart | None = None
+    survey: SurveyPart | None = None
+    loss: LossPart = LossPart()
+    safety: SafetyPart = SafetyPart()
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a plan file says.
+
+    Attributes
+    ----------
+    name : str
+        Of the mission: hold, follow or survey.
+    setpoint : Setpoint
+    limits : SafetyLimits
+    """
+
+    name: str
+    setpoint: Setpoint
+    limits: SafetyLimits
+    _file: PlanFile
+
+    def mission(self) -> Mission:
+        """Return a new mission, at its beginning."""
+        content = self._file
+        loss = LossOptions(
+            after=content.loss.after_s,
+            steady=content.loss.steady_s,
+            give_up=content.loss.give_up_s,
+        )
+        leg, sway = _leg(content), content.sway_m_s or 0.0
+        if content.survey is not None:
+            return SurveyMission(self.setpoint, _survey(content.survey, leg, sway), loss=loss)
+        if self.name == "follow":
+            return FollowMission(self.setpoint, sway, leg=leg, loss=loss)
+        duration = math.inf if content.duration_s is None else content.duration_s
+        return HoldMission(self.setpoint, duration=duration, loss=loss)
+
+
+def load_plan(path: Path | str) -> Plan:
+    """Return the plan of a file.
+
+    Raises
+    ------
+    OptionError
+        One line: file, place, value, remedy.
+    """
+    path = Path(path)
+    content = load_settings(path, PlanFile, _KEY, VERSION)
+    try:
+        _check_together(content)
+        setpoint = Setpoint(content.range_m, math.radians(content.yaw_deg))
+        limits = _limits(content.safety)
+        _check_setpoint(setpoint, limits)
+        plan = Plan(content.mission, setpoint, limits, content)
+        # A plan that cannot begin must be refused now, not under water.
+        plan.mission()
+    except OptionError as fault:
+        raise OptionError(f"{path}: {fault}") from fault
+    return plan
+
+
+def _check_together(content: PlanFile) -> None:
+    """Refuse keys that the mission does not use, and missions that lack one."""
+    name = content.mission
+    moves = name != "hold"
+    if moves and content.sway_m_s is None:
+        raise OptionError(f"sway_m_s is missing; a mission '{name}' needs a speed, such as 0.2")
+    if name == "survey" and content.survey is None:
+        raise OptionError("survey is missing; add 'survey: {depths_m: [2, 8], step_m: 1}'")
+    idle = {
+        "sway_m_s": not moves and content.sway_m_s is not None,
+        "leg": not moves and content.leg is not None,
+        "duration_s": moves and content.duration_s is not None,
+        "survey": name != "survey" and content.survey is not None,
+    }
+    for key, is_idle in idle.items():
+        if is_idle:
+            remedy = "use leg.time_s" if key == "duration_s" else "leave it out"
+            raise OptionError(f"{key} does nothing in a mission '{name}'; {remedy}")
+
+
+def _check_setpoint(setpoint: Setpoint, limits: SafetyLimits) -> None:
+    if setpoint.range < limits.least_range + _ROOM:
+        raise OptionError(
+            f"range_m is {setpoint.range:g}, but nothing approaches within safety.least_range_m, "
+            f"{limits.least_range:g}; choose at least {limits.least_range + _ROOM:.2f}"
+        )
+    if not abs(setpoint.yaw) <= SetpointHolder.MAX_YAW:
+        raise OptionError(
+            f"yaw_deg is {math.degrees(setpoint.yaw):g}; choose at most "
+            f"{math.degrees(SetpointHolder.MAX_YAW):.0f} to either side"
+        )
+
+
+def _limits(part: SafetyPart) -> SafetyLimits:
+    return SafetyLimits(
+        posture_age=part.posture_age_s,
+        heartbeat_age=part.heartbeat_age_s,
+        least_range=part.least_range_m,
+        approach_speed=part.approach_speed_m_s,
+        stopping_time=part.stopping_time_s,
+        retreat_effort=part.retreat_effort,
+        brake_effort=part.brake_effort,
+    )
+
+
+def _leg(content: PlanFile) -> LegOptions:
+    part = content.leg or LegPart()
+    sector = None
+    if part.bearings_deg is not None:
+        begin, end = (math.radians(bearing) for bearing in part.bearings_deg)
+        sector = Sector(begin, end)
+    return LegOptions(
+        time=math.inf if part.time_s is None else part.time_s,
+        distance=math.inf if part.distance_m is None else part.distance_m,
+        sector=sector,
+    )
+
+
+def _survey(part: SurveyPart, leg: LegOptions, sway: float) -> SurveyOptions:
+    return SurveyOptions(
+        depths=_depths(part),
+        sway=sway,
+        leg=leg,
+        turn=Turn(part.turn),
+        descent=part.descent_m_s,
+        patience=part.patience_s,
+    )
+
+
+def _depths(part: SurveyPart) -> tuple[float, ...]:
+    """Return the depths themselves, or those from the first to the last by a step."""
+    if part.step_m is None:
+        return tuple(part.depths_m)
+    if len(part.depths_m) != 2:
+        raise OptionError(
+            f"survey.depths_m holds {len(part.depths_m)} depths; with step_m give two, from and to"
+        )
+    first, last = part.depths_m
+    n = math.floor(abs(last - first) / part.step_m + 1e-9) + 1
+    if n > _MOST_DEPTHS:
+        raise OptionError(f"survey.step_m {part.step_m:g} makes {n} legs; choose a greater one")
+    step = math.copysign(part.step_m, last - first)
+    depths = [first + i * step for i in range(n)]
+    # The last depth counts even where the step does not meet it.
+    if abs(depths[-1] - last) > 1e-6:
+        depths.append(last)
+    return tuple(depths)

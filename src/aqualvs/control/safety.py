@@ -1,0 +1,280 @@
+"""The last word on every effort: what keeps vehicle and net whole, whoever steers.
+
+The gate sits between controllers and vehicle. It never adds thrust towards the target, never arms,
+never changes the mode; docs/missions.md has its rules as a table.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, fields, replace
+from enum import StrEnum
+
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.scanning.posture import Posture
+
+
+class Reason(StrEnum):
+    """Why an effort was changed or stopped; the value is what logs say in `reason`."""
+
+    NOT_ENGAGED = "not_engaged"
+    NO_HEARTBEAT = "no_heartbeat"
+    DISARMED = "disarmed"
+    PILOT_MODE = "pilot_mode"
+    PILOT_STICKS = "pilot_sticks"
+    CLOCK = "clock"
+    NO_POSTURE = "no_posture"
+    NOT_FINITE = "not_finite"
+    TOO_CLOSE = "too_close"
+    TOO_FAST = "too_fast"
+    NO_SETPOINT = "no_setpoint"
+    MISSION_OVER = "mission_over"
+    GAVE_UP = "gave_up"
+
+    @property
+    def words(self) -> str:
+        """What to tell the pilot."""
+        return _WORDS[self]
+
+    @property
+    def takes_over(self) -> bool:
+        """Whether the pilot must engage again before efforts pass."""
+        return self in _TAKES_OVER
+
+
+_WORDS = {
+    Reason.NOT_ENGAGED: "not engaged: the pilot steers until told otherwise",
+    Reason.NO_HEARTBEAT: "the vehicle is silent; stopped until engaged again",
+    Reason.DISARMED: "the vehicle is disarmed; arm it and engage again",
+    Reason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
+    Reason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
+    Reason.CLOCK: "time ran backwards; stopped for this update",
+    Reason.NO_POSTURE: "no valid posture; neutral until it is back",
+    Reason.NOT_FINITE: "a number is not finite; neutral for this update",
+    Reason.TOO_CLOSE: "closer than the least range; backing away",
+    Reason.TOO_FAST: "closing in too fast; braking",
+    Reason.NO_SETPOINT: "no range is set to hold",
+    Reason.MISSION_OVER: "the plan is done; stopped until engaged again",
+    Reason.GAVE_UP: "the target was lost for too long; stopped until engaged again",
+}
+_TAKES_OVER = frozenset(
+    {
+        Reason.NOT_ENGAGED,
+        Reason.NO_HEARTBEAT,
+        Reason.DISARMED,
+        Reason.PILOT_MODE,
+        Reason.PILOT_STICKS,
+        Reason.MISSION_OVER,
+        Reason.GAVE_UP,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyLimits:
+    """Where the gate steps in.
+
+    Attributes
+    ----------
+    posture_age : float
+        Seconds after the last valid posture from which on there is no thrust. The rule is 0.2 s;
+        0.15 s leaves room for the frame at which it is noticed.
+    heartbeat_age : float
+        Seconds of silence after which the vehicle counts as lost. Where the link counts nothing
+        but heartbeats, which come once a second, choose 2.5.
+    least_range : float
+        Metres to the target, from the dome's centre, within which nothing approaches.
+    approach_speed : float
+        Greatest closing speed far from the target, in m/s.
+    stopping_time : float
+        Seconds to the least range, at the present closing speed, that must remain: the speed
+        allowed shrinks with the way that is left.
+    retreat_effort : float
+        With which it backs away from too close; more where the controller asks for more. Must
+        exceed the thrusters' dead band.
+    brake_effort : float
+        With which it brakes what closes in too fast; likewise.
+    """
+
+    posture_age: float = 0.15
+    heartbeat_age: float = 1.0
+    least_range: float = 0.35
+    approach_speed: float = 0.3
+    stopping_time: float = 0.7
+    retreat_effort: float = 0.25
+    brake_effort: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse limits that cannot work.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (value > 0.0 and math.isfinite(value)):
+                raise OptionError(f"safety, {field.name} {value:g}: must be positive")
+        if self.posture_age > 0.2:
+            raise OptionError(
+                f"safety, posture_age {self.posture_age:g} s: choose at most 0.2 s; a vehicle "
+                "that cannot see must not push"
+            )
+        for name in ("retreat_effort", "brake_effort"):
+            if getattr(self, name) > 1.0:
+                raise OptionError(f"safety, {name} {getattr(self, name):g}: choose at most 1")
+
+
+class SafetyGate:
+    """Lets efforts pass, changes them or stops them; pure, all time comes from outside.
+
+    It starts disengaged.
+
+    Parameters
+    ----------
+    limits : SafetyLimits, optional
+        Defaults if left out.
+
+    Attributes
+    ----------
+    latched : Reason or None
+        Why nothing passes until `engage`; None while engaged.
+    """
+
+    def __init__(self, limits: SafetyLimits | None = None) -> None:
+        self.limits = limits or SafetyLimits()
+        self.latched: Reason | None = Reason.NOT_ENGAGED
+        self._last_s = -math.inf
+        self._seen: deque[tuple[float, float]] = deque(maxlen=32)
+
+    def engage(self, now_s: float, state: VehicleState) -> Reason | None:
+        """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
+        refused = self._vehicle_refuses(now_s, state)
+        self.latched = Reason.NOT_ENGAGED if refused else None
+        return refused
+
+    def stop(self, reason: Reason = Reason.NOT_ENGAGED) -> None:
+        """Let nothing pass until `engage`."""
+        self.latched = reason
+
+    def check(
+        self,
+        now_s: float,
+        posture_age_s: float,
+        posture: Posture | None,
+        state: VehicleState,
+        effort: Effort,
+        *,
+        range_rate: float | None = None,
+    ) -> tuple[Effort, Reason | None]:
+        """Return what may be sent, and why it differs from what was asked.
+
+        Parameters
+        ----------
+        now_s : float
+            By the clock of `VehicleState.heard_s`.
+        posture_age_s : float
+            Time since the last valid posture.
+        posture : Posture or None
+            The last valid one; None if there never was any.
+        state : VehicleState
+            What the vehicle tells.
+        effort : Effort
+            What controllers ask for.
+        range_rate : float, optional
+            In m/s, where a filter knows it; else it follows from postures in a row.
+        """
+        refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state)
+        refused = refused or self._sight_refuses(posture_age_s, posture) or _refused_effort(effort)
+        if refused is not None or posture is None:
+            return NEUTRAL, refused or Reason.NO_POSTURE
+        near = min(posture.range, posture.nearest)
+        closing = self._closing_speed(now_s - posture_age_s, near, range_rate)
+        return self._guarded(effort, near, closing)
+
+    def _clock_refuses(self, now_s: float) -> Reason | None:
+        backwards = not now_s >= self._last_s
+        # Counts from the new time on: a clock that was set back must not stop us for good.
+        self._last_s = now_s if math.isfinite(now_s) else -math.inf
+        if backwards or not math.isfinite(now_s):
+            self._seen.clear()
+            return Reason.CLOCK
+        return None
+
+    def _vehicle_stops(self, now_s: float, state: VehicleState) -> Reason | None:
+        """Return why the vehicle may not be steered; it lasts until engaged again."""
+        if self.latched is None:
+            self.latched = self._vehicle_refuses(now_s, state)
+        return self.latched
+
+    def _vehicle_refuses(self, now_s: float, state: VehicleState) -> Reason | None:
+        # A heartbeat from the future is of another clock, and tells nothing.
+        if not -self.limits.heartbeat_age <= now_s - state.heard_s <= self.limits.heartbeat_age:
+            return Reason.NO_HEARTBEAT
+        if not state.armed:
+            return Reason.DISARMED
+        if state.mode is not Mode.OURS:
+            return Reason.PILOT_MODE
+        if state.pilot_moves:
+            return Reason.PILOT_STICKS
+        return None
+
+    def _sight_refuses(self, age_s: float, posture: Posture | None) -> Reason | None:
+        if posture is None or not 0.0 <= age_s < self.limits.posture_age:
+            return Reason.NO_POSTURE
+        known = (posture.range, posture.pitch, posture.yaw, posture.nearest)
+        if not all(map(math.isfinite, known)):
+            return Reason.NOT_FINITE
+        return None
+
+    def _closing_speed(self, seen_s: float, near: float, range_rate: float | None) -> float:
+        """Return how fast the nearest point comes closer, in m/s."""
+        if not self._seen or seen_s > self._seen[-1][0]:
+            self._seen.append((seen_s, near))
+        while self._seen[-1][0] - self._seen[0][0] > _SPEED_WINDOW_S:
+            self._seen.popleft()
+        if range_rate is not None and math.isfinite(range_rate):
+            return -range_rate
+        (first_s, first), (last_s, last) = self._seen[0], self._seen[-1]
+        if last_s - first_s < _LEAST_WINDOW_S:
+            return 0.0
+        return (first - last) / (last_s - first_s)
+
+    def _guarded(self, effort: Effort, near: float, closing: float) -> tuple[Effort, Reason | None]:
+        """Return the effort without what brings the target too close."""
+        limits = self.limits
+        left = near - limits.least_range
+        if left < 0.0:
+            return _backing(effort, limits.retreat_effort), Reason.TOO_CLOSE
+        if closing > min(limits.approach_speed, left / limits.stopping_time):
+            return _backing(effort, limits.brake_effort), Reason.TOO_FAST
+        return _clipped(effort), None
+
+
+# Postures that far apart tell the closing speed to some cm/s in spite of their noise.
+_SPEED_WINDOW_S = 0.4
+_LEAST_WINDOW_S = 0.15
+
+
+def _refused_effort(effort: Effort) -> Reason | None:
+    parts = (effort.forward, effort.right, effort.down, effort.yaw)
+    return None if all(map(math.isfinite, parts)) else Reason.NOT_FINITE
+
+
+def _backing(effort: Effort, least: float) -> Effort:
+    """Return a push back, the controller's where it is stronger; turning stays allowed."""
+    back = min(effort.forward, -least)
+    return _clipped(replace(effort, forward=back, right=0.0, down=0.0))
+
+
+def _clipped(effort: Effort) -> Effort:
+    def clip(value: float) -> float:
+        return min(max(value, -1.0), 1.0)
+
+    return Effort(
+        forward=clip(effort.forward),
+        right=clip(effort.right),
+        down=clip(effort.down),
+        yaw=clip(effort.yaw),
+    )

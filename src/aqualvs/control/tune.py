@@ -1,0 +1,246 @@
+"""Gains for a vehicle model: the fastest that stay stable in the worst case.
+
+Range: linearised about rest in still or moving water, the vehicle is 1 / (m s (s + b)) with the
+drag's slope b over mass, behind its thrusters' lag and the delay of picture, link and sampling.
+With the gains `speed` k1, `position` k0 and `integral` ki, and the band H about the swell's period,
+the open loop is
+
+    L(s) = (g k1 (1 + ki / (k1 s) + 0.7 H(s)) (s + k0) + b k0) / (s (s + b)) / (lag s + 1)
+           exp(-delay s),
+
+g = 1 + 0.5 b / k1 being the controller's schedule in moving water. k0 = 0.35 k1 and ki = 0.2 k1²
+place the poles without swell, lag, delay and drag at 0.17 k1 and at (0.42 +- 0.49 j) k1, damped by
+0.65. So one number is left; it is the greatest for which the modulus margin stays at
+`least_modulus` in every corner: mass and drag off by the factors asked for, the greatest delay,
+water at rest and at the greatest current.
+
+Yaw: the autopilot keeps turning rates with a lag, that of its shaping, its rate loop and the
+thrusters; L(s) = (kp s + ki) / s² / (lag s + 1) exp(-delay s) with ki = 0.15 kp², and kp the
+greatest for the same margin, the rate loop being as calculated or, in the thrusters' dead band,
+several times slower.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.control.gains import (
+    ControlGains,
+    RangeGains,
+    VehicleFacts,
+    YawGains,
+    gain_schedule,
+)
+from aqualvs.control.tune_margins import Loop, Margins, margins, worst
+from aqualvs.control.tune_model import Turning, facts_of, tidy, turning_of
+from aqualvs.errors import OptionError
+from aqualvs.simulation.vehicle_models import VehicleModel
+
+_POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.35, 0.2, 0.15
+_SWELL = 0.7
+# In the thrusters' dead band the autopilot follows a turning rate so many times later.
+_SLUGGISH = 4.0
+# Where the bisection of a gain begins and ends, in 1/s.
+_LEAST, _GREATEST = 0.05, 20.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TuneOptions:
+    """What the loops must stand.
+
+    Attributes
+    ----------
+    delay : float
+        From the exposure to the effort at the vehicle, in seconds: what it usually is.
+    greatest_delay : float
+        What it may become.
+    frame : float
+        Seconds between frames; half of it counts as delay, for efforts are held so long.
+    mass_factor, drag_factor : float
+        By which mass and drag may be off, either way.
+    current : float
+        Greatest speed of the water, in m/s.
+    least_modulus : float
+        Least distance of the loop from -1 in the worst corner, where all is off at once; at the
+        usual delay, with the model as it is, it comes out at about twice that.
+    least_yaw_modulus : float
+        As much for the yaw, which has less to fight.
+    """
+
+    delay: float = 0.1
+    greatest_delay: float = 0.2
+    frame: float = 0.04
+    mass_factor: float = 1.2
+    drag_factor: float = 2.0
+    current: float = 0.5
+    least_modulus: float = 0.3
+    least_yaw_modulus: float = 0.45
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense.
+
+        Raises
+        ------
+        OptionError
+            Naming the value.
+        """
+        if not 0.0 <= self.delay <= self.greatest_delay:
+            raise OptionError(
+                f"tune: delay {self.delay:g} s; choose 0 to the greatest, {self.greatest_delay:g} s"
+            )
+        if not (self.frame > 0.0 and min(self.mass_factor, self.drag_factor) >= 1.0):
+            raise OptionError(
+                f"tune: frame {self.frame:g} s, factors {self.mass_factor:g} and "
+                f"{self.drag_factor:g}; the first is positive, the others are at least 1"
+            )
+        moduli = (self.least_modulus, self.least_yaw_modulus)
+        if not (self.current >= 0.0 and 0.0 < min(moduli) <= max(moduli) < 1.0):
+            raise OptionError(
+                f"tune: current {self.current:g} m/s, least moduli {moduli[0]:g} and "
+                f"{moduli[1]:g}; the first is 0 or more, the others between 0 and 1"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """What tuning came to.
+
+    Attributes
+    ----------
+    gains : ControlGains
+    range_usual, range_worst, yaw_usual, yaw_worst : Margins
+        At the usual delay with the model as it is, and in the worst corner.
+    """
+
+    gains: ControlGains
+    range_usual: Margins
+    range_worst: Margins
+    yaw_usual: Margins
+    yaw_worst: Margins
+
+
+def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
+    """Return the fastest gains for a model that stay stable in every corner.
+
+    Raises
+    ------
+    OptionError
+        If there are none.
+    """
+    options = options or TuneOptions()
+    facts = facts_of(model)
+    lag, turn = model.curve.lag, turning_of(model)
+    usual = options.delay + 0.5 * options.frame
+
+    def of_range(k: float) -> RangeGains:
+        return _range_gains(k, lag + usual)
+
+    def of_yaw(k: float) -> YawGains:
+        return _yaw_gains(k, turn.lag() + usual)
+
+    k1 = _greatest(
+        model.name, lambda k: _range_worst(facts, lag, of_range(k), options), options.least_modulus
+    )
+    kp = _greatest(
+        model.name, lambda k: _yaw_worst(turn, of_yaw(k), options), options.least_yaw_modulus
+    )
+    gains = ControlGains(vehicle=facts, range=of_range(k1), yaw=of_yaw(kp))
+    return Tuned(
+        gains,
+        margins(_range_loop(facts, lag, gains.range, usual, 0.0)),
+        _range_worst(facts, lag, gains.range, options),
+        margins(_yaw_loop(turn.lag(), gains.yaw, usual)),
+        _yaw_worst(turn, gains.yaw, options),
+    )
+
+
+def _range_gains(speed: float, lag: float) -> RangeGains:
+    return RangeGains(
+        swell=_SWELL,
+        lag=tidy(lag),
+        position=tidy(_POSITION_SHARE * speed),
+        speed=tidy(speed),
+        integral=tidy(_INTEGRAL_SHARE * speed * speed),
+    )
+
+
+def _yaw_gains(proportional: float, lag: float) -> YawGains:
+    return YawGains(
+        lag=tidy(lag),
+        proportional=tidy(proportional),
+        integral=tidy(_TURN_INTEGRAL_SHARE * proportional * proportional),
+    )
+
+
+def _range_loop(
+    facts: VehicleFacts,
+    lag: float,
+    gains: RangeGains,
+    delay: float,
+    current: float,
+    mass: float = 1.0,
+    drag: float = 1.0,
+) -> Loop:
+    """Return the open loop about rest in a current, with mass and drag off by factors."""
+    slope = facts.forward_drag.linear + 2.0 * facts.forward_drag.quadratic * current
+    damping = slope * drag / (facts.mass * mass)
+    w, zeta = 2.0 * math.pi / gains.swell_period, gains.swell_damping
+    swell = np.array([1.0, 2.0 * zeta * w, w * w])
+    swings = gains.swell * np.array([2.0 * zeta * w, 0.0])
+    known = slope / facts.mass
+    pushes = np.polymul([gains.speed, gains.integral], swell)
+    pushes = np.polyadd(pushes, gains.speed * np.polymul([1.0, 0.0], swings))
+    above = gain_schedule(gains, known) * np.polymul(pushes, [1.0, gains.position])
+    # Drag is put in beforehand at the speed asked for, which follows the position.
+    ahead = known * gains.position
+    above = np.polyadd(above, ahead * np.polymul([1.0, 0.0], swell)) / mass
+    below = np.polymul(np.polymul([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)
+    return Loop(above, below, delay)
+
+
+def _range_worst(
+    facts: VehicleFacts, lag: float, gains: RangeGains, options: TuneOptions
+) -> Margins:
+    delay = options.greatest_delay + 0.5 * options.frame
+    return worst(
+        margins(_range_loop(facts, lag, gains, delay, current, mass, drag))
+        for mass, drag, current in _corners(options)
+    )
+
+
+def _corners(options: TuneOptions) -> Iterator[tuple[float, float, float]]:
+    m, d = options.mass_factor, options.drag_factor
+    return itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))
+
+
+def _yaw_loop(lag: float, gains: YawGains, delay: float) -> Loop:
+    above = np.array([gains.proportional, gains.integral])
+    return Loop(above, np.array([lag, 1.0, 0.0, 0.0]), delay)
+
+
+def _yaw_worst(turning: Turning, gains: YawGains, options: TuneOptions) -> Margins:
+    delay = options.greatest_delay + 0.5 * options.frame
+    lags = (turning.lag(slower) for slower in (1.0, _SLUGGISH))
+    return worst(margins(_yaw_loop(lag, gains, delay)) for lag in lags)
+
+
+def _greatest(name: str, of: Callable[[float], Margins], least: float) -> float:
+    """Return the greatest gain whose worst modulus margin is enough, by bisection."""
+
+    def enough(gain: float) -> bool:
+        found = of(gain)
+        return found.stable and found.modulus >= least
+
+    if not enough(_LEAST):
+        raise OptionError(
+            f"tune {name}: no gains leave a modulus margin of {least:g}; lower the greatest delay, "
+            "or the margin"
+        )
+    low, high = _LEAST, _GREATEST
+    while high > 1.005 * low:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return low
