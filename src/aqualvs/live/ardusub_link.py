@@ -1,0 +1,264 @@
+"""ArduSub by MAVLink: what it tells of itself, and our efforts to it.
+
+Never arms or disarms, never changes the mode, never presses a button: what goes out is
+`MANUAL_CONTROL` with no button pressed, or a speed in GUIDED, and nothing else.
+"""
+
+import contextlib
+import math
+import threading
+import time
+from dataclasses import dataclass
+from typing import Final
+
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.live.ardusub_link_commands import (
+    Command,
+    Commander,
+    GuidedCommander,
+    StickCommander,
+    is_finite,
+    sticks_of,
+)
+from aqualvs.live.ardusub_link_depth import DepthChoice
+from aqualvs.live.ardusub_link_sticks import PilotSticks
+from aqualvs.live.logs.tlog import SUB_MODES
+from aqualvs.live.mavlink_link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
+
+_AUTOPILOT = 1
+# Not a ground station's own component (190 as a rule): a router would take the two for one, and
+# keep its messages from us.
+_SENDER = MAV_COMP_ID_ONBOARD_COMPUTER
+_ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
+_ARMED = 128
+_FRESH_S = 1.0
+# Two and a half of ArduSub's heartbeats.
+_BEATS_WITHIN_S = 2.5
+# Sticks that were in use so lately may still be in force when the link is closed.
+_LATELY_S = 3.0
+_GOODBYES, _GOODBYE_EVERY_S = 3, 0.02
+# Depth hold alone: elsewhere the vehicle would sink or rise under a neutral stick, or goes its way.
+_KEEPS_DEPTH: Final = {
+    Command.STICKS: ("ALT_HOLD", "POSHOLD", "SURFTRAK"),
+    Command.GUIDED: ("GUIDED",),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArduSubOptions:
+    """How ArduSub is steered, and who must be there.
+
+    Attributes
+    ----------
+    command : Command
+        Sticks, or speeds in GUIDED.
+    modes : tuple of str
+        Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
+    ground_station : int
+        System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
+        SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
+    station_timeout_s : float or None
+        Without its heartbeat for so long, efforts are not ours to give: our own sticks would keep
+        ArduSub from noticing that its ground station is gone. None where nobody need be there.
+    stick_dead_band : float
+        Deflection of the pilot's sticks that counts as centred, as a share of the full one.
+    speed : float
+        In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
+    turning_rate : float
+        In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
+    """
+
+    command: Command = Command.STICKS
+    modes: tuple[str, ...] = ()
+    ground_station: int = 255
+    station_timeout_s: float | None = 3.0
+    stick_dead_band: float = 0.1
+    speed: float = 0.3
+    turning_rate: float = math.radians(30.0)
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        allowed = _KEEPS_DEPTH[self.command]
+        for mode in self.modes:
+            if mode not in allowed:
+                raise OptionError(
+                    f"ArduSub mode {mode}: cannot be steered by {self.command}; choose of "
+                    f"{', '.join(allowed)}"
+                )
+        if not 1 <= self.ground_station <= 255:
+            raise OptionError(
+                f"ArduSub ground_station {self.ground_station}: must lie between 1 and 255"
+            )
+        for name in ("station_timeout_s", "speed", "turning_rate"):
+            value = getattr(self, name)
+            if value is not None and not (value > 0.0 and math.isfinite(value)):
+                raise OptionError(f"ArduSub {name} {value:g}: must be positive")
+        if not 0.0 < self.stick_dead_band < 1.0:
+            raise OptionError(
+                f"ArduSub stick_dead_band {self.stick_dead_band:g}: must lie between 0 and 1"
+            )
+
+    @property
+    def own_modes(self) -> tuple[str, ...]:
+        """The modes in which efforts are taken."""
+        return self.modes or _KEEPS_DEPTH[self.command][:1]
+
+
+class ArduSubLink:
+    """A vehicle with ArduSub, as `aqualvs.control.vehicle.VehicleLink`.
+
+    Parameters
+    ----------
+    link : str or MavlinkLink
+        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
+    options : ArduSubOptions, optional
+        Defaults if left out.
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
+    """
+
+    def __init__(self, link: str | MavlinkLink, options: ArduSubOptions | None = None) -> None:
+        self.options = options or ArduSubOptions()
+        self._owns_link = isinstance(link, str)
+        self.link = MavlinkLink(link) if isinstance(link, str) else link
+        self.name = f"ArduSub {self.link.url}"
+        station = self.options.ground_station
+        self._commander = self._make_commander()
+        self._sticks = PilotSticks(
+            self.link,
+            own=(station, _SENDER),
+            dead_band=self.options.stick_dead_band,
+        )
+        self._depth = DepthChoice(self.link, _FRESH_S)
+        # A watchdog sends from a thread of its own.
+        self._sending = threading.Lock()
+        self._sent_s = float("-inf")
+        self._closed = False
+
+    def state(self) -> VehicleState:
+        """Return the latest state; returns at once."""
+        beat = self.link.latest("HEARTBEAT", system=self.link.system, component=_AUTOPILOT)
+        if beat is None:
+            return VehicleState()
+        mode, mode_name = self._mode(beat)
+        roll, pitch, heading = self._attitude()
+        return VehicleState(
+            heard_s=self._heard_s(beat),
+            armed=bool(beat.message.base_mode & _ARMED),
+            mode=mode,
+            mode_name=mode_name,
+            pilot_moves=self._sticks.moved(),
+            depth=self._depth.read(),
+            heading=heading,
+            roll=roll,
+            pitch=pitch,
+        )
+
+    def send(self, effort: Effort) -> None:
+        """Ask for an effort; returns at once.
+
+        ArduSub keeps it until another one comes, from us or from the ground station, or until its
+        pilot-input fail-safe (FS_PILOT_TIMEOUT; in GUIDED 3 s) has run out.
+
+        Raises
+        ------
+        OSError
+            If it could not be sent.
+        ValueError
+            If a part of it is not finite; neutral is sent then.
+        """
+        finite = is_finite(effort)
+        sent = self._send(effort if finite else NEUTRAL)
+        if not finite:
+            raise ValueError(f"effort is not finite: {effort}")
+        if not sent:
+            raise OSError(f"{self.name}: not sent; {self.link.health().detail}")
+
+    def close(self) -> None:
+        """Send neutral, if efforts may still be in force, and free everything."""
+        if self._closed:
+            return
+        self._closed = True
+        if time.monotonic() - self._sent_s < _LATELY_S:
+            for _ in range(_GOODBYES):
+                with contextlib.suppress(OSError):
+                    self._send(NEUTRAL)
+                time.sleep(_GOODBYE_EVERY_S)
+        if self._owns_link:
+            self.link.close()
+
+    def _make_commander(self) -> Commander:
+        options, link = self.options, self.link
+        if options.command is Command.GUIDED:
+            return GuidedCommander(
+                link.dialect,
+                target=link.system,
+                speed=options.speed,
+                turning_rate=options.turning_rate,
+            )
+        return StickCommander(
+            link.dialect,
+            target=link.system,
+            system=options.ground_station,
+            component=_SENDER,
+        )
+
+    def _send(self, effort: Effort) -> bool:
+        with self._sending:
+            if self.options.command is Command.STICKS:
+                self._sticks.note(sticks_of(effort))
+            sent = self.link.send(self._commander.message(effort), urgent=True)
+            self._sent_s = time.monotonic() if sent else self._sent_s
+        return sent
+
+    def _mode(self, beat: Received) -> tuple[Mode, str]:
+        heard = beat.message
+        if heard.autopilot != _ARDUPILOT or heard.type != _SUBMARINE:
+            return Mode.UNKNOWN, f"not ArduSub (vehicle type {heard.type})"
+        name = SUB_MODES.get(heard.custom_mode, f"mode {heard.custom_mode}")
+        if name not in self.options.own_modes:
+            return Mode.PILOT, name
+        if not self._is_supervised():
+            return Mode.UNKNOWN, f"{name}, no ground station"
+        return Mode.OURS, name
+
+    def _is_supervised(self) -> bool:
+        """Return whether the ground station is there, or need not be."""
+        timeout_s = self.options.station_timeout_s
+        if timeout_s is None:
+            return True
+        beat = self.link.latest("HEARTBEAT", system=self.options.ground_station)
+        if beat is None or beat.message.type != _GROUND_STATION:
+            return False
+        return beat.age_s < timeout_s
+
+    def _heard_s(self, beat: Received) -> float:
+        """Return when the vehicle was heard last.
+
+        Heartbeats come once a second, attitude ten times and more: between two heartbeats attitude
+        tells that the vehicle is there. Without heartbeats it does not: mode and arming are then
+        unknown.
+        """
+        heard_ns = beat.received_ns
+        attitude = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)
+        if attitude is not None and beat.age_s < _BEATS_WITHIN_S:
+            heard_ns = max(heard_ns, attitude.received_ns)
+        return 1e-9 * heard_ns
+
+    def _attitude(self) -> tuple[float | None, float | None, float | None]:
+        """Return roll, pitch and heading (in [0, 2 pi)), in radians."""
+        found = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)
+        if found is None or found.age_s > _FRESH_S:
+            return None, None, None
+        told = found.message
+        return told.roll, told.pitch, told.yaw % (2.0 * math.pi)

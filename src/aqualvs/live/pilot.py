@@ -1,0 +1,238 @@
+"""The output that closes the loop: each sample becomes an effort, or none."""
+
+import logging
+import threading
+import time
+from dataclasses import replace
+
+from aqualvs.control.autopilot import Decision, Motion, NetPilot
+from aqualvs.control.mission import HoldMission
+from aqualvs.control.safety import Reason
+from aqualvs.control.setpoint import SetpointHolder
+from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleLink, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.live.health import PartHealth, State
+from aqualvs.live.pilot_report import PilotReport
+from aqualvs.live.pilot_watchdog import Watchdog
+from aqualvs.live.sample import LiveSample
+from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.posture import Reason as NoPosture
+
+# Datagrams may be lost. A pilot who holds his sticks is not to be disturbed: one will do.
+_GOODBYES, _GOODBYES_TO_STICKS = 3, 1
+_log = logging.getLogger(__name__)
+
+
+class Pilot:
+    """Steers a vehicle by what the lasers see, as an output of a live run.
+
+    It starts disengaged and sends nothing. `engage` lets efforts pass; a mode change, the pilot's
+    sticks, disarming and a silent vehicle end that until `engage` is called again. Then neutral
+    goes out a few times, and nothing more: further sticks of ours would be in the pilot's way.
+
+    Parameters
+    ----------
+    steering : NetPilot
+        Mission, controller and safety gate.
+    vehicle : VehicleLink
+        Closed with this output.
+    holder : SetpointHolder or None
+        Where the page puts the setpoint; a mission that holds follows it.
+    """
+
+    name = "pilot"
+    inline = True
+    keeps_all = False
+
+    def __init__(
+        self, steering: NetPilot, vehicle: VehicleLink, holder: SetpointHolder | None = None
+    ) -> None:
+        self._steering, self._vehicle, self._holder = steering, vehicle, holder
+        self._patience_s = steering.gate.limits.posture_age
+        self._watchdog = Watchdog(vehicle, self._patience_s)
+        # Samples come from one thread, engaging from another.
+        self._stepping = threading.Lock()
+        # Neutrals still to be sent; negative while engaged.
+        self._goodbyes = 0
+        self._seen_s = float("-inf")
+        self._latest: PilotReport | None = None
+        self._fault = ""
+        self._unsent = ""
+        self._n_unsent = 0
+        self._told: tuple[bool, Reason | None] = (False, Reason.NOT_ENGAGED)
+
+    @property
+    def engaged(self) -> bool:
+        """Whether efforts pass."""
+        return self._steering.engaged
+
+    @property
+    def latest(self) -> PilotReport | None:
+        """The last step; None before the first."""
+        return self._latest
+
+    def engage(self) -> None:
+        """Take over, as somebody wants it.
+
+        Raises
+        ------
+        OptionError
+            If that cannot be: no setpoint, another mode, disarmed, sticks off their centre.
+        """
+        with self._stepping:
+            if self._takes_setpoint() and not self._setpoint_known():
+                raise OptionError(f"pilot: {Reason.NO_SETPOINT.words}; choose one first")
+            refused = self._begin()
+            if refused is not None:
+                raise OptionError(f"pilot: not engaged: {refused.words}")
+            self._fault, self._goodbyes = "", 0
+            self._told = (True, None)
+        _log.info("pilot: engaged")
+
+    def disengage(self) -> None:
+        """Give the vehicle back: neutral at once."""
+        with self._stepping:
+            if not self._steering.engaged:
+                return
+            self._steering.disengage()
+            self._told = (False, Reason.NOT_ENGAGED)
+            self._goodbyes = _GOODBYES
+            self._send(NEUTRAL)
+        _log.info("pilot: disengaged")
+
+    def send(self, sample: LiveSample) -> None:
+        """Take one step; never waits, and never raises for what control or vehicle do."""
+        with self._stepping:
+            now_s = time.monotonic()
+            try:
+                state = self._vehicle.state()
+                decision = self._decide(sample, now_s, state)
+            except Exception as fault:
+                self._give_up(fault)
+                return
+            sent = self._obey(decision)
+            self._latest = PilotReport(
+                at_ns=round(1e9 * now_s),
+                frame=sample.scan.index,
+                engaged=decision.engaged,
+                effort=sent,
+                reason=decision.reason,
+                guidance=decision.guidance,
+                state=state,
+            )
+        self._tell(self._latest)
+
+    def health(self) -> PartHealth:
+        """Return what the pilot does, or why it does not."""
+        trouble = self._fault or self._unsent
+        if trouble:
+            return PartHealth(self.name, State.FAULT, trouble, self._n_unsent)
+        latest = self._latest
+        if latest is None or latest.engaged is not self.engaged:
+            words = "engaged" if self.engaged else Reason.NOT_ENGAGED.words
+            return PartHealth(
+                self.name, State.OK if self.engaged else State.OFF, words, self._n_unsent
+            )
+        return PartHealth(self.name, latest.colour, latest.words, self._n_unsent)
+
+    def close(self) -> None:
+        """Stop, send neutral and free the vehicle; further calls do nothing."""
+        self.disengage()
+        self._watchdog.close()
+        self._vehicle.close()
+
+    def _begin(self) -> Reason | None:
+        """Let control begin; return why not."""
+        try:
+            return self._steering.engage(time.monotonic(), self._vehicle.state())
+        except BaseException:
+            self._steering.disengage()
+            raise
+
+    def _decide(self, sample: LiveSample, now_s: float, state: VehicleState) -> Decision:
+        mission = self._steering.mission
+        if self._holder is not None and isinstance(mission, HoldMission):
+            mission.setpoint = self._holder.setpoint
+        return self._steering.step(
+            now_s,
+            sample.scan.time_s,
+            self._present(sample, now_s),
+            _motion(sample.filtered),
+            state,
+        )
+
+    def _present(self, sample: LiveSample, now_s: float) -> Posture | Refusal:
+        """Return the posture, unless measuring took so long that it is one no more."""
+        posture, arrived_s = sample.scan.posture, 1e-9 * sample.instants.arrived_ns
+        if not posture:
+            return posture
+        if now_s - arrived_s > self._patience_s:
+            return Refusal(NoPosture.NO_FRAMES, f"measured {now_s - arrived_s:.2f} s late")
+        self._seen_s = arrived_s
+        return posture
+
+    def _obey(self, decision: Decision) -> Effort:
+        """Send what was decided; return what went out."""
+        if decision.engaged:
+            self._goodbyes = -1
+            return self._send(decision.effort)
+        if self._goodbyes < 0:
+            by_sticks = decision.reason is Reason.PILOT_STICKS
+            self._goodbyes = _GOODBYES_TO_STICKS if by_sticks else _GOODBYES
+        if self._goodbyes > 0:
+            self._goodbyes -= 1
+            self._send(NEUTRAL)
+        return NEUTRAL
+
+    def _send(self, effort: Effort) -> Effort:
+        """Send an effort that rests on the last posture; return what went out."""
+        try:
+            sent = self._watchdog.send(effort, self._seen_s)
+        except (OSError, ValueError) as fault:
+            self._n_unsent += 1
+            self._unsent = str(fault)
+            return NEUTRAL
+        self._unsent = ""
+        return sent
+
+    def _give_up(self, fault: Exception) -> None:
+        """Stop after what control has raised, until somebody engages again."""
+        words = f"stopped by a fault: {fault}"
+        if words != self._fault:
+            _log.exception("pilot: %s", words)
+        self._fault = words
+        self._steering.disengage()
+        self._told = (False, Reason.NOT_ENGAGED)
+        if self._latest is not None:
+            self._latest = replace(
+                self._latest, engaged=False, effort=NEUTRAL, reason=Reason.NOT_ENGAGED
+            )
+        if self._goodbyes < 0:
+            self._goodbyes = _GOODBYES
+        if self._goodbyes > 0:
+            self._goodbyes -= 1
+            self._send(NEUTRAL)
+
+    def _takes_setpoint(self) -> bool:
+        return self._holder is not None and isinstance(self._steering.mission, HoldMission)
+
+    def _setpoint_known(self) -> bool:
+        return self._holder is not None and self._holder.setpoint is not None
+
+    def _tell(self, report: PilotReport) -> None:
+        """Log what has changed."""
+        told = (report.engaged, report.reason)
+        if told == self._told:
+            return
+        self._told = told
+        level = logging.INFO if report.reason is None else logging.WARNING
+        _log.log(level, "pilot, frame %d: %s", report.frame, report.words)
+
+
+def _motion(filtered: FilteredPosture | None) -> Motion | None:
+    """Return the filter's answer in control's words."""
+    if filtered is None:
+        return None
+    range_rate, _, yaw_rate = filtered.rates.tolist()
+    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)

@@ -1,0 +1,306 @@
+"""The link to ArduSub: what it makes of messages, and messages of efforts."""
+
+import math
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode
+from aqualvs.errors import OptionError
+from aqualvs.live.ardusub_link import ArduSubLink, ArduSubOptions
+from aqualvs.live.ardusub_link_commands import Command, is_finite, sticks_of
+from aqualvs.live.mavlink_link import Received
+
+dialect = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+
+SHARES = st.floats(-2.0, 2.0)
+EFFORTS = st.builds(Effort, forward=SHARES, right=SHARES, down=SHARES, yaw=SHARES)
+
+
+class Wire:
+    """A MAVLink connection in memory: keeps what was sent, and gives what tests put in."""
+
+    def __init__(self) -> None:
+        self.url, self.system, self.dialect = "udpout:nowhere", 1, dialect
+        self.packer = dialect.MAVLink(None, 1, 191)
+        self.heard: dict[tuple[str, int, int], Received] = {}
+        self.sent: list[Any] = []
+        self.works = True
+
+    def send(self, *messages: Any, urgent: bool = False) -> bool:
+        assert urgent
+        reader = dialect.MAVLink(None)
+        for message in messages if self.works else ():
+            self.sent.extend(reader.parse_buffer(message.pack(self.packer)))
+        return self.works
+
+    def health(self) -> Any:
+        return SimpleNamespace(detail="nobody listens")
+
+    def latest(
+        self, kind: str, *, system: int | None = None, component: int | None = None
+    ) -> Received | None:
+        found = [
+            entry
+            for (name, s, c), entry in self.heard.items()
+            if name == kind and system in (None, s) and component in (None, c)
+        ]
+        return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def put(
+        self, kind: str, sender: tuple[int, int] = (1, 1), age_s: float = 0.0, **f: Any
+    ) -> None:
+        at = time.monotonic_ns() - round(1e9 * age_s)
+        self.heard[kind, *sender] = Received(SimpleNamespace(**f), at, *sender)
+
+    def beat(self, mode: int = 2, base: int = 129, age_s: float = 0.0, **other: int) -> None:
+        fields = {"autopilot": 3, "type": 12, "base_mode": base, "custom_mode": mode, **other}
+        self.put("HEARTBEAT", age_s=age_s, **fields)
+
+
+@pytest.fixture
+def wire() -> Wire:
+    """ArduSub in depth hold, armed, and its ground station."""
+    made = Wire()
+    made.beat()
+    made.put("HEARTBEAT", (255, 190), type=6, autopilot=8, base_mode=0)
+    return made
+
+
+@pytest.fixture
+def vehicle(wire: Wire) -> Iterator[ArduSubLink]:
+    made = on(wire)
+    yield made
+    made.close()
+
+
+def on(wire: Any, **options: Any) -> ArduSubLink:
+    return ArduSubLink(wire, ArduSubOptions(**options))
+
+
+def test_nothing_heard() -> None:
+    state = on(Wire()).state()
+    assert (state.mode, state.armed, state.heard_s) == (Mode.UNKNOWN, False, -math.inf)
+
+
+@pytest.mark.parametrize(
+    ("options", "number", "mode", "name"),
+    [
+        ({}, 2, Mode.OURS, "ALT_HOLD"),
+        ({}, 16, Mode.PILOT, "POSHOLD"),
+        ({"modes": ("ALT_HOLD", "POSHOLD")}, 16, Mode.OURS, "POSHOLD"),
+        ({}, 0, Mode.PILOT, "STABILIZE"),
+        ({}, 19, Mode.PILOT, "MANUAL"),
+        ({}, 21, Mode.PILOT, "SURFTRAK"),
+        ({}, 99, Mode.PILOT, "mode 99"),
+        ({"command": Command.GUIDED}, 4, Mode.OURS, "GUIDED"),
+        ({"command": Command.GUIDED}, 2, Mode.PILOT, "ALT_HOLD"),
+    ],
+)
+def test_modes(wire: Wire, options: Any, number: int, mode: Mode, name: str) -> None:
+    wire.beat(number)
+    state = on(wire, **options).state()
+    assert (state.mode, state.mode_name, state.armed) == (mode, name, True)
+
+
+def test_only_the_autopilots_own_heartbeat_counts(wire: Wire, vehicle: ArduSubLink) -> None:
+    wire.beat(base=1)
+    # A camera manager of the same system, later, with the bit that means armed.
+    wire.put("HEARTBEAT", (1, 194), autopilot=8, type=30, base_mode=128, custom_mode=0)
+    assert not vehicle.state().armed
+    wire.beat(type=2)
+    assert vehicle.state().mode is Mode.UNKNOWN
+    assert "not ArduSub" in vehicle.state().mode_name
+
+
+def test_no_ground_station_no_efforts(wire: Wire) -> None:
+    wire.put("HEARTBEAT", (255, 190), age_s=3.5, type=6, autopilot=8, base_mode=0)
+    assert on(wire).state().mode is Mode.UNKNOWN
+    assert on(wire, station_timeout_s=5.0).state().mode is Mode.OURS
+    assert on(wire, station_timeout_s=None).state().mode is Mode.OURS
+    assert on(wire, station_timeout_s=5.0, ground_station=254).state().mode is Mode.UNKNOWN
+    wire.put("HEARTBEAT", (255, 190), type=18, autopilot=8, base_mode=0)
+    assert on(wire).state().mode is Mode.UNKNOWN
+
+
+def test_heard_between_heartbeats_by_attitude(wire: Wire, vehicle: ArduSubLink) -> None:
+    wire.beat(age_s=0.9)
+    assert time.monotonic() - vehicle.state().heard_s > 0.9
+    wire.put("ATTITUDE", roll=0.1, pitch=-0.2, yaw=-math.pi / 2)
+    state = vehicle.state()
+    assert time.monotonic() - state.heard_s < 0.5
+    assert (state.roll, state.pitch, state.heading) == pytest.approx((0.1, -0.2, 1.5 * math.pi))
+    wire.beat(age_s=2.6)
+    assert time.monotonic() - vehicle.state().heard_s > 2.5
+    wire.put("ATTITUDE", age_s=1.5, roll=0.1, pitch=-0.2, yaw=0.0)
+    assert vehicle.state().heading is None
+
+
+def test_depth_from_the_best_message(wire: Wire, vehicle: ArduSubLink) -> None:
+    assert vehicle.state().depth is None
+    wire.put("AHRS2", altitude=-5.2)
+    assert vehicle.state().depth == pytest.approx(5.2)
+    wire.put("VFR_HUD", alt=-5.1)
+    assert vehicle.state().depth == pytest.approx(5.1)
+    wire.put("GLOBAL_POSITION_INT", relative_alt=-5000)
+    assert vehicle.state().depth == pytest.approx(5.0)
+    wire.put("GLOBAL_POSITION_INT", age_s=1.2, relative_alt=-5000)
+    assert vehicle.state().depth == pytest.approx(5.1)
+
+
+def test_depth_that_stands_still_while_the_pressure_changes_is_none(
+    wire: Wire, vehicle: ArduSubLink
+) -> None:
+    for deeper in (0.0, 0.4, 1.0):
+        wire.put("GLOBAL_POSITION_INT", relative_alt=-10)
+        wire.put("VFR_HUD", alt=-2.0 - deeper)
+        wire.put("SCALED_PRESSURE2", press_abs=1200.0 + 100.5 * deeper)
+        depth = vehicle.state().depth
+    assert depth == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("sticks", "moves"),
+    [
+        ({}, False),
+        ({"x": 90}, False),
+        ({"x": -150}, True),
+        ({"y": 150}, True),
+        ({"r": 150}, True),
+        ({"z": 540}, False),
+        ({"z": 440}, True),
+        ({"x": 32767}, False),
+    ],
+)
+def test_joystick_of_the_ground_station(
+    wire: Wire, vehicle: ArduSubLink, sticks: dict[str, int], moves: bool
+) -> None:
+    axes = {"x": 0, "y": 0, "z": 500, "r": 0, **sticks}
+    wire.put("MANUAL_CONTROL", (255, 190), **axes)
+    assert vehicle.state().pilot_moves is moves
+    wire.put("MANUAL_CONTROL", (255, 190), age_s=1.1, **axes)
+    assert not vehicle.state().pilot_moves
+
+
+def channels(**moved: int) -> dict[str, int]:
+    centred = {f"chan{i}_raw": 1500 for i in range(1, 7)}
+    return {**centred, **{f"chan{name[1:]}_raw": pulse for name, pulse in moved.items()}}
+
+
+def test_sticks_seen_by_the_vehicles_channels(wire: Wire, vehicle: ArduSubLink) -> None:
+    for name in ("c3", "c4", "c5", "c6"):
+        wire.put("RC_CHANNELS", **channels(**{name: 1600}))
+        assert vehicle.state().pilot_moves, name
+        wire.put("RC_CHANNELS", **channels(**{name: 1535}))
+        assert not vehicle.state().pilot_moves, name
+        wire.put("RC_CHANNELS", **channels(**{name: 0}))
+        assert not vehicle.state().pilot_moves, name
+
+
+def test_own_sticks_are_not_the_pilots(wire: Wire, vehicle: ArduSubLink) -> None:
+    vehicle.send(Effort(forward=0.8, yaw=-0.5, down=0.6))
+    for gain in (0.2, 0.5, 1.0):
+        ours = channels(
+            c5=1500 + round(320 * gain), c4=1500 - round(200 * gain), c3=1500 - round(240 * gain)
+        )
+        wire.put("RC_CHANNELS", **ours)
+        assert not vehicle.state().pilot_moves, gain
+    wire.put("RC_CHANNELS", **channels(c5=1400))
+    assert vehicle.state().pilot_moves
+    wire.put("RC_CHANNELS", **channels(c5=1600, c6=1600))
+    assert vehicle.state().pilot_moves
+
+
+def test_neutral_on_the_wire(wire: Wire, vehicle: ArduSubLink) -> None:
+    vehicle.send(NEUTRAL)
+    (told,) = wire.sent
+    assert (told.get_srcSystem(), told.get_srcComponent()) == (255, 191)
+    assert (told.target, told.x, told.y, told.z, told.r) == (1, 0, 0, 500, 0)
+    assert (told.buttons, told.buttons2, told.enabled_extensions) == (0, 0, 0)
+
+
+def test_frames_are_numbered_by_their_own_sender(wire: Wire, vehicle: ArduSubLink) -> None:
+    for _ in range(258):
+        vehicle.send(NEUTRAL)
+    assert [told.get_seq() for told in wire.sent] == [i % 256 for i in range(258)]
+    assert wire.packer.seq == 0
+
+
+@given(EFFORTS)
+def test_sticks_stay_within_bounds_and_keep_their_signs(effort: Effort) -> None:
+    sticks = sticks_of(effort)
+    assert all(-1000 <= axis <= 1000 for axis in (sticks.x, sticks.y, sticks.r))
+    assert 0 <= sticks.z <= 1000
+    # Half a count is lost to rounding at most, and z counts half as fine.
+    for share, counts, fine in (
+        (effort.forward, sticks.x, 1000),
+        (effort.right, sticks.y, 1000),
+        (effort.down, 500 - sticks.z, 500),
+        (effort.yaw, sticks.r, 1000),
+    ):
+        assert counts == pytest.approx(fine * min(max(share, -1.0), 1.0), abs=0.5)
+
+
+def test_speeds_in_body_axes(wire: Wire) -> None:
+    vehicle = on(wire, command=Command.GUIDED, speed=0.4, turning_rate=0.6)
+    vehicle.send(Effort(forward=0.5, right=-1.0, down=0.25, yaw=3.0))
+    (told,) = wire.sent
+    assert (told.get_srcSystem(), told.get_srcComponent()) == (1, 191)
+    assert (told.target_system, told.target_component) == (1, 1)
+    assert told.coordinate_frame == dialect.MAV_FRAME_BODY_NED
+    # Position, acceleration and yaw are left out; speeds and turning rate are not.
+    assert told.type_mask == 0b0000_0101_1100_0111
+    speeds = (told.vx, told.vy, told.vz, told.yaw_rate)
+    assert speeds == pytest.approx((0.2, -0.4, 0.1, 0.6))
+
+
+@pytest.mark.parametrize("name", ["forward", "right", "down", "yaw"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_is_no_number_becomes_neutral(
+    wire: Wire, vehicle: ArduSubLink, name: str, value: float
+) -> None:
+    effort = Effort(**{"forward": 0.5, name: value})
+    assert not is_finite(effort)
+    with pytest.raises(ValueError, match="not finite"):
+        vehicle.send(effort)
+    (told,) = wire.sent
+    assert (told.x, told.y, told.z, told.r) == (0, 0, 500, 0)
+
+
+def test_unsent_efforts_are_told(wire: Wire, vehicle: ArduSubLink) -> None:
+    wire.works = False
+    with pytest.raises(OSError, match="nobody listens"):
+        vehicle.send(NEUTRAL)
+
+
+def test_closing_says_neutral_only_where_efforts_were_sent(wire: Wire) -> None:
+    on(wire).close()
+    assert not wire.sent
+    vehicle = on(wire)
+    vehicle.send(Effort(forward=1.0))
+    vehicle.close()
+    vehicle.close()
+    assert [told.x for told in wire.sent] == [1000, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"modes": ("MANUAL",)}, "MANUAL"),
+        ({"modes": ("GUIDED",)}, "GUIDED"),
+        ({"modes": ("ALT_HOLD",), "command": Command.GUIDED}, "ALT_HOLD"),
+        ({"ground_station": 0}, "ground_station 0"),
+        ({"station_timeout_s": 0.0}, "station_timeout_s 0"),
+        ({"speed": math.inf}, "speed inf"),
+        ({"turning_rate": -1.0}, "turning_rate -1"),
+        ({"stick_dead_band": 1.0}, "stick_dead_band 1"),
+    ],
+)
+def test_options_that_make_no_sense(options: Any, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        ArduSubOptions(**options)
