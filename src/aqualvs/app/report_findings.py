@@ -65,7 +65,8 @@ def warnings_of(
     """Return what the reader of the report should know, most important first."""
     return [
         *_status_warnings(run, track),
-        *_agreement_warnings(run),
+        *_summary_words(run, "laser_agreement"),
+        *_summary_words(run, "net_check"),
         *_gap_warnings(track),
         *_range_warnings(track, working_range),
         *_precision_warnings(track),
@@ -126,9 +127,10 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
         yield f"Only {100 * share:.0f} % of the frames gave a posture."
 
 
-def _agreement_warnings(run: Mapping[str, Any]) -> Iterator[str]:
+def _summary_words(run: Mapping[str, Any], name: str) -> Iterator[str]:
+    """Yield what a part of the run's summary has to say, as a sentence."""
     summary = run.get("summary")
-    found = summary.get("laser_agreement") if isinstance(summary, dict) else None
+    found = summary.get(name) if isinstance(summary, dict) else None
     words = found.get("words") if isinstance(found, dict) else None
     if isinstance(words, str) and words:
         yield f"{words[0].upper()}{words[1:]}."

@@ -16,6 +16,8 @@ REASON_WORDS: dict[str, str] = {
     Reason.NO_TARGET: "no target of the kind asked for",
     Reason.OUT_OF_RANGE: "target outside the working range",
     Reason.CORRUPT_FRAME: "frame could not be decoded",
+    Reason.WRONG_SIZE: "picture of another size",
+    Reason.NO_FRAMES: "stream silent",
 }
 
 LABEL_WORDS: dict[Label, str] = {

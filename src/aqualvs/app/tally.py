@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.net_check import NetCheck
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
@@ -26,12 +27,15 @@ class Tally:
         Metres, one for each valid frame.
     agreement : LaserAgreement or None
         What watches over the lasers, if anything does.
+    net_check : NetCheck or None
+        What compares the net with the target file's, if the file describes one.
     """
 
     n_frames: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
     agreement: LaserAgreement | None = None
+    net_check: NetCheck | None = None
 
     @property
     def n_valid(self) -> int:
@@ -43,6 +47,8 @@ class Tally:
         self.n_frames += 1
         if self.agreement is not None:
             self.agreement.add(scan)
+        if self.net_check is not None:
+            self.net_check.add(scan)
         if isinstance(scan.posture, Posture):
             self.ranges.append(scan.posture.range)
         else:
@@ -61,6 +67,8 @@ class Tally:
             found["refused"] = dict(self.refused.most_common())
         if self.agreement is not None:
             found["laser_agreement"] = self.agreement.verdict().facts()
+        if self.net_check is not None:
+            found["net_check"] = self.net_check.facts()
         return found
 
     def lines(self) -> list[str]:
@@ -77,7 +85,8 @@ class Tally:
             counts = (f"{n} {reason}" for reason, n in self.refused.most_common())
             text.append(f"no posture: {', '.join(counts)}")
         sentence = "" if self.agreement is None else self.agreement.verdict().sentence()
-        return [*text, sentence] if sentence else text
+        about_net = "" if self.net_check is None else self.net_check.sentence()
+        return [*text, *(words for words in (sentence, about_net) if words)]
 
 
 def tally_of(posture_csv: Path) -> Tally:

@@ -10,8 +10,8 @@ from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.measure import Measurement
 from aqualvs.scanning.net_labels import recruit
+from aqualvs.scanning.patch import Patch, flat_patch
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.quadric import Patch, flat_patch
 from aqualvs.scanning.readings import Readings
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.stretch_shape import StretchShapes
@@ -69,6 +69,9 @@ def label_readings(
     if target is not None and facing is not None:
         on_target = _light_on(target, facing, readings, chunk_index, explained)
         on_target |= found.rests_on
+        if found.whole is not None:
+            elsewhere = _of_same_return(readings.source, explained | on_target)
+            on_target |= found.whole & ~elsewhere
         label[on_target] = Label.NET if target.is_mesh else Label.SOLID
         explained |= on_target
     kept, shared = np.ones(len(readings), np.bool_), np.zeros(len(readings), np.bool_)

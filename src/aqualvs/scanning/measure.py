@@ -12,6 +12,16 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.sheet_kernels import COLUMNS, START, WINDOWED, sheet_distance
+from aqualvs.scanning.net_growth import follow_net
+from aqualvs.scanning.net_labels import SOME, much_beside
+from aqualvs.scanning.net_mean import doubted, fit_mean
+from aqualvs.scanning.patch import (
+    Patch,
+    flat_patch,
+    nearest_in_view,
+    nearest_tangent,
+    tangent_covariance,
+)
 from aqualvs.scanning.plane_fit import (
     MESH_ERROR,
     SOLID_ERROR,
@@ -20,13 +30,7 @@ from aqualvs.scanning.plane_fit import (
     fit_robust,
 )
 from aqualvs.scanning.posture import Posture, Reason, Refusal, believable, posture_from_fit
-from aqualvs.scanning.quadric import (
-    Patch,
-    fit_patch,
-    hints_at_curvature,
-    nearest_tangent,
-    tangent_covariance,
-)
+from aqualvs.scanning.quadric import LEAST_BEND, fit_patch, hints_at_curvature, refit_at_nearest
 from aqualvs.scanning.readings import Observations, Readings
 from aqualvs.scanning.search import StripeSearch
 from aqualvs.scanning.surfaces import Surface
@@ -41,9 +45,12 @@ _CROSSING_PX = 2.0
 _SHORTEST_STRAND = 3
 # A net bends out of the plane that touches it by at most this share of the range.
 _DEEPEST_BEND = 0.15
-# Light counts as on a plane, or beside it, within these shares of the range.
-_ON_IT, _BESIDE = 0.008, 0.04
-_MUCH = 0.85
+_FEW_STRANDS, _STRONG_BEND = 36, 0.02
+# With less than this share of a net's light a surface does not stand for the net: its mean plane
+# does, of which so many strands err independently. Up to the greater share that casts doubt.
+_MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
+_FOLDS = 6
+_NEAR_SHARE = 0.005
 # Independent pieces of stripe that the second best laser must show.
 _MIN_PIECES = 3
 
@@ -69,11 +76,14 @@ class Measurement:
         Readings in the posture; none where it is refused.
     patch : Patch or None
         The curved surface, where the net is none that a plane describes.
+    whole : bool array, shape (N,), or None
+        Readings on the net, also where its folds leave the surface; None for what is no net.
     """
 
     posture: Posture | Refusal
     rests_on: BoolArray
     patch: Patch | None = None
+    whole: BoolArray | None = None
 
 
 class PostureMeter:
@@ -98,6 +108,7 @@ class PostureMeter:
         # A kernel that is given None is compiled without the way to bent sheets.
         self._bent = sheets if sheets[:, WINDOWED].any() else None
         self._focal_px = rig.focal_px
+        self._line_px = max((search.line_px for search in searches), default=1)
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def measure(self, readings: Readings, chunk_index: IntArray, target: Surface) -> Measurement:
@@ -116,16 +127,11 @@ class PostureMeter:
         # for errors to be independent.
         piece = readings.stretch if target.is_mesh else readings.chunk
         group = np.empty(len(readings), np.int64)
-        n_groups, n_readings = _select(
-            readings.points,
-            readings.laser,
-            readings.width,
+        n_groups, n_readings = self._select(
+            readings,
             piece,
             _SHORTEST_STRAND if target.is_mesh else 1,
             target.members[chunk_index],
-            self._planes,
-            self._bent,
-            self._focal_px,
             group,
         )
         if n_readings < MIN_LINES:
@@ -140,39 +146,95 @@ class PostureMeter:
             return _nothing(readings, Refusal(Reason.ONE_LASER, detail))
         rests_on = (group >= 0) & (fit.weights[group] > 0.0)
         measured = posture_from_fit(fit, readings.points[rests_on], self._axis_in_dome)
+        flat = Measurement(measured, rests_on)
         if target.is_mesh and self._fit_method is FitMethod.ROBUST:
             plane = _plane_of(fit)
             off = np.abs(readings.points @ plane.normal - plane.offset) / plane.offset
-            if _much_beside(off) or hints_at_curvature(observed, fit.weights, plane):
-                curved = self._measure_curved(readings, plane)
-                if curved is not None:
-                    return curved
-        posture = believable(measured, self._working_range)
-        if not posture:
-            return _nothing(readings, posture)
+            # Few strands hint at nothing; only a strong bend is believed then.
+            few = n_groups < _FEW_STRANDS and much_beside(off, SOME)
+            bends = target.n_pieces > 1 or much_beside(off)
+            bends = bends or hints_at_curvature(observed, fit.weights, plane)
+            least = LEAST_BEND if bends else few * _STRONG_BEND
+            found, whole = self._measure_bent(readings, plane, off, flat, least)
+            return replace(self._believed(readings, found), whole=whole)
+        return self._believed(readings, flat)
+
+    def _believed(self, readings: Readings, found: Measurement) -> Measurement:
+        """Return what was found if a pilot may rely on it, else why not."""
+        if isinstance(found.posture, Refusal):
+            return found
+        posture = believable(found.posture, self._working_range)
+        return found if posture else _nothing(readings, posture)
+
+    def _measure_bent(
+        self, readings: Readings, plane: Plane, off: FloatArray, flat: Measurement, least: float
+    ) -> tuple[Measurement, BoolArray]:
+        """Measure the posture to a net that may bend or fold; also return what is seen of it."""
+        curved = None if least == 0.0 else self._measure_curved(readings, plane, off, least)
+        best = flat if curved is None else curved
+        if curved is not None and not self._tells(readings, curved):
+            # The net bends, but how it stands at its nearest point cannot be told.
+            best = _doubted(flat, curved, 1.0)
+        patch, whole = best.patch or flat_patch(plane), best.rests_on.copy()
+        follow_net(
+            readings.points,
+            readings.line,
+            readings.laser,
+            readings.stretch,
+            readings.trust,
+            readings.source,
+            patch.height(readings.points),
+            plane.offset,
+            plane.offset * self._line_px / self._focal_px,
+            whole,
+        )
+        group = np.empty(len(readings), np.int64)
+        n_groups, _ = self._select(readings, readings.stretch, _SHORTEST_STRAND, whole, group)
+        if n_groups < 2 * _FOLDS:
+            return best, whole
+        seen = readings.observations(group, n_groups, plane.normal)
+        share = float(np.mean(np.abs(patch.height(seen.points)) < _NEAR_SHARE * plane.offset))
+        if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or best is curved):
+            return best, whole
+        mean = self._measure_mean(readings, seen, plane, group)
+        if mean is None:
+            return best, whole
+        return (mean if share < _MAIN_SHARE else _doubted(best, mean, 1.0 - share)), whole
+
+    def _tells(self, readings: Readings, curved: Measurement) -> bool:
+        """Tell whether the posture to a curved net may be relied on."""
+        posture = curved.posture
+        return (
+            isinstance(posture, Posture)
+            and bool(believable(posture, self._working_range))
+            and nearest_in_view(
+                posture.normal_in_dome / posture.range, readings.points[curved.rests_on]
+            )
+        )
+
+    def _measure_mean(
+        self, readings: Readings, seen: Observations, plane: Plane, group: IntArray
+    ) -> Measurement | None:
+        """Measure the posture to the mean plane of all of a net; None where too little is seen."""
+        fit = fit_mean(seen.points, plane, _FOLDS) if _held_by_two_lasers(seen.laser) else None
+        if fit is None:
+            return None
+        rests_on = (group >= 0) & (fit.weights[group] > 0.0)
+        posture = posture_from_fit(fit, readings.points[rests_on], self._axis_in_dome)
         return Measurement(posture, rests_on)
 
-    def _measure_curved(self, readings: Readings, plane: Plane) -> Measurement | None:
+    def _measure_curved(
+        self, readings: Readings, plane: Plane, off: FloatArray, least_bend: float
+    ) -> Measurement | None:
         """Measure the posture to a curved net; None where a plane does."""
-        off = readings.points @ plane.normal - plane.offset
-        candidates = np.abs(off) < _DEEPEST_BEND * plane.offset
+        candidates = off < _DEEPEST_BEND
         group = np.empty(len(readings), np.int64)
-        n_groups, _ = _select(
-            readings.points,
-            readings.laser,
-            readings.width,
-            readings.stretch,
-            _SHORTEST_STRAND,
-            candidates,
-            self._planes,
-            self._bent,
-            self._focal_px,
-            group,
-        )
+        n_groups, _ = self._select(readings, readings.stretch, _SHORTEST_STRAND, candidates, group)
         if n_groups == 0:
             return None
         seen = readings.observations(group, n_groups, plane.normal)
-        fit = fit_patch(seen, plane, MESH_ERROR)
+        fit = fit_patch(seen, plane, MESH_ERROR, least_bend)
+        fit = fit and refit_at_nearest(fit, seen, MESH_ERROR)
         if fit is None or not _held_by_two_lasers(seen.laser[fit.weights > 0.0]):
             return None
         m = nearest_tangent(fit.patch)
@@ -181,13 +243,32 @@ class PostureMeter:
         rests_on = (group >= 0) & (fit.weights[group] > 0.0)
         tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
         measured = posture_from_fit(tangent, readings.points[rests_on], self._axis_in_dome)
-        posture = believable(measured, self._working_range)
-        if not posture:
-            return None
         along = fit.patch.coefficients[[3, 5]].tolist()
         sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
-        bent = replace(posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
+        bent = replace(measured, curvature=tuple(along), sigma_curvature=tuple(sigma))
         return Measurement(bent, rests_on, fit.patch)
+
+    def _select(
+        self,
+        readings: Readings,
+        piece: IntArray,
+        min_lines: int,
+        on_target: BoolArray,
+        group: IntArray,
+    ) -> tuple[int, int]:
+        """Write the pieces' numbers to `group`; return how many they and their readings are."""
+        return _select(
+            readings.points,
+            readings.laser,
+            readings.width,
+            piece,
+            min_lines,
+            on_target,
+            self._planes,
+            self._bent,
+            self._focal_px,
+            group,
+        )
 
     def _fit(
         self, readings: Readings, group: IntArray, seen: Observations, target: Surface
@@ -207,18 +288,15 @@ class PostureMeter:
         return fit_pseudo_inverse(readings.points[group >= 0], len(seen.laser), robust.covariance)
 
 
-def _much_beside(off: FloatArray) -> bool:
-    """Whether so much light lies just off the plane that the net may bend away from it.
-
-    Where stripes cross, wrong readings lie there as well.
-    """
-    on_it, near = np.count_nonzero(off < _ON_IT), np.count_nonzero(off < _BESIDE)
-    return bool(near - on_it > _MUCH * on_it)
-
-
 def _plane_of(fit: PlaneFit) -> Plane:
     length = float(np.linalg.norm(fit.m))
     return Plane(fit.m / length, 1.0 / length)
+
+
+def _doubted(found: Measurement, other: Measurement, share: float) -> Measurement:
+    """Widen a posture's covariance by another opinion, which so much of the light holds."""
+    one, two = found.posture, other.posture
+    return replace(found, posture=doubted(one, two, share)) if one and two else found
 
 
 def _held_by_two_lasers(laser: IntArray) -> bool:

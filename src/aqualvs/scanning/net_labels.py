@@ -15,6 +15,26 @@ _NEAR_SHARE = 0.010
 _NEAR_PX = 2.0
 # What of a piece must be near.
 _MOST = 0.5
+# Light counts as on a plane, or beside it, within these shares of the range.
+_ON_IT, _BESIDE = 0.008, 0.04
+MUCH, SOME = 0.85, 0.5
+"""Light beside a plane over light on it."""
+
+
+def much_beside(off: FloatArray, much: float = MUCH) -> bool:
+    """Tell whether so much light lies just off a plane that the net may bend away from it.
+
+    Where stripes cross, wrong readings lie there as well.
+
+    Parameters
+    ----------
+    off : array, shape (N,)
+        Distances of the readings from the plane, as shares of the range.
+    much : float
+        Light beside the plane over light on it.
+    """
+    on_it, near = np.count_nonzero(off < _ON_IT), np.count_nonzero(off < _BESIDE)
+    return bool(near - on_it > much * on_it)
 
 
 @kernel

@@ -7,6 +7,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.chunks import Chunks
+from aqualvs.scanning.plane_search import WEIGHT
 
 # A typical lit stretch over itself and a typical gap: below, it is a mesh. Strands of a net leave
 # longer gaps than they light; a wall behind a net is lit between short shadows.
@@ -18,8 +19,10 @@ _MIN_GAP_LINES = 3
 _MIN_STRETCHES = 3
 # So many short stretches on all lasers, and none longer, are a net of which little is seen.
 _FEW_STRETCHES = 5
-# The light on one strand is typically shorter than this, in metres.
-_LONGEST_STRETCH = 0.03
+LONGEST_STRETCH = 0.03
+"""The light on one strand is typically shorter than this, in metres."""
+# A chunk with a smaller share of its light as voice lies in a curved stretch.
+_CURVED_VOICE = 0.21
 # Share of the lines at each end of a stripe that may be stragglers.
 _STRAGGLERS = 0.1
 
@@ -37,11 +40,14 @@ class Pattern(NamedTuple):
         As on a dense net, or as on a wall in the shadows of a net: short stretches at any gaps.
     extent : float
         Search lines over which the gappy stripes reach, summed over the lasers.
+    on_strands : array, shape (n_lasers,)
+        Light in stretches as short as those on a strand, and not curved.
     """
 
     is_mesh: bool
     is_gappy: bool
     extent: float
+    on_strands: FloatArray
 
 
 def describe_pattern(
@@ -68,41 +74,50 @@ def describe_pattern(
     """
     asked, broken, gappy, long, n_stretches = 0, 0, 0, 0, 0
     total = 0.0
+    on_strands = np.zeros(n_lasers)
     for index in range(n_lasers):
         mine = np.flatnonzero(members & (chunks.laser == index))
         if chunks.n_lines[mine].sum() < min_lines:
             continue
         asked += 1
         order = mine[np.argsort(chunks.first_line[mine])]
-        n, duty, length, extent = _describe_stripe(
-            chunks.table, chunks.n_lines, chunks.first_line, chunks.last_line, order, focal_px
+        n, duty, length, extent, on_strands[index] = _describe_stripe(
+            chunks.table,
+            chunks.light,
+            chunks.n_lines,
+            chunks.first_line,
+            chunks.last_line,
+            order,
+            focal_px,
         )
         n_stretches += n
-        is_short = length < _LONGEST_STRETCH
+        is_short = length < LONGEST_STRETCH
         long += not is_short
         is_gappy = n >= _MIN_STRETCHES and is_short and duty < _GAPPY_DUTY
         gappy += is_gappy
         broken += is_gappy and duty < _MESH_DUTY
         total += extent if is_gappy else 0.0
     few = not long and gappy == broken and n_stretches >= _FEW_STRETCHES
-    return Pattern(broken >= min(2, asked) or few, gappy >= min(2, asked) or few, total)
+    is_mesh, is_gappy = (n >= min(2, asked) or few for n in (broken, gappy))
+    return Pattern(is_mesh, is_gappy, total, on_strands)
 
 
 @kernel
 def _describe_stripe(
     table: FloatArray,
+    light: FloatArray,
     n_lines: IntArray,
     first_line: IntArray,
     last_line: IntArray,
     order: IntArray,
     focal_px: float,
-) -> tuple[int, float, float, float]:
-    """Stretches of one laser's stripe, their duty, typical length (m), and extent (search lines).
+) -> tuple[int, float, float, float, float]:
+    """Stretches of one laser's stripe: number, duty, typical length (m), extent, light on strands.
 
     Medians, so that what hides behind a fish or a box for a while does not count.
     """
     n = order.shape[0]
-    lit, dark, distance = np.empty(n), np.empty(n), np.empty(n)
+    lit, dark, distance, bright = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
     n_stretches = 0
     begin = first_line[order[0]]
     end = last_line[order[0]] + 1
@@ -116,12 +131,20 @@ def _describe_stripe(
             n_stretches += 1
             begin = first_line[c]
         end = max(end, last_line[c] + 1)
+        if table[WEIGHT, c] > _CURVED_VOICE * light[c]:
+            bright[n_stretches] += light[c]
     extent = _extent(n_lines, first_line, last_line, order)
     gap = np.median(dark[:n_stretches]) if n_stretches else 0.0
     lit[n_stretches] = end - begin
-    stretch = np.median(lit[: n_stretches + 1])
-    length = stretch / focal_px * np.median(distance)
-    return n_stretches + 1, float(stretch / (stretch + gap)), float(length), extent
+    n_stretches += 1
+    stretch = np.median(lit[:n_stretches])
+    m_per_line = np.median(distance) / focal_px
+    on_strands = 0.0
+    for k in range(n_stretches):
+        if lit[k] * m_per_line < LONGEST_STRETCH:
+            on_strands += bright[k]
+    duty = float(stretch / (stretch + gap))
+    return n_stretches, duty, float(stretch * m_per_line), extent, on_strands
 
 
 @kernel

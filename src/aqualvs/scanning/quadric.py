@@ -8,22 +8,46 @@ with u to the right and v upward in that plane. The plane touches the net along 
 starts there and grows outward, because what it has learned in the band predicts the net beside it.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.patch import (
+    FLAT,
+    Patch,
+    PatchFit,
+    flat_patch,
+    height_terms,
+    nearest_tangent,
+    tangent_covariance,
+)
 from aqualvs.scanning.plane_fit import SharedError
 from aqualvs.scanning.readings import Observations
 
-FLAT = np.zeros(6)
-"""Coefficients (a, b, c, p, q, r) of a plane."""
+__all__ = (
+    "FLAT",
+    "LEAST_BEND",
+    "Patch",
+    "PatchFit",
+    "fit_patch",
+    "flat_patch",
+    "hints_at_curvature",
+    "nearest_tangent",
+    "refit_at_nearest",
+    "tangent_covariance",
+)
+
+LEAST_BEND = 0.003
+"""By so much of the range a net must bend where it is seen, or it is flat."""
 
 # Growth: steps, and the gate in shares of the range and in pixels.
 _STEPS = 16
 _GATE_SHARE = 0.004
 _GATE_PX = 1.2
+_WIDE_GATE = 3.0
 _TUKEY = 4.685
 _REWEIGHTS = 6
 # What is expected of nets before looking, in 1/m: bent by a metre's radius, hardly twisted.
@@ -32,76 +56,14 @@ _SIGMA_TWIST = 0.5
 # The residual asks for curvature when it gains so much of the light or of the scatter ...
 _MORE_LIGHT = 1.10
 _LESS_SCATTER = 0.6
-# ... and the curvature is no chance and bends the net by so much of the range where it is seen.
-_SIGNIFICANT = 4.0
+# ... and the curvature is no chance.
+_SIGNIFICANT = 6.0
 _HINT = 2.0
-_LEAST_BEND = 0.003
 # Steeper bends than a radius of half a metre are something else.
 _STRONGEST = 2.0
 _MIN_PIECES = 12
-# The nearest point is looked for in so many Newton steps.
-_FOOT_STEPS = 12
-
-
-@dataclass(frozen=True, slots=True)
-class Patch:
-    """A curved piece of net over a base plane.
-
-    Attributes
-    ----------
-    base : Plane
-        In `dome`; heights are measured along its normal.
-    right, up : array, shape (3,)
-        Unit vectors in the base plane along which u and v run, in `dome`.
-    coefficients : array, shape (6,)
-        a (m), b, c, p, q, r (1/m) of the height.
-    """
-
-    base: Plane
-    right: FloatArray
-    up: FloatArray
-    coefficients: FloatArray
-
-    def height(self, points: FloatArray) -> FloatArray:
-        """Return by how much points (N, 3) lie behind the patch, along the base's normal, in m."""
-        terms = _terms(points @ self.right, points @ self.up)
-        off: FloatArray = self.base.signed_distance(points) - terms @ self.coefficients
-        return off
-
-    def packed(self) -> FloatArray:
-        """Return the patch as 16 numbers for kernels: normal, offset, right, up, coefficients."""
-        return np.concatenate(
-            [self.base.normal, [self.base.offset], self.right, self.up, self.coefficients]
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class PatchFit:
-    """A patch and how well the observations determine it.
-
-    Attributes
-    ----------
-    patch : Patch
-        Least squares, robust.
-    covariance : array, shape (6, 6)
-        Of its coefficients.
-    weights : array, shape (M,)
-        Robust weight of each observation, 0 to 1.
-    rms : float
-        Weighted root mean square distance from the patch, in metres.
-    """
-
-    patch: Patch
-    covariance: FloatArray
-    weights: FloatArray
-    rms: float
-
-
-def flat_patch(plane: Plane) -> Patch:
-    """Return a plane as a patch: u to the right, v upward."""
-    right = np.cross(plane.normal, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return Patch(plane, right, np.cross(right, plane.normal), FLAT)
+# Strands on a bend err together more than on a plane: found on simulated nets.
+_LOOSENED = 1.5
 
 
 def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
@@ -117,7 +79,7 @@ def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) ->
         The fit.
     """
     flat = flat_patch(plane)
-    terms = _terms(seen.points @ flat.right, seen.points @ flat.up)
+    terms = height_terms(seen.points @ flat.right, seen.points @ flat.up)
     height = plane.signed_distance(seen.points)
     sigma = np.abs(seen.sensitivity @ plane.normal) * seen.sigma_px
     solved = _solve(terms, height, weights / sigma**2)
@@ -130,7 +92,9 @@ def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) ->
     return bool(np.abs(coefficients[3:] / sigmas).max() > _HINT)
 
 
-def fit_patch(seen: Observations, plane: Plane, shared: SharedError) -> PatchFit | None:
+def fit_patch(
+    seen: Observations, plane: Plane, shared: SharedError, least_bend: float = LEAST_BEND
+) -> PatchFit | None:
     """Fit a patch to what lies on it among M observations, if they ask for one.
 
     Parameters
@@ -141,21 +105,72 @@ def fit_patch(seen: Observations, plane: Plane, shared: SharedError) -> PatchFit
         As the search found it.
     shared : SharedError
         What each laser's stripe shares.
+    least_bend : float
+        Share of the range by which the net must bend where it is seen.
 
     Returns
     -------
     PatchFit or None
         None where a plane is as good, or the curvature is not determined.
     """
+    # Of a coarse net few strands are on the plane, and the others not far from it.
+    first = _fit_over(seen, plane, shared, 1.0, least_bend)
+    first = first or _fit_over(seen, plane, shared, _WIDE_GATE, least_bend)
+    return first.fit if first is not None and first.asked_for else None
+
+
+def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> PatchFit | None:
+    """Fit a patch once more, over the plane that touches it at its point nearest to the vehicle.
+
+    p and r are then the curvatures of the net at that point. The covariance is widened.
+
+    Parameters
+    ----------
+    fit : PatchFit
+        From `fit_patch`.
+    seen, shared
+        As there.
+
+    Returns
+    -------
+    PatchFit or None
+        None where there is no such point.
+    """
+    m = nearest_tangent(fit.patch)
+    if m is None:
+        return None
+    inside = fit.weights > 0.0
+    length = float(np.linalg.norm(m))
+    again = _fit_over(seen, Plane(m / length, 1.0 / length), shared, inside)
+    best = fit if again is None else again.fit
+    return replace(best, covariance=_LOOSENED**2 * best.covariance)
+
+
+class _Attempt(NamedTuple):
+    """A patch over one base plane, and whether the base leaves too much over."""
+
+    fit: PatchFit
+    asked_for: bool
+
+
+def _fit_over(
+    seen: Observations,
+    plane: Plane,
+    shared: SharedError,
+    start: BoolArray | float,
+    least_bend: float = LEAST_BEND,
+) -> _Attempt | None:
+    """Fit a patch over a plane, grown from some observations or from those in so many gates."""
     flat = flat_patch(plane)
     u, v = seen.points @ flat.right, seen.points @ flat.up
-    terms = _terms(u, v)
+    terms = height_terms(u, v)
     height = plane.signed_distance(seen.points)
     per_px = np.abs(seen.sensitivity @ plane.normal)
     gate = np.hypot(_GATE_SHARE * plane.offset, _GATE_PX * per_px)
     sigma = per_px * seen.sigma_px
     on_plane = np.abs(height) < gate
-    found = _grow(terms, height, gate, on_plane)
+    inside = np.abs(height) < start * gate if isinstance(start, float) else start
+    found = _grow(terms, height, gate, inside)
     if found is None:
         return None
     coefficients, inside = found
@@ -168,11 +183,8 @@ def fit_patch(seen: Observations, plane: Plane, shared: SharedError) -> PatchFit
     off = height - terms @ coefficients
     rms = float(np.sqrt(np.sum(weights * off**2) / np.sum(weights)))
     fit = PatchFit(patch, covariance, weights, rms)
-    return fit if _asked_for(fit, terms, height, inside, on_plane, plane.offset) else None
-
-
-def _terms(u: FloatArray, v: FloatArray) -> FloatArray:
-    return np.stack([np.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], axis=-1)
+    asked = _asked_for(fit, terms, height, inside, on_plane, plane.offset, least_bend)
+    return _Attempt(fit, asked)
 
 
 def _prior() -> FloatArray:
@@ -264,65 +276,14 @@ def _asked_for(
     inside: BoolArray,
     on_plane: BoolArray,
     distance: float,
+    least_bend: float,
 ) -> bool:
     """Whether the residual of the plane asks for curvature."""
     bend = terms[inside, 3:] @ fit.patch.coefficients[3:]
-    if np.ptp(bend) < _LEAST_BEND * distance:
+    if np.ptp(bend) < least_bend * distance:
         return False
     sigmas = np.sqrt(np.diag(fit.covariance)[3:])
     if np.abs(fit.patch.coefficients[3:] / sigmas).max() < _SIGNIFICANT:
         return False
     more = np.count_nonzero(inside) >= _MORE_LIGHT * np.count_nonzero(on_plane)
     return bool(more or fit.rms < _LESS_SCATTER * np.sqrt(np.mean(height[inside] ** 2)))
-
-
-def nearest_tangent(patch: Patch) -> FloatArray | None:
-    """Return m = n/d of the tangent plane at the point nearest to the dome's centre.
-
-    A plane has its range and its angles at the foot of the perpendicular; so has a curved net.
-
-    Returns
-    -------
-    array, shape (3,), or None
-        None where there is no such point: the net curls around the vehicle.
-    """
-    a, b, c, p, q, r = patch.coefficients
-    u = v = 0.0
-    normal, right, up = patch.base.normal, patch.right, patch.up
-    for _ in range(_FOOT_STEPS):
-        h = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
-        slope_u, slope_v = b + p * u + q * v, c + q * u + r * v
-        # Half the squared distance is (u² + v² + (d + h)²) / 2.
-        reach = patch.base.offset + h
-        gradient = np.array([u + reach * slope_u, v + reach * slope_v])
-        hessian = np.array(
-            [
-                [1.0 + slope_u**2 + reach * p, slope_u * slope_v + reach * q],
-                [slope_u * slope_v + reach * q, 1.0 + slope_v**2 + reach * r],
-            ]
-        )
-        if np.linalg.det(hessian) <= 0.05 or hessian[0, 0] <= 0.05:
-            return None
-        step = np.linalg.solve(hessian, gradient)
-        u, v = u - step[0], v - step[1]
-    tangent = normal - slope_u * right - slope_v * up
-    tangent /= np.linalg.norm(tangent)
-    point = u * right + v * up + (patch.base.offset + h) * normal
-    m: FloatArray = tangent / float(tangent @ point)
-    return m
-
-
-def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) of `nearest_tangent`, by differences of the coefficients."""
-    jacobian = np.zeros((3, 6))
-    for k in range(6):
-        step = 1e-4 * max(np.sqrt(fit.covariance[k, k]), 1e-6)
-        moved = fit.patch.coefficients.copy()
-        moved[k] += step
-        patch = Patch(fit.patch.base, fit.patch.right, fit.patch.up, moved)
-        other = nearest_tangent(patch)
-        if other is None:
-            return np.full((3, 3), np.inf)
-        jacobian[:, k] = (other - m) / step
-    covariance: FloatArray = jacobian @ fit.covariance @ jacobian.T
-    return covariance

@@ -14,6 +14,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.net_pattern import describe_pattern
+from aqualvs.scanning.net_pieces import continues, joined_plane, seen_through
 from aqualvs.scanning.plane_search import (
     JX,
     JY,
@@ -68,6 +69,9 @@ class Surface:
         Whether its stripes are broken as those on a net are.
     is_gappy : bool
         Whether they are broken at least, as on a dense net or in a net's shadows.
+    n_pieces : int
+        Planes that were joined, because a folded or bent net goes on from one to the next. `plane`
+        is then that of the largest, or their mean where none of them has half of the light.
     """
 
     plane: Plane
@@ -78,6 +82,7 @@ class Surface:
     extent: float
     is_mesh: bool
     is_gappy: bool = False
+    n_pieces: int = 1
 
 
 def find_surfaces(
@@ -122,19 +127,56 @@ def find_surfaces(
         surfaces.append(surface)
         enough = max(enough, WORTH_SHARE * surface.n_lines)
         _claim_light(pixels, chunk_index, surface.members, free)
-    return [replace(one, is_mesh=one.is_mesh or _is_dense_net(one, surfaces)) for one in surfaces]
+    told = [
+        replace(one, is_mesh=one.is_mesh or _is_dense_net(one, surfaces, chunks))
+        for one in surfaces
+    ]
+    return _join_pieces(told, chunks)
 
 
-def _is_dense_net(surface: Surface, surfaces: list[Surface]) -> bool:
-    """Whether a surface casts the shadows that make another one behind it look like a net.
+def _join_pieces(surfaces: list[Surface], chunks: Chunks) -> list[Surface]:
+    """Join planes that are pieces of one net; the others stay as they are."""
+    rest, done = list(surfaces), []
+    while rest:
+        net = rest.pop(0)
+        pieces = [net]
+        while net.is_mesh:
+            more = [
+                one
+                for one in rest
+                if one.is_mesh
+                and any(continues(p.plane, p.members, one.members, chunks) for p in pieces)
+            ]
+            if not more:
+                break
+            pieces += more
+            rest = [one for one in rest if all(one is not piece for piece in more)]
+        done.append(_joined(pieces, chunks) if len(pieces) > 1 else net)
+    return done
 
-    The twine of a dense net catches more light than it lets pass.
-    """
+
+def _joined(pieces: list[Surface], chunks: Chunks) -> Surface:
+    members = [piece.members for piece in pieces]
+    return Surface(
+        plane=joined_plane([piece.plane for piece in pieces], members, chunks),
+        members=np.logical_or.reduce(members),
+        n_lines=sum(piece.n_lines for piece in pieces),
+        support=sum(piece.support for piece in pieces),
+        voice=sum(piece.voice for piece in pieces),
+        extent=max(piece.extent for piece in pieces),
+        is_mesh=True,
+        is_gappy=True,
+        n_pieces=len(pieces),
+    )
+
+
+def _is_dense_net(surface: Surface, surfaces: list[Surface], chunks: Chunks) -> bool:
+    """Whether another surface, broken by shadows, is seen through the gaps of this one."""
     return surface.is_gappy and any(
-        other.is_mesh
+        other.is_gappy
         and other.plane.offset > surface.plane.offset
-        and other.voice < surface.voice
         and other.extent >= _EXTENT_SHARE * surface.extent
+        and seen_through(surface.members, other.members, chunks)
         for other in surfaces
     )
 
@@ -168,6 +210,8 @@ def _find_surface(
         return None
     support, loud = _on_two(light), _on_two(voice)
     pattern = describe_pattern(chunks, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
+    # Strands near the vehicle are long in search lines, and still short.
+    on_strands = max(loud, _on_two(pattern.on_strands)) > _STRANDS_SHARE * support
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,
@@ -175,8 +219,8 @@ def _find_surface(
         support=support,
         voice=loud,
         extent=pattern.extent,
-        is_mesh=pattern.is_mesh and loud > _STRANDS_SHARE * support,
-        is_gappy=pattern.is_gappy,
+        is_mesh=pattern.is_mesh and on_strands,
+        is_gappy=pattern.is_gappy and on_strands,
     )
 
 

@@ -1,8 +1,8 @@
 """Fish nets: rays against twine.
 
-The axes of the strands lie in the net plane (or in its gently bulging surface, where the tangent
-plane at the crossing stands in for it). A ray that crosses the plane beside an axis at lateral
-distance w meets that strand's cylinder where, in the cross-section of the strand,
+The axes of the strands lie in the net plane (or in its bulging or folded surface, where the
+tangent plane at the crossing stands in for it). A ray that crosses the plane beside an axis at
+lateral distance w meets that strand's cylinder where, in the cross-section of the strand,
 (w + q tau)² + (z tau)² = r²; only the nearest strand of each family can be met, because the
 distance from an axis is w times the same cosine for all of them.
 """
@@ -14,9 +14,10 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
 from aqualvs.geometry.transforms import SE3
+from aqualvs.simulation.folds import fold_limits, folded
 from aqualvs.simulation.scene import Net
 from aqualvs.simulation.textures import Tiles, sample, white_at
-from aqualvs.simulation.vectors import Vec, combine, dot, minus, row3, scaled, unit
+from aqualvs.simulation.vectors import Vec, along, combine, cross, dot, minus, row3, scaled, unit
 
 ORIGIN, AXIS_U, AXIS_V, NORMAL = 0, 3, 6, 9
 KAPPA_U, KAPPA_V, IS_HEXAGON, BAR, RADIUS, FOULING, GROWTH, MISSING = range(12, 20)
@@ -29,6 +30,12 @@ _GROOVE = 0.07
 # A knot (or a joint of knotless netting) is so much thicker than the twine.
 _KNOT = 0.45
 _GROWTH_ALBEDO = (0.42, 0.46, 0.26)
+# Least step along a ray that looks for a folded net, and halvings of the step that finds it.
+_STEP = 1e-3
+_MOST_STEPS = 200
+_HALVINGS = 16
+# A ray passes so many layers of a folded net before it is given up.
+_MOST_LAYERS = 5
 
 
 class Strand(NamedTuple):
@@ -88,11 +95,11 @@ def _families(net: Net) -> tuple[list[float], float]:
 
 
 @inline_borrowing_kernel
-def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int) -> tuple[float, float, float]:
-    """Return the distance at which a ray crosses the net's surface, and (u, v) there."""
+def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int, lift: float) -> float:
+    """Return the distance at which a ray crosses the unfolded net's surface, raised by `lift`."""
     rel = minus(o, row3(nets, i, ORIGIN))
     u0, v0 = dot(rel, row3(nets, i, AXIS_U)), dot(rel, row3(nets, i, AXIS_V))
-    w0 = dot(rel, row3(nets, i, NORMAL))
+    w0 = dot(rel, row3(nets, i, NORMAL)) - lift
     du, dv = dot(d, row3(nets, i, AXIS_U)), dot(d, row3(nets, i, AXIS_V))
     dw = dot(d, row3(nets, i, NORMAL))
     ku, kv = nets[i, KAPPA_U], nets[i, KAPPA_V]
@@ -101,10 +108,67 @@ def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int) -> tuple[float, float, f
     c = 0.5 * (ku * u0 * u0 + kv * v0 * v0) - w0
     disc = b * b - 4.0 * a * c
     if disc < 0.0 or b == 0.0:
-        return np.inf, 0.0, 0.0
+        return np.inf
     # This form of the root stays exact as the curvature tends to zero.
-    t = -2.0 * c / (b + np.copysign(np.sqrt(disc), b))
-    return t, u0 + t * du, v0 + t * dv
+    return float(-2.0 * c / (b + np.copysign(np.sqrt(disc), b)))
+
+
+@inline_borrowing_kernel
+def _behind(o: Vec, d: Vec, t: float, nets: FloatArray, i: int, folds: FloatArray) -> float:
+    """Return how far a place on a ray is behind the folded net, along the net's normal."""
+    rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
+    u, v = dot(rel, row3(nets, i, AXIS_U)), dot(rel, row3(nets, i, AXIS_V))
+    bulge = 0.5 * (nets[i, KAPPA_U] * u * u + nets[i, KAPPA_V] * v * v)
+    return float(dot(rel, row3(nets, i, NORMAL)) - bulge - folded(u, v, folds, i)[0])
+
+
+@inline_borrowing_kernel
+def _next_crossing(
+    o: Vec, d: Vec, nets: FloatArray, i: int, folds: FloatArray, begin: float
+) -> float:
+    """Return where a ray crosses the net next after `begin`; infinite where it does not."""
+    low, high, steepest = fold_limits(folds, i)
+    if low == 0.0 and high == 0.0:
+        t = _crossing(o, d, nets, i, 0.0)
+        return t if t > begin else np.inf
+    first, last = _crossing(o, d, nets, i, low), _crossing(o, d, nets, i, high)
+    t = max(min(first, last), begin)
+    end = max(first, last) + _STEP
+    if not end < 1e6:
+        return np.inf
+    # No place is nearer to the net along the ray than its height over it allows.
+    share = 1.0 / (1.5 + steepest)
+    side = _behind(o, d, t, nets, i, folds)
+    for _ in range(_MOST_STEPS):
+        if t >= end:
+            break
+        step = max(share * abs(side), _STEP)
+        now = _behind(o, d, t + step, nets, i, folds)
+        if side * now <= 0.0:
+            return _halved(o, d, t, t + step, side, nets, i, folds)
+        t, side = t + step, now
+    return np.inf
+
+
+@inline_borrowing_kernel
+def _halved(
+    o: Vec,
+    d: Vec,
+    before: float,
+    after: float,
+    side: float,
+    nets: FloatArray,
+    i: int,
+    folds: FloatArray,
+) -> float:
+    """Return where a ray changes sides between two places: from there on it is on the other."""
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (before + after)
+        if side * _behind(o, d, middle, nets, i, folds) > 0.0:
+            before = middle
+        else:
+            after = middle
+    return after
 
 
 @inline_borrowing_kernel
@@ -201,28 +265,60 @@ def _cylinder(w: float, q: float, z: float, r: float) -> float:
 
 
 @inline_borrowing_kernel
-def meet_net(o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, tiles: Tiles) -> Strand:
+def meet_net(
+    o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, folds: FloatArray, tiles: Tiles
+) -> Strand:
     """Return the first strand of net i that a ray meets."""
-    nothing = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
-    t, u, v = _crossing(o, d, nets, i)
-    if not (t > 0.0 and t < 1e6) or abs(u) > nets[i, HALF_U] or abs(v) > nets[i, HALF_V]:
-        return nothing
+    found = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+    t = 0.0
+    for _ in range(_MOST_LAYERS):
+        t = _next_crossing(o, d, nets, i, folds, t)
+        if not t < 1e6:
+            break
+        found = _meet_layer(o, d, t, nets, i, holes, folds, tiles)
+        if found.t < np.inf:
+            break
+    return found
+
+
+@inline_borrowing_kernel
+def _meet_layer(
+    o: Vec,
+    d: Vec,
+    t: float,
+    nets: FloatArray,
+    i: int,
+    holes: FloatArray,
+    folds: FloatArray,
+    tiles: Tiles,
+) -> Strand:
+    """Return the first strand that a ray meets where it crosses the net at `t`."""
+    best = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+    eu, ev, out = row3(nets, i, AXIS_U), row3(nets, i, AXIS_V), row3(nets, i, NORMAL)
+    rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
+    u, v = dot(rel, eu), dot(rel, ev)
+    if abs(u) > nets[i, HALF_U] or abs(v) > nets[i, HALF_V]:
+        return best
     if holes.shape[0] > 0 and _in_a_hole(u, v, holes, i):
-        return nothing
-    eu, ev = row3(nets, i, AXIS_U), row3(nets, i, AXIS_V)
-    tilt_u, tilt_v = -nets[i, KAPPA_U] * u, -nets[i, KAPPA_V] * v
-    normal = unit(combine(eu, tilt_u, ev, tilt_v, row3(nets, i, NORMAL), 1.0))
+        return best
+    _, slope_u, slope_v = folded(u, v, folds, i)
+    flank = unit(combine(eu, -slope_u, ev, -slope_v, out, 1.0))
+    tilt_u, tilt_v = slope_u + nets[i, KAPPA_U] * u, slope_v + nets[i, KAPPA_V] * v
+    normal = unit(combine(eu, -tilt_u, ev, -tilt_v, out, 1.0))
     u, v = u - nets[i, OFFSET_U], v - nets[i, OFFSET_V]
     cell = (0.0, 0.0)
     if nets[i, IS_HEXAGON] != 0.0:
         cell = _hexagon_centre(u, v, nets, i)
-    du, dv, dz = dot(d, eu), dot(d, ev), dot(d, normal)
+    dz = dot(d, normal)
     widest = nets[i, RADIUS] * (1.0 + _KNOT + nets[i, GROWTH] * (nets[i, FOULING] > 0.0))
-    best = nothing
     for k in range(int(nets[i, FAMILIES])):
         w, place, knot, line, bar = _nearest_axis(u, v, nets, i, k, cell)
         c, s = nets[i, DIRECTIONS + 2 * k], nets[i, DIRECTIONS + 2 * k + 1]
-        q = -s * du + c * dv
+        # The strand runs in the fold's flank, and so does what is beside it; bulges are gentle.
+        strand = unit(combine(eu, c, ev, s, out, c * slope_u + s * slope_v))
+        side = cross(strand, flank)
+        w *= dot(combine(eu, -s, ev, c, out, c * slope_v - s * slope_u), side)
+        q = dot(d, side)
         if w * w * dz * dz > widest * widest * (q * q + dz * dz):
             continue
         key = line * 131 + k * 17 + int(nets[i, SEED])
@@ -231,7 +327,6 @@ def meet_net(o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, tiles:
         r, growth = _profile(place, knot, u, v, nets, i, tiles)
         tau = _cylinder(w, q, dz, r)
         if t + tau < best.t and t + tau > 0.0:
-            side = combine(eu, -s, ev, c, normal, 0.0)
             outward = combine(side, (w + q * tau) / r, normal, dz * tau / r, side, 0.0)
             best = Strand(t + tau, outward, place, (w + q * tau) / r, growth)
     return best

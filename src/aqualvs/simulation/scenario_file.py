@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from aqualvs.errors import OptionError
 from aqualvs.simulation.clutter import random_bubbles, random_fish
 from aqualvs.simulation.scenario import Scenario
-from aqualvs.simulation.scene import Box, Mesh, Net, Sensor, Target, Wall, WaterOptics
+from aqualvs.simulation.scene import Box, Fold, Mesh, Net, Sensor, Target, Wall, WaterOptics
 from aqualvs.simulation.trajectory import Course, Trajectory
 from aqualvs.simulation.vectors import Vec
 
@@ -50,6 +50,16 @@ class MotionFile(_Strict):
     slide_z_mm: Motion = 0.0
 
 
+class FoldFile(_Strict):
+    """A fold across the net, or a row of them; see `scene.Fold`."""
+
+    direction_deg: Finite = 0.0
+    place_mm: Finite = 0.0
+    height_mm: Finite = -30.0
+    width_mm: Positive = 50.0
+    every_mm: NotNegative = 0.0
+
+
 class NetFile(_Strict):
     """A net in the target plane; see `scene.Net`."""
 
@@ -63,6 +73,7 @@ class NetFile(_Strict):
     missing: Fraction = 0.0
     holes_mm: list[Triple] = []
     curvature_per_m: tuple[Finite, Finite] = (0.0, 0.0)
+    folds: list[FoldFile] = []
     half_size_mm: tuple[Positive, Positive] | None = None
 
 
@@ -209,6 +220,8 @@ def _known_keys(parents: list[str]) -> list[str]:
     model: type[_Strict] = _MODELS.get(parents[0], ScenarioFile) if parents else ScenarioFile
     if "CourseFile" in parents:
         model = CourseFile
+    if "folds" in parents:
+        model = FoldFile
     return list(model.model_fields)
 
 
@@ -256,8 +269,19 @@ def _net(net: NetFile, seed: int) -> Net:
         missing=net.missing,
         holes=tuple(_metres(hole) for hole in net.holes_mm),
         curvature=net.curvature_per_m,
+        folds=tuple(_fold(fold) for fold in net.folds),
         half_size=(half[0] / 1e3, half[1] / 1e3),
         seed=seed,
+    )
+
+
+def _fold(fold: FoldFile) -> Fold:
+    return Fold(
+        direction=float(np.deg2rad(fold.direction_deg)),
+        place=fold.place_mm / 1e3,
+        height=fold.height_mm / 1e3,
+        width=fold.width_mm / 1e3,
+        period=fold.every_mm / 1e3,
     )
 
 

@@ -58,11 +58,42 @@ class Wall:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Fold:
+    """A smooth ridge across a net, or an endless row of them.
+
+    Over the distance s from its crest the net stands out by height * cos²(pi s / (2 width)) up to
+    s = width, and not beyond. With a period of twice the width a row of folds is a sine wave, as
+    on a slack net.
+
+    Attributes
+    ----------
+    direction : float
+        Way from the crest into the fold's flank, in radians from x towards z; the crest runs
+        square to it.
+    place : float
+        Where the crest is along that way, from the target's origin, in metres.
+    height : float
+        In metres; positive away from the vehicle, as curvature.
+    width : float
+        Half the width at the foot, in metres.
+    period : float
+        Distance from crest to crest in metres; 0 is a single fold.
+    """
+
+    direction: float = 0.0
+    place: float = 0.0
+    height: float = -0.03
+    width: float = 0.05
+    period: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Net:
-    """A fish net in (or gently bulging out of) the target plane y = 0.
+    """A fish net in (or bulging or folded out of) the target plane y = 0.
 
     The twine is a true cylinder around an axis in that plane: lit points lie within one twine
-    radius (plus growth) of the net plane, on the side that faces the vehicle.
+    radius (plus growth) of the net plane, on the side that faces the vehicle. Where the net leaves
+    the plane, its mesh is stretched, so that it stays as it is seen along the plane's normal.
 
     Attributes
     ----------
@@ -86,6 +117,8 @@ class Net:
         Round holes in scene coordinates, in metres.
     curvature : (float, float)
         Along x and z in 1/m; positive bulges away from the vehicle.
+    folds : tuple of Fold
+        What the net does beside that; heights add up.
     half_size : (float, float)
         Half extent along x and z in metres; infinite by default.
     offset : (float, float)
@@ -106,6 +139,7 @@ class Net:
     missing: float = 0.0
     holes: tuple[Vector, ...] = ()
     curvature: tuple[float, float] = (0.0, 0.0)
+    folds: tuple[Fold, ...] = ()
     half_size: tuple[float, float] = (np.inf, np.inf)
     offset: tuple[float, float] = (0.0, 0.0)
     albedo: Vector = (0.60, 0.62, 0.62)

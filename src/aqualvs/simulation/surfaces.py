@@ -7,6 +7,8 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.simulation.folds import N_COLUMNS as FOLD_COLUMNS
+from aqualvs.simulation.folds import pack_fold
 from aqualvs.simulation.net import N_COLUMNS as NET_COLUMNS
 from aqualvs.simulation.net import meet_net, pack_net, strand_albedo
 from aqualvs.simulation.scene import Box, Fish, Scene, Wall
@@ -35,6 +37,8 @@ class Surfaces(NamedTuple):
         See the column constants of this module and of `net`.
     holes : array, shape (n, 4)
         Index of the net, u, v and radius.
+    folds : array, shape (n, columns)
+        See `folds`; the first column is the index of the net.
     tiles : Tiles
         Noise for textures.
     """
@@ -42,6 +46,7 @@ class Surfaces(NamedTuple):
     walls: FloatArray
     nets: FloatArray
     holes: FloatArray
+    folds: FloatArray
     ellipsoids: FloatArray
     boxes: FloatArray
     bubbles: FloatArray
@@ -76,10 +81,12 @@ def pack_surfaces(scene: Scene, t: float) -> Surfaces:
         np.append(pose.apply(b.at(t).position), b.radius) for b in scene.bubbles if b.radius > 0.0
     ]
     holes = [(i, *hole) for i, net in enumerate(scene.nets) for hole in net.holes]
+    folds = [pack_fold(i, fold) for i, net in enumerate(scene.nets) for fold in net.folds]
     return Surfaces(
         walls=_table([_pack_wall(wall, pose) for wall in scene.walls], 17),
         nets=_table([pack_net(net, pose) for net in scene.nets], NET_COLUMNS),
         holes=_table([np.array(hole) for hole in holes], 4),
+        folds=_table(folds, FOLD_COLUMNS),
         ellipsoids=_table(ellipsoids, 16),
         boxes=_table([_pack_box(box, pose) for box in scene.boxes], 18),
         bubbles=_table(bubbles, 4),
@@ -202,7 +209,7 @@ def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: 
         if reach < t:
             t, kind, index = reach, WALL, i
     for i in range(s.nets.shape[0]):
-        strand = meet_net(o, d, s.nets, i, s.holes, s.tiles)
+        strand = meet_net(o, d, s.nets, i, s.holes, s.folds, s.tiles)
         if strand.t < t:
             t, kind, index, normal = strand.t, NET, i, strand.normal
     for i in range(s.boxes.shape[0]):
@@ -241,7 +248,7 @@ def normal_and_albedo(o: Vec, d: Vec, hit: Hit, s: Surfaces) -> tuple[Vec, Vec]:
         facing = -1.0 if dot(normal, d) > 0.0 else 1.0
         return scaled(normal, facing), _wall_albedo(along(o, d, hit.t), s.walls, hit.row, s.tiles)
     if hit.kind == NET:
-        strand = meet_net(o, d, s.nets, hit.row, s.holes, s.tiles)
+        strand = meet_net(o, d, s.nets, hit.row, s.holes, s.folds, s.tiles)
         return hit.normal, strand_albedo(strand, s.nets, hit.row, s.tiles)
     if hit.kind == FISH:
         return _fish_skin(along(o, d, hit.t), s.ellipsoids, hit.row, s.tiles)

@@ -1,0 +1,168 @@
+"""Nets that are no plain lattice in a plane: folded, torn, bent, slack, one behind the other."""
+
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.lit_points import LitPoints
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scene import Fold, Net, Scene, Wall
+from aqualvs.simulation.scene import Label as Kind
+from aqualvs.simulation.trajectory import dome_from_target
+
+PITCH, YAW = 4.0, -6.0
+NET = Net(bar=0.022, twine=0.002, roll=0.3)
+WALLS = (Wall(depth=0.5),)
+
+
+class Shot(NamedTuple):
+    scan: Scan
+    lit: LitPoints
+    in_scene: FloatArray
+
+    @property
+    def on_net(self) -> BoolArray:
+        mask: BoolArray = self.lit.label == Kind.NET
+        return mask
+
+    @property
+    def posture(self) -> Posture:
+        assert isinstance(self.scan.posture, Posture), self.scan.posture
+        return self.scan.posture
+
+    def recall(self, mask: BoolArray | None = None) -> float:
+        """Share of true points of the net within 3 px of one that is labelled net."""
+        wanted = self.on_net if mask is None else self.on_net & mask
+        points = self.scan.points
+        tree = cKDTree(points.pixels[points.label == Label.NET])
+        return float(np.mean(tree.query(self.lit.pixels[wanted])[0] < 3.0))
+
+    def precision(self) -> float:
+        """Share of the points labelled net whose nearest true point of that laser is on a net."""
+        right, judged = 0, 0
+        for laser in range(3):
+            mine = (self.scan.points.label == Label.NET) & (self.scan.points.laser == laser)
+            true = self.lit.laser == laser
+            distance, nearest = cKDTree(self.lit.pixels[true]).query(self.scan.points.pixels[mine])
+            known = distance < 9.0
+            right += np.count_nonzero(self.on_net[true][nearest[known]])
+            judged += np.count_nonzero(known)
+        return right / judged
+
+
+@cache
+def equipment() -> tuple[Renderer, Scanner]:
+    return Renderer(example_rig(), threads=2), Scanner(example_rig())
+
+
+def shoot(
+    *nets: Net, walls: tuple[Wall, ...] = WALLS, slide: tuple[float, float] = (0.0, 0.0)
+) -> Shot:
+    pose = dome_from_target(0.6, np.deg2rad(PITCH), np.deg2rad(YAW), slide)
+    scene = Scene(dome_from_scene=pose, nets=nets, walls=walls)
+    renderer, scanner = equipment()
+    picture = renderer.render(scene, 0.0, np.random.default_rng(7))
+    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+    scan = scanner.process(Frame(0, 0.0, luma, chroma))
+    return Shot(scan, picture.lit, pose.inverse().apply(picture.lit.points_in_dome))
+
+
+def check_posture(posture: Posture, *, share: float = 0.006, degrees: float = 0.6) -> None:
+    """Against the net's plane; lit twine stands 0.15 % of the range before it."""
+    assert abs(posture.range / 0.6 - 1.0) < share
+    assert abs(np.rad2deg(posture.pitch) - PITCH) < degrees
+    assert abs(np.rad2deg(posture.yaw) - YAW) < degrees
+
+
+def test_folds_change_no_posture_and_are_net() -> None:
+    found, all_of_it = [], []
+    for direction in (0.2, 1.7):
+        for height in (-0.025, 0.02):
+            fold = Fold(direction=direction, place=0.03, height=height, width=0.035)
+            shot = shoot(replace(NET, folds=(fold,)))
+            check_posture(shot.posture, degrees=0.9)
+            way = np.array([np.cos(direction), 0.0, np.sin(direction)])
+            found.append(shot.recall(np.abs(shot.in_scene @ way - 0.03) < 0.025))
+            all_of_it.append(shot.recall())
+            assert shot.precision() > 0.98
+    # Measured: 0.75 and 0.85; without following the net into its folds 0.19 and 0.61.
+    assert np.mean(found) > 0.68
+    assert np.mean(all_of_it) > 0.82
+
+
+def test_a_slack_net() -> None:
+    wave = Fold(direction=0.5, place=0.1, height=0.008, width=0.15, period=0.3)
+    shot = shoot(replace(NET, folds=(wave,)))
+    # The mean of the wave stands half its height behind; its flanks lean by 5 degrees.
+    check_posture(shot.posture, share=0.02, degrees=3.0)
+    assert shot.recall() > 0.85
+
+
+@pytest.mark.parametrize("bend", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)], ids=str)
+def test_a_bend_of_a_metres_radius_is_known_to_three_sigma(bend: tuple[float, float]) -> None:
+    posture = shoot(replace(NET, curvature=bend)).posture
+    assert posture.curvature is not None
+    assert posture.sigma_curvature is not None
+    z = (np.array(posture.curvature) - bend) / np.array(posture.sigma_curvature)
+    assert np.abs(z).max() < 3.0
+    assert max(posture.sigma_curvature) < 0.12
+    check_posture(posture, degrees=1.5)
+
+
+def test_missing_strands_and_holes() -> None:
+    holes = ((0.05, 0.04, 0.05), (-0.09, -0.08, 0.04))
+    shot = shoot(replace(NET, missing=0.25, holes=holes))
+    check_posture(shot.posture)
+    assert shot.recall() > 0.88
+    assert shot.precision() > 0.98
+
+
+@pytest.mark.parametrize("slide", [(0.55, 0.0), (0.0, -0.57)])
+def test_a_torn_edge_in_view(slide: tuple[float, float]) -> None:
+    rng = np.random.default_rng(3)
+    along = np.arange(-0.6, 0.6, 0.05)
+    if slide[0]:
+        tears = tuple((-0.6, float(z), float(rng.uniform(0.01, 0.06))) for z in along)
+    else:
+        tears = tuple((float(x), 0.6, float(rng.uniform(0.01, 0.06))) for x in along)
+    shot = shoot(replace(NET, half_size=(0.6, 0.6), holes=tears), slide=slide)
+    check_posture(shot.posture, degrees=1.0)
+    assert shot.recall() > 0.85
+    assert shot.precision() > 0.98
+
+
+def test_of_two_nets_the_nearer_one_is_measured() -> None:
+    # A fold without end moves the whole net.
+    behind = Net(mesh="square", bar=0.03, twine=0.003, folds=(Fold(height=0.25, width=1e4),))
+    shot = shoot(NET, behind)
+    check_posture(shot.posture)
+    nearer = shot.in_scene[:, 1] < 0.1
+    assert shot.recall(nearer) > 0.85
+    assert shot.precision() > 0.95
+
+
+def test_a_near_net_of_thick_twine_is_no_wall() -> None:
+    """Its strands are long in search lines, and still short on the net."""
+    pose = dome_from_target(0.34, 0.0, np.deg2rad(-10.0))
+    net = Net(mesh="hexagon", bar=0.035, twine=0.0033, roll=0.2, fouling=0.2)
+    renderer, scanner = equipment()
+    picture = renderer.render(
+        Scene(dome_from_scene=pose, nets=(net,), walls=(Wall(depth=0.31),)),
+        0.0,
+        np.random.default_rng(5),
+    )
+    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+    posture = scanner.process(Frame(0, 0.0, luma, chroma)).posture
+    assert posture
+    assert abs(posture.range / 0.34 - 1.0) < 0.02
