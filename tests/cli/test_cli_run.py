@@ -204,7 +204,8 @@ def test_options_that_make_no_sense(tmp_path, rig, dive, refused, options, words
 
 
 def test_missing_arguments(refused, dive):
-    assert "--rig" in refused("run", dive)
+    assert "--out" in refused("run", dive)
+    assert "--rig" in refused("run", dive, "--out", "out")
     assert "source" in refused("run").lower()
     assert "bogus" in refused("bogus")
 

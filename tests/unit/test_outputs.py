@@ -151,7 +151,7 @@ def test_points_become_columns_of_the_schema():
     assert batch.schema == POINTS_SCHEMA
     assert [field.name for field in POINTS_SCHEMA] == [
         *("frame", "time_s", "laser", "u_px", "v_px", "x_m", "y_m", "z_m"),
-        *("sigma_m", "quality", "label", "used"),
+        *("sigma_m", "quality", "label", "used", "intensity", "width_px"),
     ]
     table = batch.to_pydict()
     assert table["frame"] == [5] * 40
@@ -161,6 +161,8 @@ def test_points_become_columns_of_the_schema():
     np.testing.assert_array_equal(pixels, made.points.pixels.astype(np.float32))
     points = np.stack([table["x_m"], table["y_m"], table["z_m"]], -1)
     np.testing.assert_array_equal(points, made.points.points_in_dome.astype(np.float32))
+    np.testing.assert_array_equal(table["intensity"], made.points.intensity.astype(np.float32))
+    np.testing.assert_array_equal(table["width_px"], made.points.width.astype(np.float32))
     assert table["label"] == [Label(i).name.lower() for i in made.points.label]
     assert table["used"] == made.points.used.tolist()
     np.testing.assert_array_equal(table["sigma_m"], made.points.sigma.astype(np.float32))

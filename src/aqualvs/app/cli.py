@@ -14,6 +14,9 @@ import typer
 
 from aqualvs import __version__
 from aqualvs.app.cli_calibrate import board, calibrate
+from aqualvs.app.cli_control import tune
+from aqualvs.app.cli_follow import follow
+from aqualvs.app.cli_live import doctor, live
 from aqualvs.errors import AqualvsError
 
 # Matrices here are small: threads of the linear algebra gain nothing, and where another process
@@ -33,6 +36,24 @@ app.command(
     help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
     epilog="Example: aqualvs board charuco --paper a3 -o board",
 )(board)
+app.command(
+    help="Measure live: a stream, a camera or a file in real time, to pilot, autopilot, ROS, "
+    "Foxglove and recording. Ctrl-C ends it.",
+    epilog="Example: aqualvs live udp://0.0.0.0:5600 --rig rig.yaml --dashboard "
+    "--mavlink udpout:192.168.2.2:14550",
+)(live)
+app.command(
+    help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
+    epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",
+)(doctor)
+app.command(
+    help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",
+    epilog="Example: aqualvs follow --sim -o out/follow",
+)(follow)
+app.command(
+    help="Make gains for a vehicle model, and say what margins they leave.",
+    epilog="Example: aqualvs tune bluerov2_heavy -o gains.yaml",
+)(tune)
 
 # Older versions of Typer keep this class in Click, newer ones in a private module of their own.
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
@@ -58,13 +79,18 @@ def _root(
 
 @app.command(
     help="Measure a dive: range, pitch and yaw for every frame, all points, and a report. "
-    "SOURCE is a video, a folder of images, or an address (rtsp://, udp://, http://).",
+    "SOURCE is a video, a folder of images, an address (rtsp://, udp://, http://), or a recording "
+    "(dive.mcap), which brings its own rig and options.",
     epilog="Example: aqualvs run dive.mp4 --rig rig.yaml -o out/dive",
 )
 def run(
-    source: Annotated[str, typer.Argument(help="Video, folder of images, or address.")],
-    rig: RigFile,
+    context: typer.Context,
+    source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
     out: OutFolder,
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", help="Rig file; a recording has its own.", show_default=False),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a run that is there.")
     ] = False,
@@ -116,9 +142,16 @@ def run(
             show_default=False,
         ),
     ] = None,
+    net: Annotated[
+        bool, typer.Option("--net", help="Tell the state of the net too, see aqualvs net.")
+    ] = False,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
+    ] = False,
 ) -> None:
     """Measure a dive."""
     from aqualvs.app import run as body
+    from aqualvs.app.net_pass import NetRequest
     from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
 
     request = body.RunRequest(
@@ -131,12 +164,72 @@ def run(
         frames=FrameWindow.parse(frames),
         fps=fps,
         scanner=scanner_options(target, detector, mesh_filter, fit),
+        target=target,
+        chosen=_given(context, ("target", "detector", "mesh_filter", "fit")),
+        mcap=mcap,
         overlay=overlay,
         report=report,
         truth=truth,
         index_target=index_target,
+        net=NetRequest() if net else None,
     )
     raise typer.Exit(body.run_and_tell(request, typer.echo))
+
+
+@app.command(
+    help="Tell the state of a net: meshes, twine, fouling, holes, and a map. SOURCE is a dive "
+    "(video or images, which is run into DIR first) or the folder of a run.",
+    epilog="Example: aqualvs net out/dive --log vehicle.tlog",
+)
+def net(
+    source: Annotated[str, typer.Argument(help="Folder of a run, or video, folder of images.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write; of a run its own if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="Rig file, for a dive; a run has its own.", show_default=False),
+    ] = None,
+    target: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE", help="As for aqualvs run, which a dive needs first."
+        ),
+    ] = "auto",
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN.",
+            show_default=False,
+        ),
+    ] = None,
+    log_offset_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Log's clock minus the dive's; found from the motion if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    twine_mm: Annotated[
+        float | None,
+        typer.Option(help="Diameter of the bare twine, where it is known.", show_default=False),
+    ] = None,
+    stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+) -> None:
+    """Tell the state of a net."""
+    from aqualvs.app import net as body
+    from aqualvs.app.net_pass import NetRequest
+
+    request = NetRequest(twine_mm=twine_mm, stretch_m=stretch_m, log=log, log_offset_s=log_offset_s)
+    place = body.NetSource(source=source, rig=rig, out=out, target=target, overwrite=overwrite)
+    raise typer.Exit(body.net(place, request, typer.echo))
 
 
 @app.command(
@@ -203,6 +296,36 @@ def check(
 
 
 @app.command(
+    help="Draw a run's reflections in a laser's plane, with what the filters take for net: "
+    "pictures after figures 13 and 14 of the paper, and the filter's binary image.",
+    epilog="Example: aqualvs figures out/dive -o out/figures",
+)
+def figures(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    out: OutFolder,
+    frame: Annotated[
+        int | None,
+        typer.Option(help="Frame; the one that shows most if left out.", show_default=False),
+    ] = None,
+    laser: Annotated[
+        str | None,
+        typer.Option(help="Laser's name; the one that shows most if left out.", show_default=False),
+    ] = None,
+    target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target file (net.yaml) with the parameters of the paper's filter.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Draw a run's reflections."""
+    from aqualvs.app import figures as body
+
+    body.figures(folder, out, typer.echo, frame=frame, laser=laser, target=target)
+
+
+@app.command(
     help="Write the report of a run again. After a run that was killed, its points are completed "
     "first.",
     epilog="Example: aqualvs report out/dive --truth truth.csv",
@@ -220,6 +343,14 @@ def report(
     if recover(folder):
         typer.echo(f"{folder}: points completed from the journal of a run that was killed")
     typer.echo(f"report: {write_report(folder, truth=truth)}")
+
+
+def _given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
+    """Return which of some options the user gave."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    return frozenset(
+        name for name, source in sources.items() if source and source.name != "DEFAULT"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -27,11 +27,13 @@ POINTS_SCHEMA = pa.schema(
         *((name, pa.float32()) for name in ("sigma_m", "quality")),
         ("label", pa.dictionary(pa.int8(), pa.string())),
         ("used", pa.bool_()),
+        *((name, pa.float32()) for name in ("intensity", "width_px")),
     ]
 )
 """Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`.
 
-`label` says what a point lies on (`Label`), `used` whether it entered the posture.
+`label` says what a point lies on (`Label`), `used` whether it entered the posture; `intensity` is
+the stripe's height above its background in grey levels, `width_px` its full width at half of that.
 """
 
 _LABEL_NAMES = pa.array(LABELS, pa.string())
@@ -107,15 +109,18 @@ def points_batch(scan: Scan) -> Any:
     """Return the points of a frame as a record batch of `POINTS_SCHEMA`."""
     points = scan.points
     n = len(points)
-    numbers = np.empty((7, n), np.float32)
+    numbers = np.empty((9, n), np.float32)
     numbers[0:2] = points.pixels.T
     numbers[2:5] = points.points_in_dome.T
     numbers[5] = points.sigma
     numbers[6] = points.quality
+    numbers[7] = points.intensity
+    numbers[8] = points.width
     head = (np.full(n, scan.index, np.int32), np.full(n, scan.time_s), points.laser)
     label = pa.array(np.ascontiguousarray(points.label).view(np.int8))
     names = pa.DictionaryArray.from_arrays(label, _LABEL_NAMES, safe=False)
-    arrays = [*(pa.array(column) for column in (*head, *numbers)), names, pa.array(points.used)]
+    columns = [pa.array(column) for column in (*head, *numbers)]
+    arrays = [*columns[:10], names, pa.array(points.used), *columns[10:]]
     return pa.RecordBatch.from_arrays(arrays, schema=POINTS_SCHEMA)
 
 

@@ -9,7 +9,7 @@
 `run.yaml`          source, options, versions, rig, status and summary
 ==================  ========================================================================
 
-The report and the overlay video are written beside them by their own modules.
+The report, the state of a net and the overlay video are written beside them by their own modules.
 """
 
 import contextlib
@@ -37,6 +37,13 @@ POINTS_PLY = "points.ply"
 RUN_YAML = "run.yaml"
 OVERLAY_MP4 = "overlay.mp4"
 REPORT_HTML = "report.html"
+NET_CSV = "net.csv"
+HOLES_CSV = "holes.csv"
+NET_GEOJSON = "net.geojson"
+NET_MAP_PNG = "net_map.png"
+NET_MAP_SVG = "net_map.svg"
+NET_FILES = (NET_CSV, HOLES_CSV, NET_GEOJSON, NET_MAP_PNG, NET_MAP_SVG)
+"""The state of a net."""
 RUN_FILES = (
     RUN_YAML,
     POSTURE_CSV,
@@ -46,6 +53,7 @@ RUN_FILES = (
     POINTS_PLY,
     OVERLAY_MP4,
     REPORT_HTML,
+    *NET_FILES,
 )
 """What belongs to a run; nothing else in its folder is ever removed or replaced."""
 

@@ -1,5 +1,6 @@
 """From the journal of a run to `points.parquet` and `points.ply`, batch by batch."""
 
+import itertools
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -30,7 +31,7 @@ def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
     journal : Path
         May lack its end; what follows the last whole batch is left out.
     points_parquet : Path
-        Columns as `POINTS_SCHEMA`.
+        Columns as `POINTS_SCHEMA`, or those that an older journal has.
     points_ply : Path
         Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser.
 
@@ -57,12 +58,16 @@ def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
 
 def _write_drafts(journal: Path, parquet_draft: Path, ply_draft: Path) -> int:
     n_points, n_vertices = 0, 0
+    batches = read_journal(journal)
+    first = next(batches, None)
+    schema = POINTS_SCHEMA if first is None else first.schema
+    head = [] if first is None else [first]
     with (
-        parquet.ParquetWriter(parquet_draft, POINTS_SCHEMA, compression="zstd") as table_file,
+        parquet.ParquetWriter(parquet_draft, schema, compression="zstd") as table_file,
         ply_draft.open("wb") as ply,
     ):
         ply.write(_ply_header(0))
-        for table in _row_groups(read_journal(journal)):
+        for table in _row_groups(itertools.chain(head, batches)):
             table_file.write_table(table)
             vertices = _vertices(table)
             vertices.tofile(ply)

@@ -7,6 +7,7 @@ from plotly.offline import get_plotlyjs
 
 from aqualvs.app import report_charts as charts
 from aqualvs.app import report_html as html
+from aqualvs.app.net_report import net_cards, net_view
 from aqualvs.app.report_findings import headline
 from aqualvs.app.report_material import Material, gather
 from aqualvs.app.report_rig import dome_radius_mm
@@ -20,8 +21,8 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
     Parameters
     ----------
     run_dir : Path
-        Folder with `posture.csv`; `points.parquet`, `run.yaml`, `posture_bare.csv` and the source
-        that `run.yaml` names are used if they are there.
+        Folder with `posture.csv`; `points.parquet`, `run.yaml`, `posture_bare.csv`, `net.csv` with
+        what belongs to it and the source that `run.yaml` names are used if they are there.
     truth : Path or None
         CSV with columns `frame,range_mm,pitch_deg,yaw_deg`, overlaid with the errors.
     out : Path or None
@@ -58,10 +59,11 @@ def _parts(m: Material) -> dict[str, str]:
     return {
         "title": html.text(m.title),
         "subtitle": html.subtitle(m.run),
-        "cards": html.cards(headline(m.track)),
+        "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
         "warnings": html.notice(m.warnings),
         "posture_lead": html.posture_lead(m.track, m.truth),
         "truth": html.truth_view(m.track, m.truth),
+        "net": net_view(m.net),
         "planes": html.plane_view(m.lasers, m.points is not None),
         "cloud": html.cloud_view(m.points, planes_known),
         "pictures": html.picture_view(_captions(m), m.pictures, m.no_pictures, m.names),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.net_report import NetTables, net_warnings, read_net
 from aqualvs.app.report_findings import warnings_of
 from aqualvs.app.report_frames import (
     Picture,
@@ -42,6 +43,8 @@ class Material:
         Row to picture, where the source could be decoded again.
     no_pictures : str
         Why pictures are missing; "" where none is.
+    net : NetTables or None
+        The state of the net, where it was evaluated.
     warnings : list of str
     """
 
@@ -56,6 +59,7 @@ class Material:
     sample_rows: list[int]
     pictures: dict[int, Picture]
     no_pictures: str
+    net: NetTables | None
     warnings: list[str]
 
     @property
@@ -87,6 +91,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     rig = mapping(run, "rig")
     lasers = _lasers(rig, points)
     names = [laser.name for laser in lasers]
+    net, no_net = read_net(run_dir)
     told = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
         title=_title(run_dir, run),
@@ -100,7 +105,12 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
         sample_rows=sample_rows,
         pictures=pictures,
         no_pictures=no_pictures,
-        warnings=[text for text in (trouble, no_points, no_pictures, *told) if text],
+        net=net,
+        warnings=[
+            text
+            for text in (trouble, no_points, no_pictures, no_net, *told, *net_warnings(net))
+            if text
+        ],
     )
 
 

@@ -1,19 +1,20 @@
 """`aqualvs run`: from a dive to posture, points and report."""
 
-import itertools
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-
+from aqualvs.app.net_check import net_check
+from aqualvs.app.net_pass import NetRequest
 from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
 from aqualvs.app.progress import progress
 from aqualvs.app.report import write_report
 from aqualvs.app.run_agreement import agreement_of
 from aqualvs.app.run_bare_lens import RunBareLens
+from aqualvs.app.run_frames import ready, window_of, with_losses
 from aqualvs.app.run_inputs import (
     FrameWindow,
     Water,
@@ -22,9 +23,12 @@ from aqualvs.app.run_inputs import (
     scanner_facts,
     source_facts,
 )
+from aqualvs.app.run_mcap import RunMcap, ScansFrames, prepare_mcap
+from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay
+from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
 from aqualvs.app.run_water import WaterFollowingScanner
-from aqualvs.app.runfile import Status
+from aqualvs.app.run_writers import RunWriters
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.tally import Tally
 from aqualvs.app.truth import TruthComparison, compare_with_truth, read_truth
@@ -32,9 +36,8 @@ from aqualvs.errors import AqualvsError, OptionError, SourceError
 from aqualvs.live.sources import FrameSource, open_source
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
-from aqualvs.scanning.posture import Reason, Refusal
-from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,8 +47,9 @@ class RunRequest:
     Attributes
     ----------
     source : str
-        Path or address, as `open_source` takes it.
-    rig : Path
+        Path or address, as `open_source` takes it, or a recording.
+    rig : Path or None
+        None takes that of a recording; other sources need one.
     out : Path
         Folder to write.
     overwrite : bool
@@ -57,16 +61,25 @@ class RunRequest:
     fps : float or None
         Frame rate of image folders.
     scanner : ScannerOptions
+    chosen : frozenset of str or None
+        Fields of `scanner` that count for a recording, whose own options stand for the others.
+        None: all of them.
+    mcap : bool
+        Whether to write `dive.mcap`.
     overlay, report : bool
         Whether to write `overlay.mp4` and `report.html`.
     truth : Path or None
         Truth to compare with.
     index_target : Path or None
         Markers on the vehicle that tell the water's index, followed frame by frame.
+    net : NetRequest or None
+        What to find out about the net on the way, if anything.
+    target : str
+        As the command line has it: a file may say what the net is, which is then checked.
     """
 
     source: str
-    rig: Path
+    rig: Path | None
     out: Path
     overwrite: bool = False
     water: Water = field(default_factory=Water)
@@ -74,10 +87,14 @@ class RunRequest:
     frames: FrameWindow = field(default_factory=FrameWindow)
     fps: float | None = None
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    chosen: frozenset[str] | None = None
+    mcap: bool = False
     overlay: bool = False
     report: bool = True
     truth: Path | None = None
     index_target: Path | None = None
+    net: NetRequest | None = None
+    target: str = "auto"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +112,8 @@ class RunResult:
         What the dome model is worth, in words.
     water_lines : list of str
         What was found of the water's index, in words; empty where it was given.
+    net_lines : list of str
+        The state of the net, in words; empty where nobody asked.
     elapsed_s : float
         From the first frame to the complete folder, without the report.
     report : Path or None
@@ -108,17 +127,11 @@ class RunResult:
     tally: Tally
     dome_lines: list[str]
     water_lines: list[str]
+    net_lines: list[str]
     elapsed_s: float
     report: Path | None
     comparison: TruthComparison | None
     fault: AqualvsError | None
-
-
-class ScansFrames(Protocol):
-    """What a run needs of a scanner."""
-
-    def process(self, frame: Frame) -> Scan:
-        """Return the scan of one frame."""
 
 
 def run(
@@ -136,48 +149,50 @@ def run(
     AqualvsError
         If an input cannot be used, or an output not be written; what exists stays readable.
     """
-    rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)
+    replay = _replay(request)
+    if replay is None:
+        rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)
+    else:
+        rig, request = replay.rig, replace(request, scanner=replay.options)
     if request.truth is not None:
         read_truth(request.truth)
     fault: AqualvsError | None = None
-    with open_source(request.source, fps=request.fps) as source:
+    with replay or open_source(request.source, fps=request.fps) as source:
         check_fits(source, rig)
         following = _following(request, rig)
-        scanner = following or scanner_for(rig, request.scanner)
-        agreement = None if request.no_dome else agreement_of(rig, request.rig)
-        frames = _ready(_window(source, request.frames), source, request.frames)
+        scanner = following or replay or scanner_for(rig, request.scanner)
+        net, agreement = RunNet(rig, request.net), _agreement(request, rig)
+        frames = ready(window_of(source, request.frames), source, request.frames)
+        prepare_mcap(request.out, request.source, overwrite=request.overwrite)
         prepare_folder(request.out, overwrite=request.overwrite)
         started = time.perf_counter()
         try:
             with (
-                _outputs(request, rig, source) as outputs,
-                RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
-                RunBareLens(request.out, rig) as bare_lens,
+                _writers(request, rig, source, net) as writers,
                 StopSignals() as stop,
                 progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
             ):
-                outputs.tally.agreement = agreement
-                for lost, frame in _with_losses(frames, request.frames.first, rig.n_water):
+                writers.tally.agreement = agreement
+                writers.tally.net_check = net_check(request.target, rig)
+                # A recording tells of lost frames itself; what it lacks was skipped on purpose.
+                first = None if replay else request.frames.first
+                for lost, frame in with_losses(frames, first, rig.n_water):
                     for scan in lost:
-                        outputs.write(scan)
-                        bare_lens.write(scan)
-                        overlay.write(None, scan)
-                    scan = scanner.process(frame)
-                    outputs.write(scan)
-                    bare_lens.write(scan)
-                    overlay.write(frame, scan)
+                        writers.lost(scan)
+                    writers.measure(scanner, frame)
                     tick(1 + len(lost))
                     if stop.caught:
-                        outputs.status = Status.INTERRUPTED
+                        writers.interrupt()
                         break
         except SourceError as broken_off:
             fault = broken_off
     return RunResult(
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
-        tally=outputs.tally,
-        dome_lines=bare_lens.lines(),
+        tally=writers.tally,
+        dome_lines=writers.dome_lines(),
         water_lines=following.lines() if following else [],
+        net_lines=writers.net_lines(request.out, request.source),
         elapsed_s=time.perf_counter() - started,
         report=_report(request),
         comparison=_comparison(request),
@@ -207,6 +222,7 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
     lines += result.tally.lines()
     lines += result.water_lines
     lines += result.dome_lines
+    lines += result.net_lines
     if result.comparison is not None:
         lines += result.comparison.lines()
     if result.stopped_by:
@@ -218,6 +234,24 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
     return lines
 
 
+def _replay(request: RunRequest) -> Replay | None:
+    replay = replay_of(
+        request.source,
+        ReplayRequest(
+            rig=request.rig,
+            water=request.water,
+            no_dome=request.no_dome,
+            scanner=request.scanner,
+            chosen=request.chosen,
+            index_target=request.index_target,
+            pictures=request.overlay,
+        ),
+    )
+    if replay is not None and request.fps is not None:
+        raise OptionError(f"--fps: {request.source} has its own clock; leave the frame rate out")
+    return replay
+
+
 def _following(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
     if request.index_target is None:
         return None
@@ -226,69 +260,31 @@ def _following(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
     return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
 
 
-def _window(source: FrameSource, window: FrameWindow) -> Iterator[Frame]:
-    """Yield the frames of a source that lie in a window."""
-    for frame in source:
-        if window.stop is not None and frame.index >= window.stop:
-            return
-        if frame.index >= window.first:
-            yield frame
+def _agreement(request: RunRequest, rig: Rig) -> LaserAgreement | None:
+    if request.no_dome:
+        return None
+    return agreement_of(rig, request.rig or Path(request.source))
 
 
-def _ready(frames: Iterator[Frame], source: FrameSource, window: FrameWindow) -> Iterator[Frame]:
-    """Return the frames once the first of them has been decoded, or say that there is none."""
-    first = next(frames, None)
-    if first is not None:
-        return itertools.chain([first], frames)
-    if window == FrameWindow():
-        raise SourceError(f"{source.name}: holds no frame that can be decoded; record it again")
-    held = "" if source.n_frames is None else f", which has {source.n_frames}"
-    stop = "" if window.stop is None else window.stop
-    raise OptionError(
-        f"--frames {window.first}:{stop}: no such frames in {source.name}{held}; "
-        "choose frames that it has"
-    )
-
-
-def _with_losses(
-    frames: Iterator[Frame], first: int, n_water: float
-) -> Iterator[tuple[list[Scan], Frame]]:
-    """Yield each frame with the scans that stand for the lost frames right before it."""
-    last_index, last_time_s = 0, 0.0
-    for frame in frames:
-        # Between two frames that came, the clock is taken to run evenly.
-        step = (frame.time_s - last_time_s) / max(1, frame.index - last_index)
-        lost = range(first, frame.index)
-        yield [_lost(i, last_time_s + (i - last_index) * step, n_water) for i in lost], frame
-        first, last_index, last_time_s = frame.index + 1, frame.index, frame.time_s
-
-
-def _lost(index: int, time_s: float, n_water: float) -> Scan:
-    """Return the scan of a frame that could not be decoded."""
-    none = np.empty(0)
-    nothing = ScanPoints(
-        laser=np.empty(0, np.int8),
-        pixels=np.empty((0, 2)),
-        points_in_dome=np.empty((0, 3)),
-        sigma=none,
-        intensity=none,
-        width=none,
-        quality=none,
-        label=np.empty(0, np.uint8),
-        used=np.empty(0, np.bool_),
-    )
-    return Scan(index, time_s, Refusal(Reason.CORRUPT_FRAME), nothing, n_water)
-
-
-def _outputs(request: RunRequest, rig: Rig, source: FrameSource) -> RunOutputs:
-    return RunOutputs(
-        request.out, source=source_facts(source), rig=rig_to_mapping(rig), options=_options(request)
-    )
+@contextmanager
+def _writers(
+    request: RunRequest, rig: Rig, source: FrameSource, net: RunNet
+) -> Iterator[RunWriters]:
+    """Open everything that the run writes; it is completed however the run ends."""
+    facts, options = source_facts(source), _options(request)
+    with (
+        RunOutputs(request.out, source=facts, rig=rig_to_mapping(rig), options=options) as outputs,
+        RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
+        RunBareLens(request.out, rig) as bare_lens,
+        RunMcap(request.out, rig, request.scanner, wanted=request.mcap) as mcap,
+    ):
+        yield RunWriters(outputs, overlay, bare_lens, mcap, net)
 
 
 def _options(request: RunRequest) -> dict[str, Any]:
     """Return the options as `run.yaml` holds them."""
-    found = {"rig_file": str(request.rig), "no_dome": request.no_dome}
+    rig_file = None if request.rig is None else str(request.rig)
+    found: dict[str, Any] = {"rig_file": rig_file, "no_dome": request.no_dome}
     found |= asdict(request.water)
     found |= {"first_frame": request.frames.first, "stop_frame": request.frames.stop}
     found["index_target"] = None if request.index_target is None else str(request.index_target)

@@ -118,7 +118,7 @@ def scanner_facts(options: ScannerOptions) -> dict[str, Any]:
     return found
 
 
-def prepared_rig(path: Path, water: Water, *, no_dome: bool) -> Rig:
+def prepared_rig(path: Path | None, water: Water, *, no_dome: bool) -> Rig:
     """Load a rig and put it into the water it is used in.
 
     Raises
@@ -126,9 +126,22 @@ def prepared_rig(path: Path, water: Water, *, no_dome: bool) -> Rig:
     RigError
         If the file cannot be used, or the rig has no lasers.
     OptionError
+        If there is no path, or the water makes no sense.
+    """
+    if path is None:
+        raise OptionError("--rig: missing; give the rig file (only a recording brings its own)")
+    return in_water(load_rig(path), water, no_dome=no_dome)
+
+
+def in_water(rig: Rig, water: Water, *, no_dome: bool) -> Rig:
+    """Put a rig into the water it is used in.
+
+    Raises
+    ------
+    OptionError
         If the water makes no sense.
     """
-    rig = water.applied_to(load_rig(path))
+    rig = water.applied_to(rig)
     return replace(rig, dome=None) if no_dome else rig
 
 

@@ -39,6 +39,11 @@ class WaterFollowingScanner:
     water : Water
         Temperature and salinity, if given, are a prior.
 
+    Attributes
+    ----------
+    scanner : Scanner
+        For the water as it is known.
+
     Raises
     ------
     CalibrationError
@@ -47,7 +52,7 @@ class WaterFollowingScanner:
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
         self._rig, self._options, self._target = rig, options, target
-        self._scanner = Scanner(rig, options)
+        self.scanner = Scanner(rig, options)
         self._markers = load_target(target)
         self._estimator = IndexEstimator(
             rig,
@@ -61,9 +66,14 @@ class WaterFollowingScanner:
 
     def process(self, frame: Frame) -> Scan:
         """Measure a frame in the water as it is known now."""
-        if self._n_read < _FIRST_FRAMES or frame.time_s >= self._next_s:
-            self._look(frame)
-        return self._scanner.process(frame)
+        if self.is_due(frame):
+            self.look(frame)
+        return self.scanner.process(frame)
+
+    @property
+    def sigma_n_water(self) -> float:
+        """Standard deviation of the index; NaN until the target has been seen."""
+        return float("nan") if self._last is None else self._last.sigma
 
     def lines(self) -> list[str]:
         """Return what the run's summary says of the water."""
@@ -78,7 +88,12 @@ class WaterFollowingScanner:
             found.append("the pictures alone cannot tell the index; see aqualvs check")
         return found + [step_words(step) for step in self._estimator.steps]
 
-    def _look(self, frame: Frame) -> None:
+    def is_due(self, frame: Frame) -> bool:
+        """Return whether the target should be read in this frame."""
+        return self._n_read < _FIRST_FRAMES or frame.time_s >= self._next_s
+
+    def look(self, frame: Frame) -> None:
+        """Read the target in a frame; makes another scanner if the water has changed."""
         self._next_s = frame.time_s + _EVERY_S
         grey = np.ascontiguousarray(frame.luma)
         view = detect_markers(grey, self._markers, f"frame {frame.index}")
@@ -89,8 +104,8 @@ class WaterFollowingScanner:
             return
         self._last, self._n_read = reading, self._n_read + 1
         trusted = reading.sigma < _LEAST_SIGMA_TO_FOLLOW
-        if trusted and abs(reading.n - self._scanner.rig.n_water) > _WORTH:
-            self._scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
+        if trusted and abs(reading.n - self.scanner.rig.n_water) > _WORTH:
+            self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
 
 
 def _prior(water: Water, rig: Rig) -> IndexPrior | None:

@@ -11,13 +11,16 @@ from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import list_scenarios, load_scenario
+from aqualvs.simulation.vehicle_log import LEAD_S, write_hole_truth, write_vehicle_log
 
 CALIBRATION = "calibration"
 """What is given in a scenario's place to render pictures for a calibration."""
 
 _ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
-_FILES = ("dive.mp4", "truth.csv", "rig.yaml")
+_LOG, _HOLES = "vehicle.csv", "truth_holes.csv"
+_FILES = ("dive.mp4", "truth.csv", "rig.yaml", _LOG, _HOLES)
 _CALIBRATION_FILES = ("camera_air", "dome_air", "box", "index", "dive", "truth", "nominal.yaml")
 
 
@@ -60,6 +63,7 @@ def simulate(
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     _check_free(out, _FILES, overwrite=overwrite)
     with writing(out), progress(scenario, course.n_frames) as tick:
+        _write_net_truth(course, out)
         dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1))
         save_rig(rig, out / "rig.yaml")
     tell(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
@@ -67,6 +71,19 @@ def simulate(
         f"next: aqualvs run {dive.video} --rig {out / 'rig.yaml'} --truth {dive.truth} "
         f"-o {out / 'run'}"
     )
+    if course.nets:
+        tell(
+            f"then: aqualvs net {out / 'run'} --log {out / _LOG} --log-offset-s {LEAD_S:g}; "
+            f"true holes: {out / _HOLES}"
+        )
+
+
+def _write_net_truth(course: Scenario, out: Path) -> None:
+    """Write the vehicle's log and the true holes beside a dive along a net."""
+    if course.nets:
+        out.mkdir(parents=True, exist_ok=True)
+        write_vehicle_log(course, out / _LOG)
+        write_hole_truth(course, out / _HOLES)
 
 
 def _simulate_calibration(

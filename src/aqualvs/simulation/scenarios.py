@@ -82,6 +82,27 @@ _BUILT_IN: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
                 "bubbles": 40,
             },
         ),
+        "net_holes": (
+            "along a fouled net with three holes at 0.2 m/s, with the vehicle's log",
+            {
+                "duration_s": 12.0,
+                "motion": {
+                    "range_mm": {"values": [480, 430, 520, 450], "sway": 6, "period_s": 2.9},
+                    "pitch_deg": {"values": [2, -3, 3, -1], "sway": 1.5, "period_s": 3.1},
+                    "yaw_deg": {"values": [-5, 7, -3, 6], "sway": 4, "period_s": 4.3},
+                    # From rest to 0.2 m/s and to rest again.
+                    "slide_x_mm": [0, -70, -270, *range(-490, -2200, -220), -2250, -2300],
+                    "slide_z_mm": [0, -120, 60, -40],
+                },
+                "net": {
+                    "bar_mm": 25,
+                    "twine_mm": 2.5,
+                    "fouling": 0.45,
+                    "growth": 1.5,
+                    "holes_mm": [[500, 40, 55], [1250, -20, 75], [1950, 90, 65]],
+                },
+            },
+        ),
         "demo": (
             "the bundled dive: along a fouled net with a hole, among fish and bubbles",
             {

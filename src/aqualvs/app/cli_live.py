@@ -1,0 +1,142 @@
+"""The command line of live runs: signatures only; bodies are imported when they run."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+
+def live(
+    source: Annotated[
+        str, typer.Argument(help="Stream, camera or file; docs/sources.md has a table.")
+    ],
+    rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).", show_default=False)],
+    mavlink: Annotated[
+        list[str] | None,
+        typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
+    ] = None,
+    json: Annotated[
+        list[str] | None, typer.Option(help="Send lines of JSON by UDP to HOST:PORT; repeatable.")
+    ] = None,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Publish to ROS 2.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="Publish to ROS 1 (Noetic).")] = False,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve Foxglove at ws://127.0.0.1:8765.")
+    ] = False,
+    foxglove_address: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where to serve Foxglove.")
+    ] = "127.0.0.1:8765",
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Serve the pilot's page at http://127.0.0.1:8100.")
+    ] = False,
+    dashboard_address: Annotated[
+        str,
+        typer.Option(
+            metavar="HOST:PORT", help="Where to serve it; other than 127.0.0.1 needs a token."
+        ),
+    ] = "127.0.0.1:8100",
+    token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="AQUALVS_TOKEN",
+            help="Password of the page; made and printed if one is needed.",
+            show_default=False,
+        ),
+    ] = None,
+    record: Annotated[bool, typer.Option("--record", help="Record from the start.")] = False,
+    record_to: Annotated[Path, typer.Option(help="Folder of recordings.")] = Path("dives"),
+    record_video: Annotated[
+        bool, typer.Option("--record-video", help="Record the pictures too.")
+    ] = False,
+    smooth: Annotated[
+        bool, typer.Option("--filter", help="Smooth over time; raw values stay available.")
+    ] = False,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Files: every frame, as fast as possible.")
+    ] = False,
+    fps: Annotated[
+        float | None, typer.Option(help="Of images, or asked of a camera.", show_default=False)
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Picture size asked of a camera.", show_default=False),
+    ] = None,
+    pixel_format: Annotated[
+        str | None,
+        typer.Option(help="Asked of a camera: h264, mjpeg, yuyv422.", show_default=False),
+    ] = None,
+    transport: Annotated[
+        Literal["tcp", "udp"] | None,
+        typer.Option(help="How RTSP shall send; tcp if left out.", show_default=False),
+    ] = None,
+    target: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."
+        ),
+    ] = "auto",
+    detector: Annotated[Literal["ridge", "threshold"], typer.Option(help="Stripe detector.")] = (
+        "ridge"
+    ),
+    water_n: Annotated[
+        float | None, typer.Option(help="Refractive index of the water.", show_default=False)
+    ] = None,
+    temperature_c: Annotated[
+        float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
+    ] = None,
+    salinity: Annotated[
+        float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
+    ] = None,
+    index_target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Measure live."""
+    from aqualvs.app import live as body
+    from aqualvs.app.live_outputs import OutputRequest
+    from aqualvs.app.run_inputs import Water, scanner_options
+
+    request = body.LiveRequest(
+        source=source,
+        rig=rig,
+        feed=body.FeedRequest(fps=fps, size=size, pixel_format=pixel_format, transport=transport),
+        outputs=OutputRequest(
+            mavlink=tuple(mavlink or ()),
+            json=tuple(json or ()),
+            ros2=ros2,
+            ros1=ros1,
+            foxglove=foxglove_address if foxglove else None,
+        ),
+        dashboard=dashboard_address if dashboard else None,
+        token=token,
+        record=record,
+        record_to=record_to,
+        record_video=record_video,
+        smooth=smooth,
+        fast=fast,
+        water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
+        scanner=scanner_options(target, detector, "none", "robust"),
+        index_target=index_target,
+    )
+    raise typer.Exit(body.live_and_tell(request, typer.echo))
+
+
+def doctor(
+    source: Annotated[
+        str | None, typer.Argument(help="Stream, camera or file to look at.", show_default=False)
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig that the pictures should fit.", show_default=False)
+    ] = None,
+    mavlink: Annotated[
+        str | None, typer.Option(help="Autopilot to listen for.", show_default=False)
+    ] = None,
+) -> None:
+    """Look at the machine."""
+    from aqualvs.app.doctor import DoctorRequest, run_doctor
+
+    raise typer.Exit(run_doctor(DoctorRequest(source=source, rig=rig, mavlink=mavlink)))

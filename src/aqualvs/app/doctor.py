@@ -1,0 +1,240 @@
+"""`aqualvs doctor`: whether machine, stream and autopilot are ready, in words."""
+
+import importlib.metadata
+import importlib.resources
+import itertools
+import os
+import platform
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from aqualvs import __version__
+from aqualvs.app.check_finding import Finding, Severity, findings_table
+from aqualvs.app.demo import bundled_dive
+from aqualvs.errors import AqualvsError
+from aqualvs.live.sources import open_source
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanning.scan import Frame
+
+EXIT_READY, EXIT_NOT_READY = 0, 2
+
+_EXTRAS = {
+    "mavlink": (("pymavlink",), "MAVLink, .tlog and .BIN logs"),
+    "dds": (("cyclonedds",), "ROS 2 without ROS"),
+    "foxglove": (("foxglove-sdk",), "Foxglove live"),
+    "dashboard": (("starlette", "uvicorn", "websockets"), "the pilot's page"),
+    "bags": (("rosbags",), "ROS bags as source"),
+}
+"""Extra, the packages it brings, what they are for."""
+
+_N_FRAMES, _FRAME_RATE = 40, 25.0
+_LEAST_FREE_GB = 2.0
+_STREAM_S, _HEARTBEAT_S = 8.0, 6.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoctorRequest:
+    """What to look at beyond the machine itself.
+
+    Attributes
+    ----------
+    source : str or None
+        Stream, camera or file.
+    rig : Path or None
+        Rig that the pictures should fit.
+    mavlink : str or None
+        Address of an autopilot.
+    """
+
+    source: str | None = None
+    rig: Path | None = None
+    mavlink: str | None = None
+
+
+def run_doctor(request: DoctorRequest, console: Console | None = None) -> int:
+    """Look at everything, print what was found, and return the exit code.
+
+    Returns
+    -------
+    int
+        0 where all that was looked at works, 2 where something does not.
+    """
+    console = console or Console()
+    console.print(f"aqualvs {__version__}", style="bold", highlight=False)
+    looks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
+    if request.source is not None:
+        looks.append(lambda: _stream(str(request.source), request.rig))
+    if request.mavlink is not None:
+        looks.append(lambda: _autopilot(str(request.mavlink)))
+    worst = Severity.OK
+    for look in looks:
+        found = list(_guarded(look))
+        console.print(findings_table(found))
+        if any(finding.severity is Severity.BAD for finding in found):
+            worst = Severity.BAD
+    return EXIT_NOT_READY if worst is Severity.BAD else EXIT_READY
+
+
+def _guarded(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    try:
+        yield from look()
+    except AqualvsError as fault:
+        yield Finding(Severity.BAD, str(fault))
+
+
+def _machine() -> Iterator[Finding]:
+    cores = os.cpu_count() or 1
+    words = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
+    yield Finding(Severity.OK if cores > 1 else Severity.WARN, words)
+    free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
+    if free_gb < _LEAST_FREE_GB:
+        yield Finding(
+            Severity.WARN, f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour"
+        )
+
+
+def _packages() -> Iterator[Finding]:
+    for extra, (packages, purpose) in _EXTRAS.items():
+        missing = [name for name in packages if not _installed(name)]
+        if missing:
+            yield Finding(
+                Severity.WARN,
+                f"{purpose}: {', '.join(missing)} missing; pip install 'aqualvs[{extra}]'",
+            )
+        else:
+            told = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+            yield Finding(Severity.OK, f"{purpose}: {told}")
+
+
+def _installed(package: str) -> bool:
+    try:
+        importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _pipeline() -> Iterator[Finding]:
+    """Decode and measure the bundled dive."""
+    with importlib.resources.as_file(bundled_dive()) as folder:
+        rig = load_rig(folder / "rig.yaml")
+        with open_source(folder / "dive.mp4") as source:
+            frames = list(itertools.islice(source, _N_FRAMES))
+        yield Finding(Severity.OK, f"H.264 decoded: {len(frames)} frames of the bundled dive")
+        yield _speed(rig, frames)
+
+
+def _speed(rig: Rig, frames: list[Frame]) -> Finding:
+    began = time.perf_counter()
+    scanner = Scanner(rig)
+    scanner.process(frames[0])
+    ready_s = time.perf_counter() - began
+    times, n_valid = [], 0
+    for frame in frames:
+        began = time.perf_counter()
+        n_valid += bool(scanner.process(frame).posture)
+        times.append(time.perf_counter() - began)
+    middle = statistics.median(times)
+    width, height = rig.size_px
+    words = (
+        f"posture in {n_valid} of {len(frames)} frames; {1e3 * middle:.1f} ms a frame of "
+        f"{width}x{height} px, first after {ready_s:.1f} s"
+    )
+    if n_valid < 0.9 * len(frames):
+        return Finding(Severity.BAD, f"{words}; the installation is broken, install aqualvs again")
+    if middle > 0.5 / _FRAME_RATE:
+        return Finding(Severity.WARN, f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
+    return Finding(Severity.OK, words)
+
+
+def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
+    """Take frames for a few seconds."""
+    rig = None if rig_file is None else load_rig(rig_file)
+    frames, span_s, health = _received(where)
+    if not frames:
+        yield Finding(
+            Severity.BAD,
+            f"{where}: no picture in {_STREAM_S:.0f} s ({health}); is the sender on, its address "
+            "this machine's, the port open in the firewall?",
+        )
+        return
+    height, width = frames[-1].luma.shape
+    lost = frames[-1].index - frames[0].index + 1 - len(frames)
+    rate = (len(frames) - 1) / span_s if span_s > 0 else 0.0
+    severity = Severity.WARN if lost else Severity.OK
+    yield Finding(
+        severity, f"{where}: {width}x{height} px, {rate:.1f} frames a second, {lost} lost"
+    )
+    if rig is not None:
+        yield _fit(rig, frames)
+
+
+def _received(where: str) -> tuple[list[Frame], float, str]:
+    """Return the frames of a few seconds, the time between first and last, and the feed's words."""
+    from aqualvs.live.frame_reader import FrameReader
+    from aqualvs.live.mailbox import Mailbox
+    from aqualvs.live.sources.opening import open_feed
+
+    feed, mailbox = open_feed(where, realtime=True), Mailbox()
+    frames: list[Frame] = []
+    arrived_ns: list[int] = []
+    with FrameReader(feed, mailbox) as reader:
+        end = time.monotonic() + _STREAM_S
+        while time.monotonic() < end and len(frames) < 2 * _N_FRAMES and not mailbox.exhausted:
+            arrival = mailbox.take(0.2)
+            if arrival is not None:
+                frames.append(arrival.frame)
+                arrived_ns.append(arrival.arrived_ns)
+        words = reader.health().detail
+    if reader.fault is not None and not frames:
+        raise reader.fault
+    span_s = 1e-9 * (arrived_ns[-1] - arrived_ns[0]) if arrived_ns else 0.0
+    return frames, span_s, words
+
+
+def _fit(rig: Rig, frames: list[Frame]) -> Finding:
+    height, width = frames[-1].luma.shape
+    if (width, height) != rig.size_px:
+        need = "x".join(map(str, rig.size_px))
+        return Finding(
+            Severity.BAD,
+            f"the rig {rig.name!r} has pictures of {need} px; set the camera to that mode, or "
+            "calibrate in this one",
+        )
+    scanner = Scanner(rig)
+    n_valid = sum(bool(scanner.process(frame).posture) for frame in frames)
+    words = f"posture in {n_valid} of {len(frames)} frames with the rig {rig.name!r}"
+    if not n_valid:
+        reason = scanner.process(frames[-1]).posture
+        return Finding(Severity.WARN, f"{words}: {getattr(reason, 'detail', '')}")
+    return Finding(Severity.OK, words)
+
+
+def _autopilot(address: str) -> Iterator[Finding]:
+    """Wait for the heartbeat of an autopilot."""
+    from aqualvs.live.mavlink_link import MavlinkLink
+
+    link = MavlinkLink(address)
+    try:
+        end = time.monotonic() + _HEARTBEAT_S
+        while link.autopilot() is None and time.monotonic() < end:
+            time.sleep(0.05)
+        heard, health = link.autopilot(), link.health()
+    finally:
+        link.close()
+    if heard is None:
+        yield Finding(
+            Severity.BAD,
+            f"{address}: no heartbeat of an autopilot in {_HEARTBEAT_S:.0f} s ({health.detail}); "
+            "add this machine as an endpoint in BlueOS, or check address and port",
+        )
+    else:
+        yield Finding(Severity.OK, f"{address}: {health.detail}")

@@ -1,0 +1,163 @@
+"""`aqualvs net`: the state of a net, from a dive or from a run of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aqualvs.app.disk import writing
+from aqualvs.app.net_pass import NetPass, NetRequest
+from aqualvs.app.outputs import (
+    NET_FILES,
+    NET_MAP_PNG,
+    POSTURE_CSV,
+    REPORT_HTML,
+    RUN_YAML,
+    recover,
+)
+from aqualvs.app.progress import progress
+from aqualvs.app.report import write_report
+from aqualvs.app.run import RunRequest, run_and_tell
+from aqualvs.app.run_inputs import scanner_options
+from aqualvs.app.stopping import StopSignals
+from aqualvs.app.stored_scans import check_stored, stored_scans
+from aqualvs.errors import OptionError, OutputError, SourceError
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import rig_from_mapping
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetSource:
+    """Where the net was seen, and where its state goes.
+
+    Attributes
+    ----------
+    source : str
+        Folder of a run, or a dive as `open_source` takes it.
+    rig, out : Path or None
+        Needed for a dive (a recording brings its rig). A run has its own rig, and its own folder is
+        the default.
+    target : str
+        As `aqualvs run` takes it; for a dive.
+    overwrite : bool
+        Whether what is already there may be replaced.
+    """
+
+    source: str
+    rig: Path | None = None
+    out: Path | None = None
+    target: str = "auto"
+    overwrite: bool = False
+
+
+def net(place: NetSource, request: NetRequest, tell: Callable[[str], object]) -> int:
+    """Find the state of a net, write it and tell it.
+
+    Returns
+    -------
+    exit_code : int
+        0, or 128 + signal if it was stopped: then the files tell of what came before.
+
+    Raises
+    ------
+    AqualvsError
+        If an input cannot be used, or a file not be written.
+    """
+    if (Path(place.source) / POSTURE_CSV).is_file():
+        return net_of_run(place, request, tell)
+    if place.out is None:
+        raise OptionError("--out: missing; give the folder in which the dive is to be run")
+    run = RunRequest(
+        source=place.source,
+        rig=place.rig,
+        out=place.out,
+        overwrite=place.overwrite,
+        scanner=scanner_options(place.target, "ridge", "none", "robust"),
+        chosen=frozenset() if place.target == "auto" else frozenset({"target"}),
+        net=request,
+    )
+    return run_and_tell(run, tell)
+
+
+def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], object]) -> int:
+    """Find the state of a net from a run that is on disk; one that was killed is completed first.
+
+    Returns
+    -------
+    exit_code : int
+        0, or 128 + signal if it was stopped: then the files tell of what came before.
+
+    Raises
+    ------
+    AqualvsError
+        If the run cannot be read, or a file not be written.
+    """
+    run_folder = Path(place.source)
+    folder = place.out or run_folder
+    if place.rig is not None:
+        raise OptionError(
+            f"--rig {place.rig}: {run_folder} is a run and has its rig; leave --rig out"
+        )
+    if recover(run_folder):
+        tell(f"{run_folder}: points completed from the journal of a run that was killed")
+    check_stored(run_folder)
+    content = _run_file(run_folder)
+    net = NetPass(_rig(run_folder, content), request)
+    _prepare(folder, overwrite=place.overwrite)
+    with StopSignals() as stop, progress(str(run_folder), _n_frames(content)) as tick:
+        for scan in stored_scans(run_folder):
+            net.add(scan)
+            tick(1)
+            if stop.caught:
+                break
+    result = net.write(folder, _video(content))
+    for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
+        tell(line)
+    if stop.caught:
+        tell(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
+    if folder == run_folder and (run_folder / REPORT_HTML).exists():
+        tell(f"report: {write_report(run_folder)}")
+    return stop.exit_code
+
+
+def _prepare(folder: Path, *, overwrite: bool) -> None:
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        found = [folder / name for name in NET_FILES if (folder / name).exists()]
+        if found and not overwrite:
+            raise OutputError(
+                f"{folder}: already holds the state of a net ({found[0].name}); choose another "
+                "folder or add --overwrite"
+            )
+
+
+def _run_file(run_folder: Path) -> dict[str, Any]:
+    path = run_folder / RUN_YAML
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as fault:
+        raise SourceError(
+            f"{path}: cannot be read, and the rig with it; run the dive again"
+        ) from fault
+    if not isinstance(content, dict) or not isinstance(content.get("rig"), dict):
+        raise SourceError(f"{path}: holds no rig; run the dive again")
+    return content
+
+
+def _rig(run_folder: Path, content: dict[str, Any]) -> Rig:
+    return rig_from_mapping(content["rig"], source_name=str(run_folder / RUN_YAML))
+
+
+def _n_frames(content: dict[str, Any]) -> int | None:
+    summary = content.get("summary")
+    count = summary.get("n_frames") if isinstance(summary, dict) else None
+    return count if isinstance(count, int) else None
+
+
+def _video(content: dict[str, Any]) -> Path | None:
+    """Return the dive's video, if it is still there."""
+    source = content.get("source")
+    path = source.get("path") if isinstance(source, dict) else None
+    return Path(path) if isinstance(path, str) and Path(path).is_file() else None

@@ -1,0 +1,183 @@
+"""The net's condition over a dive: from scans, one by one, to the files that tell of it."""
+
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aqualvs import __version__
+from aqualvs.app.disk import writing
+from aqualvs.app.net_log import LaidLog, lay_log, open_log
+from aqualvs.app.net_map import draw_map
+from aqualvs.app.net_places import place_net
+from aqualvs.app.net_seen import DivePostures
+from aqualvs.app.net_tables import (
+    HOLE_COLUMNS,
+    NET_COLUMNS,
+    hole_rows,
+    stretch_rows,
+    write_geojson,
+    write_table,
+)
+from aqualvs.app.net_wall import NetWall, unroll
+from aqualvs.app.net_words import net_facts, net_lines
+from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG, NET_MAP_SVG
+from aqualvs.errors import OptionError
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.net_condition import NetCondition, NetConditionOptions
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Label, Scan
+
+# The posture is that of a net if so much of what it rests on is net.
+_NET_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetRequest:
+    """What to find out about a net.
+
+    Attributes
+    ----------
+    twine_mm : float or None
+        Diameter of the bare twine, where it is known.
+    stretch_m : float
+        Length of a stretch of net.
+    log : Path or None
+        The vehicle's log.
+    log_offset_s : float or None
+        Its clock minus the dive's, where it is known.
+    """
+
+    twine_mm: float | None = None
+    stretch_m: float = NetConditionOptions().stretch
+    log: Path | None = None
+    log_offset_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be."""
+        for option, value in (("twine-mm", self.twine_mm), ("stretch-m", self.stretch_m)):
+            if value is not None and not 0.0 < value < np.inf:
+                raise OptionError(f"--{option} {value:g}: must be positive; correct it")
+        if self.log_offset_s is not None and not np.isfinite(self.log_offset_s):
+            raise OptionError(f"--log-offset-s {self.log_offset_s:g}: give a number of seconds")
+
+    def options(self) -> NetConditionOptions:
+        """Return the options of the evaluation."""
+        twine = None if self.twine_mm is None else 1e-3 * self.twine_mm
+        return NetConditionOptions(stretch=self.stretch_m, twine=twine)
+
+    def facts(self) -> dict[str, Any]:
+        """Return them for the files that are written."""
+        return {"twine_mm": self.twine_mm, "stretch_m": self.stretch_m}
+
+
+@dataclass(frozen=True, slots=True)
+class NetResult:
+    """What was found of a net and written.
+
+    Attributes
+    ----------
+    wall : NetWall
+        Stretches and holes on the unrolled net.
+    lines : list of str
+        The summary in words.
+    log : LaidLog or None
+        The vehicle's log.
+    """
+
+    wall: NetWall
+    lines: list[str]
+    log: LaidLog | None
+
+
+class NetPass:
+    """Takes a dive's scans in turn, and writes what they say of the net.
+
+    Parameters
+    ----------
+    rig : Rig
+        That the scans were made with.
+    request : NetRequest
+        What to find out; its log is read at once.
+
+    Raises
+    ------
+    AqualvsError
+        If the log cannot be read.
+    """
+
+    def __init__(self, rig: Rig, request: NetRequest) -> None:
+        self._rig, self._request = rig, request
+        self._log = open_log(request.log, request.log_offset_s)
+        self._condition = NetCondition(rig, request.options())
+        self._postures = [array("d") for _ in range(4)]
+        self._n_frames = 0
+
+    def add(self, scan: Scan) -> None:
+        """Take the next scan; what is not a net is passed over."""
+        self._n_frames += 1
+        posture = scan.posture
+        if not isinstance(posture, Posture) or not _is_net(scan):
+            return
+        values = (scan.time_s, posture.range, posture.pitch, posture.yaw)
+        for column, value in zip(self._postures, values, strict=True):
+            column.append(value)
+        self._condition.add(scan)
+
+    def write(self, folder: Path, video: Path | None = None) -> NetResult:
+        """Finish, write the files of `NET_FILES` and return what was found.
+
+        Parameters
+        ----------
+        folder : Path
+            That exists.
+        video : Path or None
+            Of the dive; its clock may help to lay the log on it.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written.
+        """
+        self._condition.finish()
+        stretches, holes = self._condition.stretches, self._condition.holes
+        postures = DivePostures(*(np.array(column) for column in self._postures))
+        log = None
+        if self._log is not None:
+            log = lay_log(self._log, postures, self._request.log_offset_s, video)
+        places = place_net(stretches, holes, postures, log.places if log else None)
+        wall = unroll(stretches, holes, places, self._rig)
+        area = self._condition.area
+        facts = {
+            "version": __version__,
+            "options": self._request.facts(),
+            "log": None if log is None else log.facts(),
+            "summary": net_facts(wall, area, self._n_frames, len(postures.time_s)),
+        }
+        with writing(folder):
+            write_net_files(folder, wall, facts)
+        lines = net_lines(wall, area, self._n_frames)
+        if log is not None:
+            lines += [*log.log.notes, log.words()]
+        return NetResult(wall, lines, log)
+
+
+def write_net_files(folder: Path, wall: NetWall, facts: dict[str, Any]) -> None:
+    """Write tables first, pictures last.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    write_table(folder / NET_CSV, NET_COLUMNS, stretch_rows(wall))
+    write_table(folder / HOLES_CSV, HOLE_COLUMNS, hole_rows(wall))
+    write_geojson(folder / NET_GEOJSON, wall, facts)
+    draw_map(wall, [folder / NET_MAP_PNG, folder / NET_MAP_SVG])
+
+
+def _is_net(scan: Scan) -> bool:
+    labels = scan.points.label[scan.points.used]
+    return bool(np.count_nonzero(labels == Label.NET) > _NET_SHARE * len(labels))

@@ -1,0 +1,143 @@
+"""`dive.mcap`: the recording that a run writes on request."""
+
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from aqualvs.app.disk import writing
+from aqualvs.app.outputs import RUN_FILES
+from aqualvs.app.run_replay import Replay
+from aqualvs.app.run_water import WaterFollowingScanner
+from aqualvs.errors import OptionError, OutputError
+from aqualvs.live.health import Health
+from aqualvs.live.recorder import RecorderOptions, Recording
+from aqualvs.live.sample import Instants, LiveSample
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.search import SearchAxis
+from aqualvs.scanning.stripe import Returns
+
+DIVE_MCAP = "dive.mcap"
+
+Measured = tuple[Rig, Scan, dict[SearchAxis, Returns]]
+
+
+class ScansFrames(Protocol):
+    """What a run needs of a scanner."""
+
+    def process(self, frame: Frame) -> Scan:
+        """Return the scan of one frame."""
+
+
+class RunMcap:
+    """Writes `dive.mcap` while a run goes on, or does nothing; a context manager.
+
+    Parameters
+    ----------
+    folder : Path
+    rig : Rig
+        For frames that were lost.
+    options : ScannerOptions
+        That the run measures with.
+    wanted : bool
+        False makes it measure frames and nothing else.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the file cannot be written.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, options: ScannerOptions, *, wanted: bool) -> None:
+        self._path, self._rig = folder / DIVE_MCAP, rig
+        self._began_ns = time.time_ns()
+        self._recording: Recording | None = None
+        if wanted:
+            with writing(self._path):
+                self._recording = Recording(self._path, RecorderOptions(scanner=options))
+
+    def process(self, scanner: ScansFrames, frame: Frame) -> Scan:
+        """Return the scan of a frame; it is recorded with its stripes."""
+        if self._recording is None:
+            return scanner.process(frame)
+        rig, scan, returns = _measured(scanner, frame)
+        self._write(rig, scan, returns)
+        return scan
+
+    def lost(self, scan: Scan) -> None:
+        """Record the scan of a frame that was lost."""
+        if self._recording is not None:
+            self._write(self._rig, scan, {})
+
+    def _write(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> None:
+        at_ns = round(1e9 * scan.time_s)
+        sample = LiveSample(
+            rig=rig,
+            scan=scan,
+            returns=returns,
+            frame=None,
+            # As if the dive had begun with the run.
+            utc_ns=self._began_ns + at_ns,
+            instants=Instants(at_ns, at_ns, at_ns),
+            filtered=None,
+            health=Health(),
+        )
+        if self._recording is not None:
+            with writing(self._path):
+                self._recording.write(sample)
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file; readable in any case."""
+        if self._recording is not None:
+            with writing(self._path):
+                self._recording.close()
+
+
+def prepare_mcap(folder: Path, source: str, *, overwrite: bool) -> None:
+    """Make sure that a recording can be written to a folder, or that none of another run is there.
+
+    Raises
+    ------
+    OptionError
+        If the run's own source would be replaced.
+    OutputError
+        If the folder holds a recording and `overwrite` is not set, or it cannot be removed.
+    """
+    path = Path(source)
+    is_ours = path.is_file() and path.name in (DIVE_MCAP, *RUN_FILES)
+    if is_ours and path.resolve().parent == folder.resolve():
+        raise OptionError(f"{path}: is what the run reads; write to another folder")
+    old = folder / DIVE_MCAP
+    if not old.exists():
+        return
+    if not overwrite:
+        raise OutputError(
+            f"{folder}: already holds a run ({DIVE_MCAP}); choose another folder or add --overwrite"
+        )
+    with writing(old):
+        old.unlink()
+
+
+def _measured(scanner: ScansFrames, frame: Frame) -> Measured:
+    """Return the scan of a frame, and what it was made with and of."""
+    if isinstance(scanner, Replay):
+        return scanner.measured(frame)
+    if isinstance(scanner, WaterFollowingScanner):
+        if scanner.is_due(frame):
+            scanner.look(frame)
+        scanner = scanner.scanner
+    if not isinstance(scanner, Scanner):
+        raise TypeError(f"{type(scanner).__name__} does not tell its stripes")
+    returns = scanner.detect(frame)
+    return scanner.rig, scanner.measure(frame.index, frame.time_s, returns), returns

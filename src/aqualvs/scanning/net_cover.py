@@ -1,0 +1,219 @@
+"""How much of the net its strands cover, and what dashes of one kind look like.
+
+The share of a line that is lit is, in expectation, the share of the area that strands cover
+(Delesse, C. R. Acad. Sci. 25 (1847) 544; Rosiwal, Verh. k. k. geol. Reichsanst. 1898, 143). What
+the detector adds to every dash is taken off, as `net_twine` says it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.scanning.net_dashes import NetView
+from aqualvs.scanning.net_hypotheses import Mesh
+from aqualvs.scanning.net_lattice import NetLattice
+from aqualvs.scanning.net_track import Fit
+from aqualvs.scanning.net_twine import DashKind, Twine
+
+# Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
+_LEAST_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
+_LEAST_DASHES = 6
+# Growth lengthens dashes, and makes them differ; up to this share of all light on a kind's dashes
+# they are bare still, less the more they differ. Measured on simulated dives.
+_BARE_SHARE, _LESS_BARE, _LEAST_BARE = 0.4, 0.63, 0.12
+_SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
+_WIDTH_QUANTILE = 0.4
+# Sines of smaller angles say no more than that a strand runs along the line.
+_NEARLY_ALONG = 0.02
+# Dashes of more search lines may be lost (`segments`).
+_MOST_LINES = 20.0
+_BLOCKS = 6
+# A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
+# bars long.
+_TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class LaidView:
+    """A frame on which the lattice was laid."""
+
+    view: NetView
+    fit: Fit
+
+
+@dataclass(frozen=True, slots=True)
+class _Angles:
+    """How a laser's line and search lines lie to strands; shapes alike.
+
+    Attributes
+    ----------
+    across : array
+        Sine of the angle between line and strand.
+    slant : array
+        As in `DashKind`.
+    square : array
+        Sine of the angle between line and search lines.
+    """
+
+    across: FloatArray
+    slant: FloatArray
+    square: FloatArray
+
+    @classmethod
+    def of(cls, line: FloatArray, search: FloatArray, normal: FloatArray) -> "_Angles":
+        beside = np.stack([-line[..., 1], line[..., 0]], axis=-1)
+        across = np.maximum(np.abs(np.sum(line * normal, axis=-1)), _NEARLY_ALONG)
+        square = np.maximum(np.abs(np.sum(search * beside, axis=-1)), _NEARLY_ALONG)
+        slant = np.abs(np.sum(search * normal, axis=-1)) / (across * square)
+        return cls(across, slant, square)
+
+
+def _angles(lattice: NetLattice, one: LaidView) -> _Angles:
+    """Of every dash."""
+    laser = one.view.dashes.laser
+    normal = lattice.normals[one.fit.family]
+    return _Angles.of(one.view.direction[laser], one.view.search[laser], normal)
+
+
+def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind]:
+    """Sort whole dashes that lie clearly on one strand by laser and family."""
+    rows = [_rows(lattice, one) for one in frames]
+    table = np.concatenate(rows) if rows else np.empty((0, 8))
+    kinds = np.unique(table[:, :2], axis=0)
+    each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
+    each = [mine for mine in each if len(mine) >= _LEAST_DASHES]
+    # Long dashes against short ones; on slanted strands the light sheet evens them out.
+    spreads = [
+        np.log(_length_at(mine, _LONG) / _length_at(mine, _SHORT))
+        for mine in each
+        if np.median(mine[:, 3]) < _SLANTED
+    ]
+    spread = float(np.median(spreads)) if spreads else _USUAL_SPREAD
+    return [_kind(mine, spread) for mine in each]
+
+
+def _kind(mine: FloatArray, spread: float) -> DashKind:
+    """Take dashes (rows as `_rows` makes them) together."""
+    across, slant, height, step = np.median(mine[:, [2, 3, 6, 7]], axis=0)
+    share = float(np.clip(_BARE_SHARE - _LESS_BARE * spread, _LEAST_BARE, _BARE_SHARE))
+    return DashKind(
+        laser=int(mine[0, 0]),
+        family=int(mine[0, 1]),
+        across=float(across),
+        slant=float(slant),
+        length=_length_at(mine, share),
+        width=float(np.quantile(mine[:, 5], _WIDTH_QUANTILE)),
+        height=float(height),
+        step=float(step),
+        spread=spread,
+        count=len(mine),
+    )
+
+
+def _length_at(mine: FloatArray, share: float) -> float:
+    """Length up to which dashes have this share of all light; so fragments count little."""
+    ordered = np.sort(mine[:, 4])
+    light = np.cumsum(ordered)
+    return float(ordered[np.searchsorted(light, share * light[-1])])
+
+
+def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
+    """(laser, family, across, slant, length, width, height, step) of a frame's clear dashes."""
+    pitch, dashes, fit = lattice.pitch, one.view.dashes, one.fit
+    angles = _angles(lattice, one)
+    clear = dashes.whole & (fit.off < _ON_STRAND * pitch[fit.family])
+    clear &= angles.across > _LEAST_ACROSS
+    if lattice.mesh is Mesh.FOUR_SIDED:
+        clear &= fit.clear > _CLEAR * pitch.min()
+    columns = [
+        dashes.laser,
+        fit.family,
+        angles.across,
+        angles.slant,
+        dashes.length,
+        dashes.width * angles.square,
+        dashes.height,
+        one.view.step[dashes.laser],
+    ]
+    return np.stack([column[clear].astype(np.float64) for column in columns], axis=1)
+
+
+def measure_solidity(
+    lattice: NetLattice, twine: Twine, frames: Sequence[LaidView]
+) -> tuple[float, float] | None:
+    """Share of the sound net that strands and growth cover, and its standard deviation.
+
+    Of hexagons, whose strands every laser crosses in three directions, the lasers' lines as a
+    whole. Of meshes with four sides family by family, each from the lasers that cross it at an
+    angle at which no dash is lost.
+    """
+    counts = np.ones((len(frames[0].view.step), len(lattice.waves)), np.bool_)
+    if lattice.mesh is Mesh.FOUR_SIDED:
+        counts = _reliable(lattice, twine, frames[len(frames) // 2].view)
+    shape = (len(frames), *counts.shape)
+    body, error, seen = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
+    for i, one in enumerate(frames):
+        dashes, family = one.view.dashes, one.fit.family
+        angles, step = _angles(lattice, one), one.view.step[dashes.laser]
+        excess, sigma = twine.excess(angles.across, angles.slant, step)
+        # A dash that is cut off, or lies along the edge of the light, has its share of the halo.
+        share = np.minimum(dashes.length / twine.usual(angles.across, angles.slant, step), 1.0)
+        share = np.where(dashes.whole, share, 0.5 * share)
+        np.add.at(body[i], (dashes.laser, family), dashes.length - excess * share)
+        np.add.at(error[i], (dashes.laser, family), sigma * share)
+        seen[i] = sound_length(lattice, one.view)
+    if not np.all(np.any(counts & (seen.sum(axis=0) > 0.0)[:, None], axis=0)):
+        return None
+    solidity = _family_sum(body, seen, counts)
+    blocks = np.array_split(np.arange(len(frames)), min(_BLOCKS, len(frames)))
+    shares = [_family_sum(body[b], seen[b], counts) for b in blocks]
+    chance = float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else 0.1
+    sigma_solidity = float(np.hypot(chance, _family_sum(error, seen, counts)))
+    return float(np.clip(solidity, 0.0, 1.0)), sigma_solidity
+
+
+def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
+    """Lines of each family that the lasers' lines cross in a metre, shape (L, F)."""
+    known = np.isfinite(view.direction)
+    direction = np.where(known, view.direction, lattice.normals[0])
+    return np.asarray(np.abs(direction @ lattice.waves.T))
+
+
+def long_gaps(lattice: NetLattice, view: NetView) -> BoolArray:
+    """Mark the gaps of a frame that are longer than the lattice allows."""
+    longest = 1.0 / crossing_rates(lattice, view).max(axis=1)
+    if lattice.mesh is Mesh.SIX_SIDED:
+        longest = np.full(len(view.step), _HEXAGON_GAP * lattice.bar)
+    return np.asarray(view.gaps.length > _TOO_LONG * longest[view.gaps.laser])
+
+
+def sound_length(lattice: NetLattice, view: NetView) -> FloatArray:
+    """Metres of each laser's line (L,) that could be seen, without gaps that are too long."""
+    length, long = np.zeros(len(view.step)), long_gaps(lattice, view)
+    np.add.at(length, view.span_laser, view.span[:, 1] - view.span[:, 0])
+    np.subtract.at(length, view.gaps.laser[long], view.gaps.length[long])
+    return length
+
+
+def _family_sum(body: FloatArray, seen: FloatArray, counts: BoolArray) -> float:
+    """Covered share of the lines, added up over the families: (frames, lasers, families) in."""
+    covered = np.sum(body.sum(axis=0) * counts, axis=0)
+    looked = np.sum(seen.sum(axis=0)[:, None] * counts, axis=0)
+    return float(np.sum(covered / np.maximum(looked, 1e-9)))
+
+
+def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
+    """Which lasers (L) show all crossings of which families (F).
+
+    Light that runs along a strand for many search lines is taken for another laser's stripe. Where
+    no laser crosses a family well, the one that does so best counts.
+    """
+    line, search = np.nan_to_num(view.direction), np.nan_to_num(view.search)
+    angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
+    lines = twine.usual(angles.across, angles.slant, view.step[:, None]) / view.step[:, None]
+    good: BoolArray = lines < _MOST_LINES
+    best = lines.argmin(axis=0)
+    good[best, np.arange(len(best))] = True
+    return good

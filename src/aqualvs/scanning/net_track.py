@@ -1,0 +1,317 @@
+"""Where the net's lattice lies in every frame, and so how the vehicle moved along the net.
+
+A lattice fixes the place of the net but for whole meshes; which one is taken follows from how the
+vehicle moved before (a Kalman filter with constant velocity). So the move from frame to frame must
+be foreseen to better than half a mesh: say how fast the vehicle goes where another sensor knows it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.scanning.net_dashes import Dashes
+from aqualvs.scanning.net_hypotheses import Mesh
+from aqualvs.scanning.net_lattice import NetLattice
+from aqualvs.scanning.net_spectrum import Crossings
+from aqualvs.scanning.net_waves import wave_sums
+
+# Harmonics of each family's wave; the strands' spacing leaves this share of each amplitude.
+_HARMONICS, _REGULAR = 3, 0.92
+# Shifts by up to so many cells to each side are tried, in so many steps: the cell around what is
+# expected, whatever its shape.
+_REACH, _TRIED = 0.75, 18
+# Matched filter: as a share of what perfect crossings would give, and in deviations of random ones.
+_LEAST_SHARE, _LEAST_DEVIATIONS = 0.4, 3.0
+_LEAST_CROSSINGS = 4
+# Newton's steps to the best shift, and what holds it where the crossings do not say (1/m²).
+_ROUNDS, _STIFF = 4, 100.0
+# Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and the
+# foot of the perpendicular on the net in one frame (m): the posture trembles.
+_VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
+# Where the place is not known to this any more, in metres, a new piece of track begins; after so
+# many seconds the velocity counts for nothing either.
+_LOST, _FORGOTTEN = 0.05, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How a frame's dashes lie on the lattice.
+
+    Attributes
+    ----------
+    family : int array, shape (N,)
+        Family whose strand is nearest to each dash.
+    strand : int array, shape (N,)
+        Number of that strand.
+    off : array, shape (N,)
+        Distance of the dash from it, in metres.
+    clear : array, shape (N,)
+        Distance from the nearest strand of any other family, in metres.
+    """
+
+    family: IntArray
+    strand: IntArray
+    off: FloatArray
+    clear: FloatArray
+
+    @property
+    def n_strands(self) -> int:
+        """Strands that the frame shows."""
+        return len(np.unique(np.stack([self.family, self.strand]), axis=1).T)
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """Where the lattice lies in one frame.
+
+    Attributes
+    ----------
+    place : array, shape (2,)
+        Of a knot (four-sided) or the middle of an opening (six-sided) in `net`, in metres; any
+        other one would serve as well.
+    information : array, shape (2, 2)
+        Inverse of its covariance; may be singular.
+    """
+
+    place: FloatArray
+    information: FloatArray
+
+
+class LatticeFitter:
+    """Lays a lattice onto frames.
+
+    Parameters
+    ----------
+    lattice : NetLattice
+        Of the frames.
+    """
+
+    def __init__(self, lattice: NetLattice) -> None:
+        self.lattice = lattice
+        self._waves, self._amplitude, step = _pattern(lattice)
+        share = np.arange(-_TRIED, _TRIED + 1) * (_REACH / _TRIED)
+        self._away = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) @ step
+        self._swings = np.exp(-2j * np.pi * (self._away @ self._waves.T))
+
+    def shift(
+        self,
+        crossings: Crossings,
+        expected: FloatArray | None = None,
+        precision: FloatArray | None = None,
+    ) -> Shift | None:
+        """Find where the lattice lies in a frame; None where its crossings do not show it.
+
+        Parameters
+        ----------
+        crossings : Crossings
+            Of the frame.
+        expected : array, shape (2,), optional
+            Where the lattice is expected; one shift of many alike is chosen by it.
+        precision : array, shape (2, 2), optional
+            How well that is known: inverse of its covariance.
+        """
+        if len(crossings.place) < _LEAST_CROSSINGS:
+            return None
+        expected = np.zeros(2) if expected is None else expected
+        precision = np.zeros((2, 2)) if precision is None else precision
+        sums = self._amplitude * _sums(crossings, self._waves)
+        here = sums * np.exp(-2j * np.pi * (self._waves @ expected))
+        prior = np.sum((self._away @ precision) * self._away, axis=1)
+        score = 2.0 * (self._swings @ here).real - 0.5 * prior
+        place = expected + self._away[np.argmax(score)]
+        for _ in range(_ROUNDS):
+            _, slope, information = self._about(sums, place)
+            place = place + np.linalg.solve(information + _STIFF * np.eye(2), slope)
+        match, _, information = self._about(sums, place)
+        full = len(crossings.place) * float(np.sum(self._amplitude**2))
+        if match < max(_LEAST_SHARE * full, _LEAST_DEVIATIONS * np.sqrt(0.5 * full)):
+            return None
+        return Shift(place, information)
+
+    def _about(
+        self, sums: NDArray[np.complex128], place: FloatArray
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Match at a shift; slope (2,) and information (2, 2) of the log-likelihood there."""
+        swung = sums * np.exp(-2j * np.pi * (self._waves @ place))
+        slope = 4.0 * np.pi * (swung.imag @ self._waves)
+        bend = np.maximum(swung.real, 0.0)
+        information = 8.0 * np.pi**2 * (self._waves.T * bend) @ self._waves
+        return float(swung.real.sum()), slope, information
+
+    def assign(self, dashes: Dashes, place: FloatArray) -> Fit:
+        """Give each dash to the nearest strand, the lattice lying at a place (2,)."""
+        lattice = self.lattice
+        turns = (dashes.place - place) @ lattice.waves.T
+        distance = np.abs(turns - np.rint(turns)) * lattice.pitch
+        rows = np.arange(len(dashes))
+        family = np.argmin(distance, axis=1)
+        off = distance[rows, family]
+        distance[rows, family] = np.inf
+        return Fit(
+            family=family,
+            strand=np.rint(turns[rows, family]).astype(np.int64),
+            off=off,
+            clear=distance.min(axis=1),
+        )
+
+
+def _sums(crossings: Crossings, waves: FloatArray) -> NDArray[np.complex128]:
+    """Return the sums of waves over crossings, less what evenly spread ones would give."""
+    seen = np.bincount(crossings.laser, minlength=len(crossings.length))
+    per_metre = seen / np.maximum(crossings.length, 1e-9)
+    length = np.hypot(*(crossings.end - crossings.begin).T)
+    real, imaginary = wave_sums(
+        crossings.place,
+        crossings.begin,
+        crossings.end,
+        length * per_metre[crossings.span_laser],
+        waves,
+    )
+    return np.asarray(real + 1j * imaginary)
+
+
+def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Plane waves that a lattice is made of, about a knot or the middle of a six-sided opening.
+
+    Returns
+    -------
+    waves : array, shape (Q, 2)
+        Wave vectors.
+    amplitude : array, shape (Q,)
+        Of one crossing.
+    step : array, shape (2, 2)
+        Rows take the lattice to itself.
+    """
+    basis = lattice.basis
+    step = _inverse(basis).T
+    if lattice.mesh is Mesh.FOUR_SIDED:
+        number = np.arange(1.0, _HARMONICS + 1.0)
+        waves = np.concatenate([number[:, None] * basis[0], number[:, None] * basis[1]])
+        return waves, 0.5 * np.tile(_REGULAR**number, 2), step
+    # The shells of the reciprocal lattice; of a wave and its mirror one.
+    first = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
+    second = np.array([[1.0, 1.0], [2.0, -1.0], [1.0, -2.0]])
+    waves = np.concatenate([first, second, 2.0 * first, 2.0 * second]) @ basis
+    # Bars stand half way between middles, square to the way from one to the other.
+    ways = np.array([step[0], step[1], step[0] + step[1]])
+    bars = np.stack([-ways[:, 1], ways[:, 0]], axis=1) / np.sqrt(3.0)
+    each = np.cos(np.pi * waves @ ways.T) * np.sinc(waves @ bars.T)
+    return waves, _REGULAR * each.mean(axis=1), step
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+def _at_first() -> FloatArray:
+    """Covariance of place and velocity where a piece of track begins."""
+    return np.diag([_FOOT**2, _FOOT**2, _VELOCITY**2, _VELOCITY**2])
+
+
+@dataclass(slots=True)
+class NetTrack:
+    """Keeps count of how far the net has moved past the vehicle.
+
+    Attributes
+    ----------
+    place : array, shape (2,)
+        Where the vehicle's foot on the net is now on the net itself: right and up of where it was
+        at first, in metres.
+    velocity : array, shape (2,)
+        Metres a second.
+    path : float
+        Metres passed in all.
+    piece : int
+        Counts up whenever the track was lost: places of different pieces have nothing in common.
+    """
+
+    path: float = 0.0
+    piece: int = 0
+    _state: FloatArray = field(default_factory=lambda: np.zeros(4))
+    _covariance: FloatArray = field(default_factory=_at_first)
+    _time_s: float = 0.0
+    _origin: FloatArray | None = None
+    _lattice: NetLattice | None = None
+
+    @property
+    def place(self) -> FloatArray:
+        """As above."""
+        return self._state[:2].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """As above."""
+        return self._state[2:].copy()
+
+    def step(
+        self,
+        fitter: LatticeFitter,
+        crossings: Crossings,
+        time_s: float,
+        velocity: FloatArray | None = None,
+    ) -> Shift | None:
+        """Take the next frame; None where it does not tell where the net lies.
+
+        Parameters
+        ----------
+        fitter : LatticeFitter
+            With the stretch's lattice.
+        crossings : Crossings
+            Of the frame.
+        time_s : float
+            Of the frame.
+        velocity : array, shape (2,), optional
+            Of the vehicle along the net, right and up, if another sensor knows it.
+        """
+        state, covariance = self._ahead(time_s, velocity)
+        if self._origin is None or covariance[:2, :2].trace() > _LOST**2:
+            return self._begin(fitter, crossings, time_s, state)
+        if self._lattice is not fitter.lattice:
+            shift = fitter.shift(crossings)
+            if shift is not None:
+                # The same net, measured anew: it lies where it is expected.
+                self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
+                self._take(state, covariance, time_s)
+            return shift
+        precision = _inverse(covariance[:2, :2] + _FOOT**2 * np.eye(2))
+        shift = fitter.shift(crossings, self._origin - state[:2], precision)
+        if shift is not None:
+            told = np.zeros((4, 4))
+            told[:2, :2] = shift.information @ _inverse(np.eye(2) + _FOOT**2 * shift.information)
+            covariance = _inverse(_inverse(covariance) + told)
+            miss = np.r_[self._origin - shift.place - state[:2], 0.0, 0.0]
+            self._take(state + covariance @ told @ miss, covariance, time_s)
+        return shift
+
+    def _ahead(self, time_s: float, velocity: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """State and covariance at a later time."""
+        dt = time_s - self._time_s
+        state, covariance = self._state.copy(), self._covariance.copy()
+        if velocity is not None:
+            state[2:] = velocity
+            covariance[2:, :2] = covariance[:2, 2:] = 0.0
+            covariance[2:, 2:] = _TOLD_VELOCITY**2 * np.eye(2)
+        move = np.eye(4)
+        move[:2, 2:] = dt * np.eye(2)
+        noise = np.outer([0.5 * dt**2, dt], [0.5 * dt**2, dt]) * _ACCELERATION**2
+        return move @ state, move @ covariance @ move.T + np.kron(noise, np.eye(2))
+
+    def _begin(
+        self, fitter: LatticeFitter, crossings: Crossings, time_s: float, state: FloatArray
+    ) -> Shift | None:
+        """Begin a piece of track, at the state to be expected if the one before is not long ago."""
+        shift = fitter.shift(crossings)
+        if shift is None:
+            return None
+        if self._origin is None or time_s - self._time_s > _FORGOTTEN:
+            state = np.r_[self.place, 0.0, 0.0]
+        self.piece += self._origin is not None
+        self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
+        self._take(state, _at_first(), time_s)
+        return shift
+
+    def _take(self, state: FloatArray, covariance: FloatArray, time_s: float) -> None:
+        self.path += float(np.hypot(*(state - self._state)[:2]))
+        self._state, self._covariance, self._time_s = state, covariance, time_s

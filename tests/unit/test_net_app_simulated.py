@@ -1,0 +1,113 @@
+"""The try-out dive `net_holes`: its log and truth agree with its scenes, and its holes are found.
+
+Scans come from the true lit points instead of pictures, which would take minutes to render.
+"""
+
+import csv
+
+import numpy as np
+import pytest
+
+from aqualvs.app import simulate as body
+from aqualvs.app.cli import main
+from aqualvs.app.outputs import RunOutputs
+from aqualvs.live.logs import VehiclePlaces, read_vehicle_log
+from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.vehicle_log import (
+    LEAD_S,
+    NET_BEARING,
+    NET_DEPTH,
+    write_hole_truth,
+    write_vehicle_log,
+)
+from net_cases import NetCamera
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("net_holes")
+
+
+@pytest.fixture(scope="module")
+def log_file(scenario, tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "vehicle.csv"
+    write_vehicle_log(scenario, path)
+    return path
+
+
+def rows(path):
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def test_the_log_lies_on_the_dive_as_the_docs_say(scenario, log_file):
+    """Bearing and depth of the plumb net come out of log and true posture, all the time."""
+    log = read_vehicle_log(log_file)
+    times = np.array(list(scenario.times()))
+    normals = np.array([scenario.scene_at(t).target_plane().normal for t in times])
+    yaw = np.arctan2(normals[:, 0], normals[:, 1])
+    pitch = np.arctan2(normals[:, 2], normals[:, 1])
+    places = VehiclePlaces(log, LEAD_S).at(times, yaw, pitch)
+    assert places.bearing_valid.all()
+    # The log's noise: 0.2 degrees and 5 mm.
+    assert np.abs(np.rad2deg(places.bearing - NET_BEARING)).max() < 1.0
+    assert np.abs(np.rad2deg(places.lean)).max() < 1.0
+    assert np.rad2deg(np.std(places.bearing)) == pytest.approx(0.17, abs=0.08)
+    middle = [
+        scenario.trajectory.pose_at(t, scenario.duration).inverse().translation for t in times
+    ]
+    assert places.depth == pytest.approx(NET_DEPTH - np.array(middle)[:, 2], abs=0.03)
+    begins, ends = log.span_s
+    assert (begins, ends) == pytest.approx((0.0, scenario.duration + 2 * LEAD_S), abs=0.2)
+
+
+def test_the_log_half_a_second_off_does_not_lie_on_the_dive(scenario, log_file):
+    """Guard of the test above: then the bearing of the net is no longer steady."""
+    times = np.array(list(scenario.times()))
+    normals = np.array([scenario.scene_at(t).target_plane().normal for t in times])
+    yaw = np.arctan2(normals[:, 0], normals[:, 1])
+    places = VehiclePlaces(read_vehicle_log(log_file), LEAD_S + 0.5).at(times, yaw)
+    assert np.rad2deg(np.std(places.bearing)) > 1.0
+
+
+def test_simulate_writes_log_and_holes_beside_a_dive_along_a_net(tmp_path, capsys):
+    short = tmp_path / "short.yaml"
+    short.write_text(
+        "duration_s: 0.04\nmotion: {range_mm: 500, slide_x_mm: [0, -10]}\n"
+        "net: {holes_mm: [[100, 50, 30]]}\n"
+    )
+    out = tmp_path / "dive"
+    body.simulate(str(short), None, out, print, overwrite=False)
+    names = ["dive.mp4", "rig.yaml", "truth.csv", "truth_holes.csv", "vehicle.csv"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    (hole,) = rows(out / "truth_holes.csv")
+    expected = {"right_m": 0.1, "up_m": 0.05, "diameter_mm": 60.0, "depth_m": NET_DEPTH - 0.05}
+    assert {name: float(hole[name]) for name in expected} == pytest.approx(expected)
+    said = capsys.readouterr().out
+    assert f"aqualvs net {out / 'run'} --log {out / 'vehicle.csv'} --log-offset-s 20" in said
+
+
+def test_the_holes_of_the_try_out_are_found_where_they_are(scenario, log_file, tmp_path):
+    """The first of them, to save time."""
+    rig = example_rig()
+    run, truth = tmp_path / "run", tmp_path / "truth_holes.csv"
+    run.mkdir()
+    write_hole_truth(scenario, truth)
+    camera = NetCamera(rig)
+    with RunOutputs(run, source={}, rig=rig_to_mapping(rig), options={}) as outputs:
+        for i, t in enumerate(t for t in scenario.times() if t < 3.6):
+            outputs.write(camera.scan(scenario.scene_at(t), t, i))
+    assert main(["net", str(run), "--log", str(log_file), "--log-offset-s", str(LEAD_S)]) == 0
+    found, true = rows(run / "holes.csv"), rows(truth)[:1]
+    assert len(found) == 1
+    for one, other in zip(found, true, strict=True):
+        # The middle of what three lasers saw of a hole is within two meshes of the hole's.
+        assert float(one["along_m"]) == pytest.approx(float(other["right_m"]), abs=0.05)
+        assert float(one["depth_m"]) == pytest.approx(float(other["depth_m"]), abs=0.06)
+        assert float(one["bearing_deg"]) == pytest.approx(float(other["bearing_deg"]), abs=0.5)
+        assert float(one["time_s"]) == pytest.approx(float(other["time_s"]), abs=0.8)
+        assert float(one["diameter_mm"]) == pytest.approx(float(other["diameter_mm"]), rel=0.45)
+    (stretch,) = rows(run / "net.csv")
+    assert float(stretch["bar_mm"]) == pytest.approx(25.0, rel=0.05)
+    assert float(stretch["fouling"]) > 0.02
