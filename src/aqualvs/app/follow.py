@@ -1,0 +1,220 @@
+"""`aqualvs follow --sim`: the loop in simulation, as a log, figures and a summary."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.app.disk import writing
+from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_rendered import RenderedEye
+from aqualvs.app.follow_report import RunFacts, summary_lines, write_report
+from aqualvs.app.follow_sim import Eye, SimulatedLoop, Timing
+from aqualvs.app.follow_sim_case import SimCase, sea, tuned_gains, vehicle_model
+from aqualvs.app.follow_sim_log import write_log
+from aqualvs.control.follow_log import FollowLog
+from aqualvs.control.gains_file import load_gains
+from aqualvs.control.mission import HoldMission, Mission
+from aqualvs.control.plan import load_plan
+from aqualvs.control.safety import SafetyLimits
+from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.errors import OptionError
+from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.net_motion import NetWall
+
+FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"
+_TELL_EVERY_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Aim:
+    """What the loop shall do: a plan file, or a range and yaw to hold.
+
+    Attributes
+    ----------
+    plan : Path or None
+    range : float or None
+        Metres; 0.6 if neither it nor a plan is given.
+    yaw : float
+        Radians.
+    """
+
+    plan: Path | None = None
+    range: float | None = None
+    yaw: float = 0.0
+
+    def mission(self, working_range: tuple[float, float]) -> tuple[Mission, SafetyLimits, Setpoint]:
+        """Return the mission, the limits of the safety gate, and the first setpoint.
+
+        Raises
+        ------
+        OptionError
+            If both are given, the plan cannot be used, or the range cannot be measured.
+        """
+        holder = SetpointHolder(working_range)
+        if self.plan is not None:
+            if self.range is not None or self.yaw:
+                raise OptionError("--plan: brings its own range and yaw; leave --range, --yaw out")
+            plan = load_plan(self.plan)
+            holder.put(plan.setpoint)
+            return plan.mission(), plan.limits, plan.setpoint
+        setpoint = Setpoint(_DEFAULT_RANGE if self.range is None else self.range, self.yaw)
+        holder.put(setpoint)
+        return HoldMission(setpoint), SafetyLimits(), setpoint
+
+
+_DEFAULT_RANGE = 0.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimRequest:
+    """What to simulate.
+
+    Attributes
+    ----------
+    out : Path
+        Folder to write.
+    aim : Aim
+    vehicle : str
+        A name of `VEHICLE_NAMES`.
+    gains : str or None
+        Gains file, or a vehicle's name; tuned for the vehicle if left out.
+    pilot_gain : float
+        ArduSub's.
+    current, current_to : float
+        Speed in m/s, and where it flows, in radians clockwise from the way one looks at the net.
+    waves : float
+        Amplitude in metres.
+    cage_radius : float
+        Of a round net seen from inside, in metres; 0 is a flat one.
+    net_sway : float
+        Amplitude of the net's own motion to and fro, in metres.
+    seconds : float
+    fps : float
+        Frames a second.
+    rendered : bool
+        Render every frame and measure in it, instead of sampling the scanner's noise.
+    seed : int
+    """
+
+    out: Path
+    aim: Aim
+    vehicle: str = "bluerov2"
+    gains: str | None = None
+    pilot_gain: float = 0.5
+    current: float = 0.3
+    current_to: float = math.radians(60.0)
+    waves: float = 0.1
+    cage_radius: float = 0.0
+    net_sway: float = 0.0
+    seconds: float = 60.0
+    fps: float = 25.0
+    rendered: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated.
+
+        Raises
+        ------
+        OptionError
+            Naming the value.
+        """
+        if not self.seconds >= _LEAST_S:
+            raise OptionError(f"--seconds {self.seconds:g}: choose at least {_LEAST_S:g}")
+        if self.cage_radius and not self.cage_radius >= _LEAST_RADIUS:
+            raise OptionError(
+                f"--cage-radius {self.cage_radius:g}: choose at least {_LEAST_RADIUS:g} m, or 0 "
+                "for a flat net"
+            )
+        if not (0.0 <= self.current <= 2.0 and 0.0 <= self.net_sway <= 1.0):
+            raise OptionError(
+                f"--current {self.current:g} m/s, --net-sway {self.net_sway:g} m: choose 0 to 2, "
+                "and 0 to 1"
+            )
+
+
+_LEAST_S, _LEAST_RADIUS = 1.0, 2.0
+
+
+def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:
+    """Run the loop, write log, figures and page, and tell the summary; returns 0.
+
+    Raises
+    ------
+    AqualvsError
+        If an input cannot be used, or the folder cannot be written.
+    """
+    rig = example_rig()
+    mission, limits, setpoint = request.aim.mission(rig.working_range)
+    case = _case(request, limits, setpoint)
+    with writing(request.out):
+        request.out.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng([request.seed, 53])
+    eye: Eye = SampledEye(case.net, rng, working_range=rig.working_range)
+    if request.rendered:
+        eye = RenderedEye(case.net, rig, rng)
+    loop = case.loop(eye, mission)
+    with FollowLog(request.out / FOLLOW_CSV) as follow_log:
+        loop.on_step = follow_log.write
+        _run(loop, request, tell)
+    write_log(loop.log, request.out / TRUTH_CSV)
+    facts = RunFacts(
+        vehicle=case.model.name,
+        current=request.current,
+        waves=request.waves,
+        rendered=request.rendered,
+        fps=request.fps,
+    )
+    page = write_report(loop.log, facts, request.out)
+    for line in summary_lines(loop.log, facts):
+        tell(line)
+    tell(f"written: {page}")
+    return 0
+
+
+def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimCase:
+    model = vehicle_model(request.vehicle, request.pilot_gain)
+    return SimCase(
+        model=model,
+        gains=tuned_gains(model) if request.gains is None else load_gains(request.gains),
+        water=sea(
+            current=request.current,
+            current_to=request.current_to,
+            waves=request.waves,
+            seed=request.seed,
+        ),
+        net=NetWall(
+            curvature=-1.0 / request.cage_radius if request.cage_radius else 0.0,
+            sway=request.net_sway,
+            sway_period=8.0,
+        ),
+        start_range=setpoint.range,
+        start_yaw=setpoint.yaw,
+        timing=Timing(fps=request.fps),
+        limits=limits,
+        seed=request.seed,
+    )
+
+
+def _run(loop: SimulatedLoop, request: SimRequest, tell: Callable[[str], object]) -> None:
+    """Run, and tell the way where a second takes seconds."""
+    told_s = 0.0
+
+    def progress(now_s: float) -> bool:
+        nonlocal told_s
+        if request.rendered and now_s - told_s >= _TELL_EVERY_S:
+            told_s = now_s
+            tell(f"simulated {now_s:.0f} of {request.seconds:g} s")
+        if not loop.steering.engaged:
+            tell(f"at {now_s:.1f} s: {_last_words(loop)}; here a pilot takes over")
+        return loop.steering.engaged
+
+    loop.run(request.seconds, progress)
+
+
+def _last_words(loop: SimulatedLoop) -> str:
+    reason = loop.steering.gate.latched
+    return "disengaged" if reason is None else reason.words

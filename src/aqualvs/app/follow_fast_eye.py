@@ -1,0 +1,126 @@
+"""A scanner that is sampled instead of run: the true posture with noise, and with losses."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.simulation.net_motion import NetPosture, NetWall
+
+# What a posture of the example rig rests on, about.
+_N_POINTS = 400
+_GREATEST_ANGLE = math.radians(60.0)
+
+
+class Loss(StrEnum):
+    """How sight is lost."""
+
+    TARGET = "target"
+    """Frames come, but nothing is measured in them."""
+    STREAM = "stream"
+    """No frames come."""
+
+
+@dataclass(frozen=True, slots=True)
+class Blind:
+    """A stretch without a valid posture.
+
+    Attributes
+    ----------
+    start_s, end_s : float
+        Of the exposures, in seconds.
+    loss : Loss
+    """
+
+    start_s: float
+    end_s: float
+    loss: Loss = Loss.TARGET
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PostureNoise:
+    """Standard deviations, of each frame by itself.
+
+    Attributes
+    ----------
+    range_share : float
+        Of the range.
+    pitch, yaw : float
+        In radians.
+    outliers : float
+        Share of frames with ten times that noise, unknown to the scanner.
+    """
+
+    range_share: float = 0.003
+    pitch: float = math.radians(0.4)
+    yaw: float = math.radians(0.4)
+    outliers: float = 0.0
+
+
+class SampledEye:
+    """Gives the true posture with noise.
+
+    Parameters
+    ----------
+    net : NetWall
+    rng : Generator
+        Source of the noise.
+    noise : PostureNoise, optional
+        Defaults if left out.
+    blind : sequence of Blind
+        Stretches without sight.
+    working_range : (float, float)
+        Outside of it nothing is measured, in metres.
+    """
+
+    def __init__(
+        self,
+        net: NetWall,
+        rng: np.random.Generator,
+        noise: PostureNoise | None = None,
+        blind: Sequence[Blind] = (),
+        working_range: tuple[float, float] = (0.3, 1.0),
+    ) -> None:
+        self._net, self._rng = net, rng
+        self._noise = noise or PostureNoise()
+        self._blind = tuple(blind)
+        self._working_range = working_range
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
+        """Return what the frame exposed now gives."""
+        truth = self._net.posture_at(world_from_dome, time_s)
+        # Drawn in any case: the noise of a frame does not depend on what happened before.
+        draws = self._rng.normal(size=3)
+        wild = self._rng.uniform() < self._noise.outliers
+        for blind in self._blind:
+            if blind.start_s <= time_s < blind.end_s:
+                return None if blind.loss is Loss.STREAM else Refusal(Reason.TOO_FEW_POINTS)
+        near, far = self._working_range
+        if not near <= truth.range <= far:
+            return Refusal(Reason.OUT_OF_RANGE, f"{truth.range:.2f} m")
+        if max(abs(truth.yaw), abs(truth.pitch)) > _GREATEST_ANGLE:
+            return Refusal(Reason.COLLINEAR, "the lasers leave the net")
+        return self._measured(truth, (10.0 if wild else 1.0) * draws)
+
+    def _measured(self, truth: NetPosture, draws: FloatArray) -> Posture:
+        noise = self._noise
+        sigma = np.array([noise.range_share * truth.range, noise.pitch, noise.yaw])
+        distance, pitch, yaw = (np.array(truth[:3]) + sigma * draws).tolist()
+        normal = np.array([math.tan(yaw), 1.0, math.tan(pitch)])
+        normal /= np.linalg.norm(normal)
+        return Posture(
+            range=distance,
+            pitch=pitch,
+            yaw=yaw,
+            covariance=np.diag(sigma**2),
+            normal_in_dome=normal,
+            slant_range=distance / float(normal[1]),
+            nearest=distance,
+            n_points=_N_POINTS,
+            rms=0.001,
+        )

@@ -1,0 +1,168 @@
+"""Pictures of a loop over time, after figures 22 and 23 of the paper.
+
+Constantinou, Georgiades and Loizou, Robotics 2021, 10, 126. Matplotlib is asked for when a picture
+is drawn, and only its Agg canvas: no display is needed.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs.app.follow_sim_log import LoopLog
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_DPI = 160
+_BLUE, _ORANGE, _DARK, _GREY = "#1f4fc8", "#d55e00", "#23272e", "#8a8f98"
+_LOST, _GUARDED = "#f3c9bd", "#f6e3a8"
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e6ea",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+}
+# An axis shows at least so much, so that noise does not fill it: metres, degrees.
+_LEAST_DEPTH, _LEAST_RANGE, _LEAST_ANGLE = 0.2, 0.1, 6.0
+
+
+def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
+    """Write `figure_22.png` and `figure_23.png`.
+
+    Parameters
+    ----------
+    log : LoopLog
+        With at least one row.
+    out : Path
+        Folder that exists.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
+    """
+    from matplotlib import rc_context
+
+    written = []
+    with rc_context(_STYLE):
+        for name, draw in (("figure_22.png", _motion), ("figure_23.png", _control)):
+            draw(log).savefig(out / name, dpi=_DPI)
+            written.append(out / name)
+    return written
+
+
+def _motion(log: LoopLog) -> "Figure":
+    """As figure 22: depth, range, heading and target yaw."""
+    figure, axes = _panels(3, 6.4)
+    time_s = log.column("time_s")
+    depth, ranges, angles = axes
+    depth.plot(time_s, log.column("depth"), color=_BLUE, linewidth=0.9)
+    _name(depth, "depth (m)", _LEAST_DEPTH)
+    depth.invert_yaxis()
+    ranges.plot(time_s, log.column("measured_range"), color=_BLUE, linewidth=0.9)
+    _name(ranges, "range (m)", _LEAST_RANGE)
+    heading = np.degrees(np.unwrap(log.column("heading")))
+    angles.plot(time_s, heading, color=_ORANGE, linewidth=0.9, label="heading")
+    yaw = np.degrees(log.column("measured_yaw"))
+    angles.plot(time_s, yaw, color=_BLUE, linewidth=0.9, label="target yaw")
+    _name(angles, "angle (deg)", _LEAST_ANGLE)
+    _legend(angles)
+    _finish(axes, log, time_s)
+    return figure
+
+
+def _control(log: LoopLog) -> "Figure":
+    """As figure 23: setpoint, measurement and command of both controllers."""
+    figure, axes = _panels(4, 8.0)
+    time_s = log.column("time_s")
+    _loop(axes[0], log, "range", 1.0)
+    _name(axes[0], "range (m)", _LEAST_RANGE)
+    _command(axes[1], time_s, log.column("forward"), "forward effort")
+    _loop(axes[2], log, "yaw", 180.0 / np.pi)
+    _name(axes[2], "target yaw (deg)", _LEAST_ANGLE)
+    _command(axes[3], time_s, log.column("turn"), "yaw effort")
+    _legend(axes[0])
+    _finish(axes, log, time_s)
+    return figure
+
+
+def _loop(axes: "Axes", log: LoopLog, name: str, unit: float) -> None:
+    time_s = log.column("time_s")
+    measured = unit * log.column(f"measured_{name}")
+    axes.plot(time_s, measured, color=_BLUE, linewidth=0.8, alpha=0.55, label="measured")
+    axes.plot(time_s, unit * log.column(name), color=_DARK, linewidth=1.0, label="true")
+    wanted = unit * log.column(f"wanted_{name}")
+    axes.plot(time_s, wanted, color=_ORANGE, linewidth=1.2, linestyle="--", label="setpoint")
+
+
+def _command(axes: "Axes", time_s: FloatArray, effort: FloatArray, name: str) -> None:
+    axes.axhline(0.0, color=_GREY, linewidth=0.6)
+    axes.plot(time_s, effort, color=_DARK, linewidth=0.7)
+    most = max(0.2, 1.15 * float(np.abs(effort).max()))
+    axes.set_ylim(-most, most)
+    axes.set_ylabel(name)
+
+
+def _panels(n: int, height_in: float) -> "tuple[Figure, list[Axes]]":
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(n, 1, sharex=True)
+    figure.align_ylabels(axes)
+    return figure, list(axes)
+
+
+def _name(axes: "Axes", label: str, least: float) -> None:
+    """Name an axis, and let it show at least so much."""
+    axes.set_ylabel(label)
+    low, high = axes.get_ylim()
+    short = least - abs(high - low)
+    if short > 0.0:
+        axes.set_ylim(low - 0.5 * short, high + 0.5 * short)
+
+
+def _legend(axes: "Axes") -> None:
+    """Put the legend above, out of the curves' way."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1)
+
+
+def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
+    """Shade where there was no posture, and where the gate stepped in."""
+    lost = np.array([row.refusal != "" for row in log.rows])
+    guarded = np.array([row.reason != "" for row in log.rows]) & ~lost
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    for one in axes:
+        for here, colour in ((lost, _LOST), (guarded, _GUARDED)):
+            for start, end in _stretches(here):
+                one.axvspan(time_s[start], time_s[end] + step_s, color=colour, linewidth=0)
+        one.set_xlim(float(time_s[0]), float(time_s[-1]))
+    notes = [
+        ("no posture", _LOST) if lost.any() else None,
+        ("safety gate", _GUARDED) if guarded.any() else None,
+    ]
+    words = ", ".join(f"{name} shaded {_COLOURS[colour]}" for name, colour in filter(None, notes))
+    axes[-1].set_xlabel("time (s)" + (f"   ({words})" if words else ""))
+
+
+_COLOURS = {_LOST: "red", _GUARDED: "yellow"}
+
+
+def _stretches(here: BoolArray) -> Iterator[tuple[int, int]]:
+    """Yield first and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(np.int8)))
+    yield from zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True)

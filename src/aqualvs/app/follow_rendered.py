@@ -1,0 +1,69 @@
+"""A scanner that is run on rendered pictures: every frame goes through the real pipeline."""
+
+import numpy as np
+
+from aqualvs.geometry.transforms import SE3
+from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.scan import Frame
+from aqualvs.simulation.net_motion import NetWall
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scene import Net, Scene
+
+
+def net_scene(seed: int = 0) -> Scene:
+    """Return a diamond net with a little growth, in clear water."""
+    net = Net(bar=0.025, twine=0.0022, fouling=0.1, seed=seed)
+    return Scene(dome_from_scene=SE3.identity(), nets=(net,), target="net")
+
+
+class RenderedEye:
+    """Renders what the camera sees from a vehicle, and measures in it.
+
+    Parameters
+    ----------
+    net : NetWall
+    rig : Rig
+        That the pictures are taken with, and measured with.
+    rng : Generator
+        Source of the sensor's noise.
+    scene : Scene, optional
+        In the frame of the net at rest; `net_scene` if left out.
+    options : ScannerOptions, optional
+        Defaults if left out.
+    samples : int
+        Rays along each side of a pixel.
+
+    Attributes
+    ----------
+    frame : Frame or None
+        The last picture.
+    """
+
+    def __init__(
+        self,
+        net: NetWall,
+        rig: Rig,
+        rng: np.random.Generator,
+        scene: Scene | None = None,
+        options: ScannerOptions | None = None,
+        samples: int = 1,
+    ) -> None:
+        self._net, self._rng = net, rng
+        self._scene = net_scene() if scene is None else scene
+        self._renderer = Renderer(rig, samples=samples)
+        self._scanner = Scanner(rig, options)
+        self._n_frames = 0
+        self.frame: Frame | None = None
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
+        """Return what the frame exposed now gives."""
+        scene = self._net.scene_at(world_from_dome, time_s, self._scene)
+        image = self._renderer.render(scene, time_s, self._rng).image
+        # OpenCV's order of colours.
+        planes = planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
+        self.frame = Frame(self._n_frames, time_s, *planes)
+        self._n_frames += 1
+        return self._scanner.process(self.frame).posture

@@ -1,0 +1,191 @@
+"""How well a simulated loop did, from its log."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.app.follow_sim_log import NEUTRAL_WITHIN_S, LoopLog
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+
+SETTLED_SHARE = 0.1
+"""A step has settled once the range stays within this share of it."""
+LOST_AFTER_S = 2.5
+"""Without sight for longer, in seconds, somebody has to take over."""
+# Swings that are that much greater at the end of a run than in its middle are growing, in metres.
+_GROWS, _GROWS_BY = 2.0, 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldMeasures:
+    """Of a stretch with a constant setpoint.
+
+    Attributes
+    ----------
+    range_rms, yaw_rms : float
+        Of the true posture about the setpoint, in metres and radians.
+    range_worst : float
+        Greatest error of the range, in metres.
+    least_clearance : float
+        Between hull and net, in metres; negative is contact.
+    n_lost : int
+        Frames without a posture.
+    n_guarded : int
+        Frames at which the safety gate changed the effort.
+    """
+
+    range_rms: float
+    yaw_rms: float
+    range_worst: float
+    least_clearance: float
+    n_lost: int
+    n_guarded: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepMeasures:
+    """Answer to a step of the range.
+
+    Attributes
+    ----------
+    settling : float
+        Seconds until the range stays within `SETTLED_SHARE` of the step; infinite if it never does.
+    overshoot : float
+        Share of the step by which it is exceeded; 0 if it is not.
+    """
+
+    settling: float
+    overshoot: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyMeasures:
+    """Of a whole run.
+
+    Attributes
+    ----------
+    least_clearance : float
+        In metres; negative is contact.
+    n_blind : int
+        Stretches of more than 0.2 s without a valid posture.
+    neutral_late : float
+        Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
+    stable : bool
+        Whether swings of the range do not grow while the net is in sight.
+    lost_s : float
+        When sight was lost for good; infinite if it was not.
+    greatest_tilt : float
+        Of the vehicle, in radians.
+    """
+
+    least_clearance: float
+    n_blind: int
+    neutral_late: float
+    stable: bool
+    lost_s: float
+    greatest_tilt: float
+
+    @property
+    def contact(self) -> bool:
+        """Whether the hull touched the net."""
+        return self.least_clearance <= 0.0
+
+    @property
+    def neutral_in_time(self) -> bool:
+        """Whether thrust always ended in time."""
+        return self.neutral_late <= NEUTRAL_WITHIN_S + 1e-9
+
+
+def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> HoldMeasures:
+    """Return what a stretch came to; frames without a setpoint count against the last one."""
+    here = _between(log, start_s, end_s)
+    off = log.column("range")[here] - _filled(log.column("wanted_range"))[here]
+    turned = log.column("yaw")[here] - _filled(log.column("wanted_yaw"))[here]
+    rows = [row for row, kept in zip(log.rows, here, strict=True) if kept]
+    return HoldMeasures(
+        range_rms=_rms(off),
+        yaw_rms=_rms(turned),
+        range_worst=float(np.abs(off).max()),
+        least_clearance=float(log.column("clearance")[here].min()),
+        n_lost=sum(row.refusal != "" for row in rows),
+        n_guarded=sum(row.reason != "" for row in rows),
+    )
+
+
+def step_measures(
+    time_s: FloatArray, ranges: FloatArray, step_s: float, before: float, after: float
+) -> StepMeasures:
+    """Return settling time and overshoot of a step.
+
+    Parameters
+    ----------
+    time_s, ranges : array, shape (n,)
+        True ranges, or their mean over several runs.
+    step_s : float
+        When the setpoint changed.
+    before, after : float
+        Setpoints in metres.
+    """
+    later = time_s > step_s
+    share = (ranges[later] - before) / (after - before)
+    outside = np.flatnonzero(np.abs(share - 1.0) > SETTLED_SHARE)
+    times = time_s[later] - step_s
+    settling = 0.0 if len(outside) == 0 else float(times[outside[-1]])
+    if len(outside) and outside[-1] == len(times) - 1:
+        settling = math.inf
+    return StepMeasures(settling=settling, overshoot=max(0.0, float(share.max()) - 1.0))
+
+
+def safety_measures(log: LoopLog) -> SafetyMeasures:
+    """Return what a whole run came to."""
+    return SafetyMeasures(
+        least_clearance=float(log.column("clearance").min()),
+        n_blind=log.n_blind,
+        neutral_late=max(log.blind_thrust_s, default=0.0),
+        stable=_is_stable(log),
+        lost_s=_lost_s(log),
+        greatest_tilt=float(log.column("tilt").max()),
+    )
+
+
+def _lost_s(log: LoopLog) -> float:
+    """Return when the last valid posture was exposed, if more than that is missing at the end."""
+    last_s = _last_seen_s(log)
+    return last_s if log.rows[-1].time_s - last_s > LOST_AFTER_S else math.inf
+
+
+def _last_seen_s(log: LoopLog) -> float:
+    seen = np.flatnonzero(np.isfinite(log.column("measured_range")))
+    return float(log.column("time_s")[seen[-1]]) if len(seen) else 0.0
+
+
+def _is_stable(log: LoopLog) -> bool:
+    """Return whether the last third swings no more than the second, both about their setpoints."""
+    off = log.column("range") - _filled(log.column("wanted_range"))
+    off = off[log.column("time_s") <= _last_seen_s(log)]
+    third = len(off) // 3
+    if third == 0 or not np.isfinite(off[-1]):
+        return third == 0
+    middle, last = _rms(off[third : 2 * third]), _rms(off[2 * third :])
+    return last <= _GROWS * middle + _GROWS_BY
+
+
+def _between(log: LoopLog, start_s: float, end_s: float) -> BoolArray:
+    time_s = log.column("time_s")
+    here: BoolArray = (time_s >= start_s) & (time_s <= end_s)
+    return here
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Return values with the last known one where there is none."""
+    known = np.isfinite(values)
+    if not known.any():
+        return values
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    first = int(np.argmax(known))
+    filled: FloatArray = values[np.where(last < 0, first, last)]
+    return filled
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,158 @@
+"""`aqualvs follow SOURCE`: hold and follow with a real vehicle."""
+
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO
+
+from aqualvs.app.follow import FOLLOW_CSV, Aim
+from aqualvs.app.follow_vehicle_log import FollowLogOutput
+from aqualvs.app.live import SWITCH_S, FeedRequest
+from aqualvs.app.live_console import Console
+from aqualvs.app.live_outputs import DASHBOARD_PORT, host_and_port
+from aqualvs.app.run_inputs import Water, prepared_rig
+from aqualvs.app.stopping import StopSignals
+from aqualvs.control.autopilot import NetPilot
+from aqualvs.control.controller import RangeYawController
+from aqualvs.control.gains_file import load_gains
+from aqualvs.control.safety import SafetyGate
+from aqualvs.control.setpoint import SetpointHolder
+from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.live.ardusub_link import ArduSubLink
+from aqualvs.live.outputs.base import Output
+from aqualvs.live.pilot import Pilot
+from aqualvs.live.runner import FixedScanner, LiveRunner
+from aqualvs.live.time_filter import PostureFilter
+from aqualvs.live.warm_up import warm_up
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FollowRequest:
+    """What to steer, and by what.
+
+    Attributes
+    ----------
+    source : str
+        As `open_feed` takes it.
+    rig : Path
+    mavlink : str
+        Address of the vehicle.
+    gains : str
+        Gains file, or the name of a vehicle whose gains come with the package.
+    out : Path
+        Folder for the log.
+    aim : Aim
+    feed : FeedRequest
+    dashboard : str or None
+        Address HOST:PORT of the pilot's page.
+    token : str or None
+        Its password.
+    water : Water
+    scanner : ScannerOptions
+    """
+
+    source: str
+    rig: Path
+    mavlink: str
+    gains: str
+    out: Path
+    aim: Aim
+    feed: FeedRequest = field(default_factory=FeedRequest)
+    dashboard: str | None = None
+    token: str | None = None
+    water: Water = field(default_factory=Water)
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
+
+
+def follow_and_tell(
+    request: FollowRequest, tell: Callable[[str], object], keys: TextIO | None = None
+) -> int:
+    """Run until the source ends or somebody stops it; returns 0.
+
+    It starts disengaged: a line on `keys` (the terminal) engages or disengages.
+
+    Raises
+    ------
+    AqualvsError
+        If an input cannot be used, or the source can never work.
+    """
+    rig = prepared_rig(request.rig, request.water, no_dome=False)
+    mission, limits, setpoint = request.aim.mission(rig.working_range)
+    holder = SetpointHolder(rig.working_range)
+    holder.put(setpoint)
+    steering = NetPilot(mission, RangeYawController(load_gains(request.gains)), SafetyGate(limits))
+    scanner = Scanner(rig, request.scanner)
+    warm_up(scanner)
+    feed = request.feed.opened(request.source, realtime=True)
+    sys.setswitchinterval(SWITCH_S)
+    with ExitStack() as undo:
+        undo.callback(feed.close)
+        pilot = Pilot(steering, ArduSubLink(request.mavlink), holder)
+        undo.callback(pilot.close)
+        outputs: list[Output] = [pilot, FollowLogOutput(request.out / FOLLOW_CSV, pilot)]
+        undo.callback(outputs[1].close)
+        outputs.append(Console())
+        if request.dashboard is not None:
+            outputs.append(_dashboard(request.dashboard, request.token, rig, holder, tell))
+        runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
+        undo.pop_all()
+    tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
+    listen(pilot, sys.stdin if keys is None else keys, tell)
+    with StopSignals() as stop:
+        fault = runner.run(lambda: stop.caught is not None)
+    if fault is not None:
+        raise fault
+    return 0
+
+
+def listen(pilot: Pilot, keys: TextIO, tell: Callable[[str], object]) -> threading.Thread:
+    """Engage and disengage by lines of a terminal, in a thread of its own."""
+
+    def toggle() -> None:
+        for _ in keys:
+            try:
+                if pilot.engaged:
+                    pilot.disengage()
+                    tell("disengaged")
+                else:
+                    pilot.engage()
+                    tell("engaged")
+            except (AqualvsError, OSError) as fault:
+                tell(str(fault))
+
+    thread = threading.Thread(target=toggle, name="follow keys", daemon=True)
+    thread.start()
+    return thread
+
+
+def _dashboard(
+    address: str,
+    token: str | None,
+    rig: Rig,
+    holder: SetpointHolder,
+    tell: Callable[[str], object],
+) -> Output:
+    """Serve the page; its setpoint is the pilot's."""
+    try:
+        from aqualvs.app.dashboard.access import make_access, token_fault
+        from aqualvs.app.dashboard.commands import Controls, NoRecorder
+        from aqualvs.app.dashboard.output import Dashboard
+        from aqualvs.app.dashboard.server import DashboardServer
+    except ImportError as fault:
+        raise OptionError(
+            f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
+        ) from fault
+    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
+    wrong = token_fault(token)
+    if wrong:
+        raise OptionError(wrong)
+    access, controls = make_access(host, token), Controls(holder, NoRecorder())
+    server = DashboardServer(host, port, access, rig, controls)
+    shown = f"[{host}]" if ":" in host else host
+    tell(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
+    return Dashboard(server, controls)

@@ -1,0 +1,97 @@
+"""The closed loop against what it must reach, on the simulated vehicles.
+
+Set AQUALVS_LOOP_RUNS=500 for as many random dives, and AQUALVS_LOOP_RENDERED=1 for the trials with
+rendered pictures at full length.
+"""
+
+import math
+import os
+
+import numpy as np
+import pytest
+
+from aqualvs.app.follow_fast import DiveResult, random_dives
+from aqualvs.app.follow_sim_case import tuned_gains, vehicle_model
+from aqualvs.app.follow_sim_measures import step_measures
+from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials, trial_gains
+
+N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "24"))
+RENDERED = "AQUALVS_LOOP_RENDERED" in os.environ
+BOTH = pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
+SEEDS = (1, 2, 3)
+
+
+def trials(name: str, seed: int, *, rendered: bool = False) -> Trials:
+    model = vehicle_model(name)
+    fps = 12.5 if rendered else 25.0
+    return Trials(model, trial_gains(model), rendered=rendered, fps=fps, seed=seed)
+
+
+@BOTH
+def test_holds_and_steps_in_current_and_waves(name: str) -> None:
+    runs = [trials(name, seed).hold_and_step() for seed in SEEDS]
+    for _, hold, step in runs:
+        assert hold.range_rms <= 15e-3
+        assert math.degrees(hold.yaw_rms) <= 1.5
+        assert hold.n_lost == hold.n_guarded == 0
+        assert step.overshoot <= 0.15
+    # The waves of several runs cancel in part: what is left is the answer to the step. In one run
+    # by itself a wave may leave the band of 20 mm some seconds after.
+    mean = np.mean([log.column("range") for log, _, _ in runs], axis=0)
+    answer = step_measures(runs[0][0].column("time_s"), mean, STEP_S, RANGE, RANGE + STEP)
+    assert answer.settling <= 4.0
+    assert answer.overshoot <= 0.15
+
+
+@BOTH
+def test_follows_a_curved_net_that_moves(name: str) -> None:
+    log, follow = trials(name, 1).follow()
+    assert follow.range_rms <= 30e-3
+    assert math.degrees(follow.yaw_rms) <= 3.0
+    assert follow.n_lost == 0
+    assert follow.least_clearance > 0.0
+    along = log.column("along")
+    # 0.2 m/s through the water for a minute; the current changes what that is over ground.
+    assert along[-1] - along[0] > 5.0
+
+
+@BOTH
+def test_random_dives_are_safe(name: str) -> None:
+    # A full stick is full thrust: half of it does not hold every drag and current drawn here.
+    model = vehicle_model(name, pilot_gain=1.0)
+    found = list(random_dives(model, tuned_gains(model), range(N_RUNS // 2)))
+    assert not any(dive.safety.contact for dive in found)
+    assert max(dive.safety.neutral_late for dive in found) <= 0.2
+    assert sum(dive.safety.n_blind for dive in found) > 2 * len(found)
+    assert all(dive.safety.stable for dive in found)
+    assert _share_lost(found) <= 0.1
+
+
+def _share_lost(found: list[DiveResult]) -> float:
+    return sum(math.isfinite(dive.safety.lost_s) for dive in found) / len(found)
+
+
+@BOTH
+def test_a_rendered_loop_takes_hold(name: str) -> None:
+    """Through pictures and scanner: hold for some seconds, or for as long as it is judged by."""
+    run = trials(name, 1, rendered=True)
+    if not RENDERED:
+        log = run.begin(3.0)
+        error = log.column("range") - RANGE
+        # From rest in the current: pushed off by less than 0.1 m, and seen in every frame.
+        assert np.abs(error).max() < 0.1
+        assert all(row.refusal == "" for row in log.rows)
+        scanned = log.column("measured_range") - log.column("range")
+        # The scanner sees the front of the twine, 1 mm before the net's middle.
+        assert np.abs(scanned + 1e-3).max() < 4e-3
+        return
+    _, hold, step = run.hold_and_step()
+    assert hold.range_rms <= 15e-3
+    assert math.degrees(hold.yaw_rms) <= 1.5
+    assert step.settling <= 4.0
+    assert step.overshoot <= 0.15
+    _, follow = run.follow()
+    assert follow.range_rms <= 30e-3
+    assert math.degrees(follow.yaw_rms) <= 3.0
+    assert follow.n_lost == 0
+    assert follow.least_clearance > 0.0

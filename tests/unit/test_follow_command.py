@@ -1,0 +1,126 @@
+"""`aqualvs follow`: what it writes in simulation, what it refuses, and the pilot's keys."""
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import pytest
+
+from aqualvs.app.cli_follow import follow
+from aqualvs.app.follow import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, simulate_and_tell
+from aqualvs.app.follow_vehicle import listen
+from aqualvs.control.follow_log import FOLLOW_COLUMNS
+from aqualvs.errors import OptionError
+
+PLAN = """aqualvs_plan: 1
+mission: follow
+range_m: 0.6
+sway_m_s: 0.2
+leg:
+  time_s: 2
+"""
+
+
+def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
+    told: list[str] = []
+    request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.7), seconds=3.0)
+    assert simulate_and_tell(request, lambda line: told.append(line)) == 0
+    made = {path.name for path in request.out.iterdir()}
+    assert made == {FOLLOW_CSV, TRUTH_CSV, "figure_22.png", "figure_23.png", "follow.html"}
+    with (request.out / FOLLOW_CSV).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == FOLLOW_COLUMNS
+    assert {row["range_setpoint_m"] for row in rows} == {"0.7000"}
+    # Frames at 25 Hz, the last two still on their way.
+    assert 70 <= len(rows) <= 76
+    page = (request.out / "follow.html").read_text(encoding="utf-8")
+    assert "figure_22.png" in page
+    assert "range error, rms" in page
+    assert any("rms" in line and "mm" in line for line in told)
+    assert told[-1].endswith("follow.html")
+    for name in ("figure_22.png", "figure_23.png"):
+        assert (request.out / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_simulation_ends_where_the_plan_ends(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(PLAN, encoding="utf-8")
+    told: list[str] = []
+    request = SimRequest(out=tmp_path / "out", aim=Aim(plan=plan), seconds=20.0, cage_radius=10.0)
+    simulate_and_tell(request, lambda line: told.append(line))
+    assert any("the plan is done" in line and "a pilot takes over" in line for line in told)
+    with (request.out / TRUTH_CSV).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    # The leg of 2 s counts from the first posture.
+    assert 2.0 < float(rows[-1]["time_s"]) < 2.6
+    assert float(rows[-1]["along_m"]) > float(rows[0]["along_m"])
+
+
+def test_a_vehicle_that_cannot_sway_refuses_to_follow(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(PLAN, encoding="utf-8")
+    request = SimRequest(out=tmp_path, aim=Aim(plan=plan), vehicle="videoray", seconds=2.0)
+    with pytest.raises(OptionError, match="cannot move sideways"):
+        simulate_and_tell(request, print)
+
+
+def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="--seconds 0"):
+        SimRequest(out=tmp_path, aim=Aim(), seconds=0.0)
+    with pytest.raises(OptionError, match="--cage-radius 1"):
+        SimRequest(out=tmp_path, aim=Aim(), cage_radius=1.0)
+    with pytest.raises(OptionError, match="--current 9"):
+        SimRequest(out=tmp_path, aim=Aim(), current=9.0)
+    with pytest.raises(OptionError, match="leave --range"):
+        Aim(plan=tmp_path / "plan.yaml", range=0.5).mission((0.3, 1.0))
+    with pytest.raises(OptionError, match="outside the working range"):
+        Aim(range=5.0).mission((0.3, 1.0))
+
+
+def test_command_line_says_what_is_missing() -> None:
+    with pytest.raises(OptionError, match="--rig, --mavlink and --gains"):
+        follow(source="udp://0.0.0.0:5600")
+    with pytest.raises(OptionError, match="has no source"):
+        follow(source="udp://0.0.0.0:5600", sim=True)
+
+
+class Switch:
+    """Stands for a pilot that refuses the first time."""
+
+    def __init__(self) -> None:
+        self.engaged = False
+        self.n_asked = 0
+
+    def engage(self) -> None:
+        self.n_asked += 1
+        if self.n_asked == 1:
+            raise OptionError("pilot: not engaged: the vehicle is disarmed")
+        self.engaged = True
+
+    def disengage(self) -> None:
+        self.engaged = False
+
+
+def test_enter_engages_and_gives_back() -> None:
+    told: list[str] = []
+    pilot = Switch()
+    keys = io.StringIO("\n\n\n")
+    listen(pilot, keys, lambda line: told.append(line)).join(5.0)  # type: ignore[arg-type]
+    assert told == ["pilot: not engaged: the vehicle is disarmed", "engaged", "disengaged"]
+    assert not pilot.engaged
+
+
+def test_yaw_is_held_where_it_is_asked_for(tmp_path: Path) -> None:
+    request = SimRequest(
+        out=tmp_path,
+        aim=Aim(range=0.6, yaw=math.radians(15.0)),
+        seconds=8.0,
+        current=0.0,
+        waves=0.0,
+    )
+    simulate_and_tell(request, lambda _: None)
+    with (tmp_path / TRUTH_CSV).open(encoding="utf-8") as file:
+        last = list(csv.DictReader(file))[-1]
+    # The scanner's noise of 0.4 degrees, smoothed.
+    assert float(last["yaw_deg"]) == pytest.approx(15.0, abs=1.0)

@@ -1,0 +1,105 @@
+"""`aqualvs follow SOURCE`: the parts together, with a recorded dive and no vehicle that answers."""
+
+import csv
+import importlib.resources
+import io
+import socket
+from pathlib import Path
+
+import pytest
+
+from aqualvs.app.follow import FOLLOW_CSV, Aim
+from aqualvs.app.follow_vehicle import FollowRequest, follow_and_tell
+from aqualvs.app.follow_vehicle_log import FollowLogOutput
+from aqualvs.control.mission import Guidance, Stage
+from aqualvs.control.safety import Reason
+from aqualvs.control.setpoint import Setpoint
+from aqualvs.control.vehicle import Effort, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.live.health import State
+from aqualvs.live.pilot_report import PilotReport
+from live_cases import demo_samples
+
+pytest.importorskip("pymavlink")
+
+
+class Reports:
+    """Stands for a pilot: a new report for every sample."""
+
+    def __init__(self) -> None:
+        self.latest: PilotReport | None = None
+
+    def step(self, frame: int, forward: float) -> None:
+        self.latest = PilotReport(
+            at_ns=40_000_000 * frame,
+            frame=frame,
+            engaged=True,
+            effort=Effort(forward=forward),
+            reason=Reason.TOO_FAST if frame == 2 else None,
+            guidance=Guidance(setpoint=Setpoint(0.6), stage=Stage.HOLDING),
+            state=VehicleState(armed=True, depth=4.0),
+        )
+
+
+def test_log_has_a_row_for_every_step(tmp_path: Path) -> None:
+    pilot = Reports()
+    path = tmp_path / "new" / FOLLOW_CSV
+    log = FollowLogOutput(path, pilot)  # type: ignore[arg-type]
+    samples = demo_samples(4)
+    log.send(samples[0])
+    for frame, sample in enumerate(samples):
+        pilot.step(frame, 0.1 * frame)
+        log.send(sample)
+    log.send(samples[-1])
+    assert log.health().state is State.OK
+    log.close()
+    log.close()
+    with path.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["forward"] for row in rows] == ["0.0000", "0.1000", "0.2000", "0.3000"]
+    assert [row["reason"] for row in rows] == ["", "", "too_fast", ""]
+    for row, sample in zip(rows, samples, strict=True):
+        assert (row["posture"] == "valid") is bool(sample.scan.posture)
+
+
+def test_a_dive_without_a_vehicle_is_logged_and_never_steered(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        port = nobody.getsockname()[1]
+        told: list[str] = []
+        folder = importlib.resources.files("aqualvs") / "data" / "demo"
+        with importlib.resources.as_file(folder) as demo:
+            request = FollowRequest(
+                source=str(demo / "dive.mp4"),
+                rig=demo / "rig.yaml",
+                mavlink=f"udpout:127.0.0.1:{port}",
+                gains="bluerov2",
+                out=tmp_path,
+                aim=Aim(range=0.5),
+            )
+            # Two lines: both times there is no vehicle that could be steered.
+            keys = io.StringIO("\n\n")
+            assert follow_and_tell(request, lambda line: told.append(line), keys) == 0
+    assert sum("not engaged" in line and "silent" in line for line in told) == 2
+    with (tmp_path / FOLLOW_CSV).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    # Six seconds at 25 Hz, less what a slow machine drops.
+    assert len(rows) >= 10
+    assert {row["engaged"] for row in rows} == {"0"}
+    assert {row["forward"] for row in rows} == {"0.0000"}
+    assert "valid" in {row["posture"] for row in rows}
+
+
+def test_gains_that_are_not_there_are_told(tmp_path: Path) -> None:
+    folder = importlib.resources.files("aqualvs") / "data" / "demo"
+    with importlib.resources.as_file(folder) as demo:
+        request = FollowRequest(
+            source=str(demo / "dive.mp4"),
+            rig=demo / "rig.yaml",
+            mavlink="udpout:127.0.0.1:14550",
+            gains="submarine",
+            out=tmp_path,
+            aim=Aim(),
+        )
+        with pytest.raises(OptionError, match="submarine"):
+            follow_and_tell(request, print, io.StringIO())
