@@ -29,6 +29,8 @@ from aqualvs.simulation.video import VideoWriter
 _SWAY_S = 3.0
 # How far the camera sees to the side, and a wall's least distance behind a net, in metres.
 _VIEW, _CLEAR = 0.6, 0.05
+# What is seen to each side, in ranges.
+_SEEN_BESIDE = 0.3
 # Pictures in which a laser's line must cross a hole that was passed.
 _LOOKS = 3
 
@@ -188,11 +190,13 @@ def _frame(index: int, time_s: float, image: NDArray[np.uint8]) -> Frame:
     return Frame(index, float(time_s), luma, chroma)
 
 
-def true_solidity(net: Net, n: int = 60_000) -> float:
-    """Share of the area that the net covers, growth included, seen straight on."""
-    whole = replace(net, holes=(), curvature=(0.0, 0.0))
+def true_solidity(dive: Dive, n: int = 60_000) -> float:
+    """Share of the area passed that net and growth cover, seen straight on; without the holes."""
+    whole = replace(dive.net, holes=(), curvature=(0.0, 0.0))
     surfaces = pack_surfaces(Scene(dome_from_scene=SE3.identity(), nets=(whole,)), 0.0)
-    place = np.random.default_rng(1).uniform(-0.4, 0.4, (n, 2))
+    rng = np.random.default_rng(1)
+    foot = rng.uniform(0.0, dive.times[-1], (n, 1)) * dive.velocity
+    place = foot + rng.uniform(-1.0, 1.0, (n, 2)) * _SEEN_BESIDE * np.mean(dive.range)
     origins = np.stack([place[:, 0], np.full(n, -0.5), place[:, 1]], axis=1)
     ahead = np.tile([0.0, 1.0, 0.0], (n, 1))
     return float(np.isfinite(cast(origins, ahead, surfaces).solid).mean())

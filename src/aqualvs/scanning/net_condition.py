@@ -283,8 +283,9 @@ class NetCondition:
             shift = self._track.step(fitter, crossed, view.time_s, velocity)
             if shift is None:
                 continue
-            laid.append(LaidView(view, fitter.assign(view.dashes, shift.place)))
-            self._map.add(lattice, view, self._track.place, self._track.piece)
+            place = self._track.place
+            laid.append(LaidView(view, fitter.assign(view.dashes, shift.place), place))
+            self._map.add(lattice, view, place, self._track.piece)
         self._map.update(lattice)
         return laid
 

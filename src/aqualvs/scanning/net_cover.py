@@ -30,6 +30,8 @@ _NEARLY_ALONG = 0.02
 # Dashes of more search lines may be lost (`segments`).
 _MOST_LINES = 20.0
 _BLOCKS = 6
+# Growth so far apart along the net, in metres, is independent.
+_ALIKE = 0.02
 # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
 # bars long.
 _TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
@@ -37,10 +39,21 @@ _TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
 
 @dataclass(frozen=True, slots=True)
 class LaidView:
-    """A frame on which the lattice was laid."""
+    """A frame on which the lattice was laid.
+
+    Attributes
+    ----------
+    view : NetView
+        What it shows.
+    fit : Fit
+        How its dashes lie on the lattice.
+    place : array, shape (2,)
+        Where the origin of `net` lies on the net itself, as `NetTrack.place`.
+    """
 
     view: NetView
     fit: Fit
+    place: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +167,7 @@ def measure_solidity(
         counts = _reliable(lattice, twine, frames[len(frames) // 2].view)
     shape = (len(frames), *counts.shape)
     body, error, seen = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
+    rows = []
     for i, one in enumerate(frames):
         dashes, family = one.view.dashes, one.fit.family
         angles, step = _angles(lattice, one), one.view.step[dashes.laser]
@@ -161,7 +175,9 @@ def measure_solidity(
         # A dash that is cut off, or lies along the edge of the light, has its share of the halo.
         share = np.minimum(dashes.length / twine.usual(angles.across, angles.slant, step), 1.0)
         share = np.where(dashes.whole, share, 0.5 * share)
-        np.add.at(body[i], (dashes.laser, family), dashes.length - excess * share)
+        mine = dashes.length - excess * share
+        rows.append(np.c_[family, mine, dashes.place + one.place][counts[dashes.laser, family]])
+        np.add.at(body[i], (dashes.laser, family), mine)
         np.add.at(error[i], (dashes.laser, family), sigma * share)
         seen[i] = sound_length(lattice, one.view)
     if not np.all(np.any(counts & (seen.sum(axis=0) > 0.0)[:, None], axis=0)):
@@ -170,8 +186,25 @@ def measure_solidity(
     blocks = np.array_split(np.arange(len(frames)), min(_BLOCKS, len(frames)))
     shares = [_family_sum(body[b], seen[b], counts) for b in blocks]
     chance = float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else 0.1
+    chance = float(np.hypot(chance, solidity * _spread_of_mean(np.concatenate(rows))))
     sigma_solidity = float(np.hypot(chance, _family_sum(error, seen, counts)))
     return float(np.clip(solidity, 0.0, 1.0)), sigma_solidity
+
+
+def _spread_of_mean(rows: FloatArray) -> float:
+    """How uncertain the mean of dashes (family, length, place) is for their spread, as a share.
+
+    Dashes near to one another show the same growth, in whatever frames.
+    """
+    variance, weight = 0.0, 0.0
+    for family in np.unique(rows[:, 0]):
+        mine = rows[rows[:, 0] == family, 1:]
+        total, mean = float(mine[:, 0].sum()), float(mine[:, 0].mean())
+        independent = len(np.unique(np.floor(mine[:, 1:] / _ALIKE), axis=0))
+        if mean > 0.0:
+            variance += (total * float(mine[:, 0].std()) / mean) ** 2 / independent
+            weight += total
+    return float(np.sqrt(variance) / weight) if weight > 0.0 else 1.0
 
 
 def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:

@@ -28,9 +28,10 @@ _LOOK, _MOST_WEIGHT = 0.2, 2.0
 _MOST_LOOKS = 25.0
 # Of the looks at a cell of a hole this share goes through.
 _THROUGH = 0.6
-# A hole: extent in bars and area in squares of a bar. And looks through it that are so many bars
-# long together, where nothing speaks against it; sound looks in and around it count against it.
-_LEAST_EXTENT, _LEAST_AREA = 2.0, 2.0
+# A hole: greater and smaller extent in bars, area in squares of a bar. And looks through it that
+# are so many bars long together, where nothing speaks against it; sound looks in and around it
+# count against it.
+_LEAST_EXTENT, _LEAST_WIDTH, _LEAST_AREA = 2.0, 1.5, 2.0
 _LEAST_SEEN, _AGAINST = 20.0, 0.9
 # Cells farther from the vehicle than this are settled, in metres.
 _SETTLED = 2.0
@@ -244,7 +245,9 @@ class HoleMap:
         # Cells between the lines of sight belong to the hole where no look says otherwise.
         filled, inside = _filled(places, centres, self._cell, _REACH * bar)
         area = filled * self._cell**2
-        if size.max() < _LEAST_EXTENT * bar or area < _LEAST_AREA * bar**2:
+        if size.max() < _LEAST_EXTENT * bar or size.min() < _LEAST_WIDTH * bar:
+            return None
+        if area < _LEAST_AREA * bar**2:
             return None
         through, sound = float(self._through[inside].sum()), float(self._sound[inside].sum())
         if seen * (through - _AGAINST * sound) < _LEAST_SEEN * (through + sound):

@@ -1,0 +1,116 @@
+"""Dashes, gaps and spans, from made-up signals."""
+
+import numpy as np
+import pytest
+
+from aqualvs.scanning.net_dashes import crossings_of, find_dashes
+from aqualvs.scanning.net_lines import NetSignal
+
+STEP = 1e-3
+
+
+def signal_of(*states: str, beyond: str = "", back: bool = False) -> NetSignal:
+    """A signal from one string for each laser: space hidden, dot dark, # lit.
+
+    `beyond` marks by # where light is seen behind the net; `back` lets `along` descend.
+    """
+    state = np.array([[" .#".index(c) for c in text] for text in states], np.uint8)
+    n_lasers, n_lines = state.shape
+    angle = np.linspace(0.0, 2.0, n_lasers)
+    along = np.tile(np.arange(n_lines) * STEP, (n_lasers, 1))
+    behind = np.array([c == "#" for c in beyond.ljust(n_lines)])
+    return NetSignal(
+        index=0,
+        time_s=0.0,
+        range=0.5,
+        origin=np.zeros((n_lasers, 2)),
+        direction=np.stack([np.cos(angle), np.sin(angle)], axis=1),
+        search=np.stack([-np.sin(angle), np.cos(angle)], axis=1),
+        pixel=6e-4,
+        along=along[:, ::-1].copy() if back else along,
+        step=np.full(state.shape, STEP),
+        state=state,
+        height=np.where(state == 2, 100.0, 0.0),
+        width=np.where(state == 2, 4e-3, 0.0),
+        beyond=np.tile(behind, (n_lasers, 1)),
+    )
+
+
+def test_dashes_have_place_and_length() -> None:
+    view = find_dashes(signal_of("..###....#####.."))
+    np.testing.assert_allclose(view.dashes.along, [3 * STEP, 11 * STEP])
+    np.testing.assert_allclose(view.dashes.length, [3 * STEP, 5 * STEP])
+    assert view.dashes.whole.all()
+    assert view.seen_length == pytest.approx(16 * STEP)
+    np.testing.assert_allclose(view.step, STEP)
+
+
+def test_one_dark_search_line_does_not_end_a_dash_two_do() -> None:
+    assert len(find_dashes(signal_of("..##.##..")).dashes) == 1
+    assert len(find_dashes(signal_of("..##..##..")).dashes) == 2
+
+
+def test_a_dash_cut_off_is_not_whole() -> None:
+    view = find_dashes(signal_of("##...##.  ..##", "..##  ..##...."))
+    np.testing.assert_array_equal(view.dashes.whole, [False, True, False, False, True])
+    np.testing.assert_array_equal(view.dashes.laser, [0, 0, 0, 1, 1])
+    np.testing.assert_array_equal(view.span_laser, [0, 0, 1, 1])
+
+
+def test_gaps_lie_between_dashes() -> None:
+    gaps = find_dashes(signal_of("..##...####.")).gaps
+    np.testing.assert_allclose(gaps.length, np.array([2, 3, 1]) * STEP)
+    np.testing.assert_array_equal(gaps.closed, [[False, True], [True, True], [True, False]])
+    # From the middle of the one dash to the middle of the other.
+    np.testing.assert_allclose(gaps.middles[1], [2.5 * STEP, 8.5 * STEP])
+    np.testing.assert_allclose(gaps.middles[0, 0], gaps.ends[0, 0])
+
+
+def test_a_line_that_runs_back_shows_the_same() -> None:
+    forth = find_dashes(signal_of("..###......#."))
+    back = find_dashes(signal_of(".#......###..", back=True))
+    for a, b in (
+        (forth.dashes.along, back.dashes.along),
+        (forth.gaps.ends, back.gaps.ends),
+        (forth.gaps.middles, back.gaps.middles),
+        (forth.span, back.span),
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_light_beyond_is_counted_where_it_is_dark() -> None:
+    view = find_dashes(signal_of("....##....", beyond="##..####.."))
+    np.testing.assert_allclose(view.gaps.beyond, [0.5, 0.5])
+    np.testing.assert_allclose(view.beyond, 0.5)
+
+
+def test_what_is_not_usable_counts_as_hidden() -> None:
+    signal = signal_of("..###....###..")
+    usable = np.ones(signal.state.shape, np.bool_)
+    usable[0, :7] = False
+    view = find_dashes(signal, usable)
+    assert len(view.dashes) == 1
+    assert view.seen_length == pytest.approx(7 * STEP)
+
+
+def test_nothing_seen_nothing_found() -> None:
+    view = find_dashes(signal_of("      ", "......"))
+    assert len(view.dashes) == 0
+    assert view.seen_length == pytest.approx(6 * STEP)
+    assert len(crossings_of(view).place) == 0
+
+
+def test_crossings_stand_for_all_that_was_seen() -> None:
+    view = find_dashes(signal_of("..###....###......#" * 4, " ..##..  ..##.." * 4 + " " * 16))
+    crossings = crossings_of(view)
+    length = np.hypot(*(crossings.end - crossings.begin).T)
+    assert length.sum() == pytest.approx(view.seen_length)
+    np.testing.assert_allclose(np.bincount(crossings.span_laser, length), crossings.length)
+    assert len(crossings.place) == np.count_nonzero(view.dashes.whole)
+
+
+def test_a_hole_is_no_place_to_look_for_the_lattice() -> None:
+    net, hole = "..##......" * 6, "." * 60
+    crossings = crossings_of(find_dashes(signal_of(net + hole + net)))
+    assert crossings.length[0] == pytest.approx(120 * STEP, abs=10 * STEP)
+    assert len(crossings.begin) == 2
