@@ -1,5 +1,6 @@
 """Patches: pieces of paraboloids over a plane, and the point of them nearest to the vehicle."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,9 +75,11 @@ class PatchFit:
 
 def flat_patch(plane: Plane) -> Patch:
     """Return a plane as a patch: u to the right, v upward."""
-    right = np.cross(plane.normal, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return Patch(plane, right, np.cross(right, plane.normal), FLAT)
+    a, b, c = plane.normal.tolist()
+    level = math.hypot(a, b)
+    right, ahead = b / level, -a / level
+    up = np.array([ahead * c, -right * c, right * b - ahead * a])
+    return Patch(plane, np.array([right, ahead, 0.0]), up, FLAT)
 
 
 def height_terms(u: FloatArray, v: FloatArray) -> FloatArray:
