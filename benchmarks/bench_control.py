@@ -15,10 +15,10 @@ import numpy as np
 from aqualvs.app.follow_fast import DiveResult, random_dives
 from aqualvs.app.follow_sim_case import tuned_gains, vehicle_model
 from aqualvs.app.follow_sim_measures import step_measures
-from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials, trial_gains
+from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials
 
 _VEHICLES = ("bluerov2", "bluerov2-heavy")
-_DIVES = 500
+_DIVES = {"bluerov2": 200, "bluerov2-heavy": 200, "videoray": 100}
 _SEEDS = (1, 2, 3)
 
 
@@ -27,15 +27,15 @@ def run() -> list[dict[str, Any]]:
     rows = [row for name in _VEHICLES for row in _trials(name, rendered=False)]
     if "AQUALVS_LOOP_RENDERED" in os.environ:
         rows += [row for name in _VEHICLES for row in _trials(name, rendered=True)]
-    for name in _VEHICLES:
-        rows += _dives(name, _DIVES // len(_VEHICLES))
+    for name, n in _DIVES.items():
+        rows += _dives(name, n)
     return rows
 
 
 def _trials(name: str, *, rendered: bool) -> list[dict[str, Any]]:
     """Return the worst of all seeds, and the step of their mean."""
     model = vehicle_model(name)
-    gains, fps = trial_gains(model), 12.5 if rendered else 25.0
+    gains, fps = tuned_gains(model), 12.5 if rendered else 25.0
     seeds = _SEEDS[:1] if rendered else _SEEDS
     each = [Trials(model, gains, rendered=rendered, fps=fps, seed=seed) for seed in seeds]
     runs = [one.hold_and_step() for one in each]
@@ -68,16 +68,23 @@ def _dives(name: str, n: int) -> list[dict[str, Any]]:
         return float(sum(of))
 
     late = max(dive.safety.neutral_late for dive in found)
+    nearest = min(dive.safety.least_clearance for dive in found)
     return [
         _row(f"{name}: {n} dives, contacts", count([d.safety.contact for d in found]), "", None),
         _row(f"{name}: {n} dives, unstable", count([_unstable(d) for d in found]), "", None),
         _row(f"{name}: {n} dives, sight lost", count([_lost(d) for d in found]), "", None),
+        _row(f"{name}: {n} dives, tipped over", count([_tipped(d) for d in found]), "", None),
+        _row(f"{name}: {n} dives, nearest", nearest, "m", None),
         _row(f"{name}: {n} dives, neutral after", late, "s", 0.2),
     ]
 
 
 def _unstable(dive: DiveResult) -> bool:
     return not dive.safety.stable
+
+
+def _tipped(dive: DiveResult) -> bool:
+    return dive.safety.greatest_tilt > math.radians(60.0)
 
 
 def _lost(dive: DiveResult) -> bool:

@@ -13,9 +13,13 @@ import pytest
 from aqualvs.app.follow_fast import DiveResult, random_dives
 from aqualvs.app.follow_sim_case import tuned_gains, vehicle_model
 from aqualvs.app.follow_sim_measures import step_measures
-from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials, trial_gains
+from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials
+from aqualvs.control.gains_file import load_gains
 
-N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "24"))
+N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))
+# Some of any kind, and the hardest that were met: a BlueROV2 Heavy that swings its pitch up with
+# too high a gain (29, 49, 151), strong currents onto the net (104, 173).
+HARD_SEEDS = (*range(5), 29, 49, 104, 151, 173)
 RENDERED = "AQUALVS_LOOP_RENDERED" in os.environ
 BOTH = pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
 SEEDS = (1, 2, 3)
@@ -24,7 +28,7 @@ SEEDS = (1, 2, 3)
 def trials(name: str, seed: int, *, rendered: bool = False) -> Trials:
     model = vehicle_model(name)
     fps = 12.5 if rendered else 25.0
-    return Trials(model, trial_gains(model), rendered=rendered, fps=fps, seed=seed)
+    return Trials(model, load_gains(model.name), rendered=rendered, fps=fps, seed=seed)
 
 
 @BOTH
@@ -59,7 +63,8 @@ def test_follows_a_curved_net_that_moves(name: str) -> None:
 def test_random_dives_are_safe(name: str) -> None:
     # A full stick is full thrust: half of it does not hold every drag and current drawn here.
     model = vehicle_model(name, pilot_gain=1.0)
-    found = list(random_dives(model, tuned_gains(model), range(N_RUNS // 2)))
+    seeds = range(N_RUNS // 2) if N_RUNS else HARD_SEEDS
+    found = list(random_dives(model, tuned_gains(model), seeds))
     assert not any(dive.safety.contact for dive in found)
     assert max(dive.safety.neutral_late for dive in found) <= 0.2
     assert sum(dive.safety.n_blind for dive in found) > 2 * len(found)

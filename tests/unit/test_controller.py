@@ -78,6 +78,17 @@ def test_step_in_a_current_is_no_slower(name: str) -> None:
     assert settling <= 4.0
 
 
+@pytest.mark.parametrize("onto", [0.35, -0.35])
+def test_the_force_of_a_strong_current_is_found_in_seconds(onto: float) -> None:
+    """Drag makes the Heavy's loop stiff there; the integral keeps up with that."""
+    gains = load_gains("bluerov2_heavy")
+    plant = PlanePlant(gains, current=(onto, 0.0))
+    run = fly(plant, RangeYawController(gains), HOLD, 12.0)
+    # Pushed off by 139 mm, 24 mm after 9 s; 201 and 128 mm where the integral does not rise.
+    assert np.abs(run.range - 0.6).max() < 0.16
+    assert np.abs(run.range[run.time > 9.0] - 0.6).max() < 0.03
+
+
 @pytest.mark.parametrize("name", VEHICLES)
 def test_step_of_the_yaw(name: str) -> None:
     gains = load_gains(name)

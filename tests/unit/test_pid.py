@@ -159,7 +159,7 @@ def test_applied_output_is_where_the_rate_limit_starts() -> None:
 def test_schedule_scales_proportional_and_integral() -> None:
     pid = Pid(PidOptions(proportional=2.0, integral=3.0))
     pid.update(0.0, 1.0, 0.0)
-    assert pid.update(0.1, 1.0, 0.0, schedule=2.0) == pytest.approx(4.0 + 0.6)
+    assert pid.update(0.1, 1.0, 0.0, schedule=(2.0, 3.0)) == pytest.approx(4.0 + 0.9)
 
 
 @pytest.mark.parametrize(

@@ -119,10 +119,32 @@ def test_too_close_backs_away_and_does_nothing_else() -> None:
     near = posture_at(gate.limits.least_range - 0.01)
     effort, reason = gate.check(100.0, 0.0, near, state_at(100.0), ASKED)
     assert reason is Reason.TOO_CLOSE
-    back = -gate.limits.retreat_effort
-    assert effort == Effort(forward=back, right=0.0, down=0.0, yaw=ASKED.yaw)
+    # 10 of the 50 mm over which the retreat grows firm.
+    back = -(0.25 + 0.2 * (0.5 - 0.25))
+    assert effort.forward == pytest.approx(back)
+    assert (effort.right, effort.down, effort.yaw) == (0.0, 0.0, ASKED.yaw)
     stronger = replace(ASKED, forward=-0.8)
     assert gate.check(100.04, 0.0, near, state_at(100.04), stronger)[0].forward == -0.8
+
+
+@pytest.mark.parametrize(("within", "back"), [(0.0005, 0.25), (0.025, 0.375), (0.2, 0.5)])
+def test_the_retreat_grows_firm_where_the_water_pushes_on(within: float, back: float) -> None:
+    gate = engaged()
+    near = posture_at(gate.limits.least_range - within)
+    effort, _ = gate.check(100.0, 0.0, near, state_at(100.0), NEUTRAL)
+    assert effort.forward == pytest.approx(-back, abs=0.003)
+    # Never less than asked for, even where braking is set to be gentler than retreating.
+    odd = engaged(limits=SafetyLimits(retreat_effort=0.4, brake_effort=0.2))
+    assert odd.check(100.0, 0.0, near, state_at(100.0), NEUTRAL)[0].forward == -0.4
+
+
+def test_a_posture_that_ages_is_taken_to_have_come_closer() -> None:
+    """0.1 m/s towards the target, 76 mm left: allowed when seen, too fast 0.1 s later."""
+    gate, posture = engaged(), posture_at(0.426)
+    young = gate.check(100.0, 0.0, posture, state_at(100.0), ASKED, range_rate=-0.1)
+    assert young == (ASKED, None)
+    old = gate.check(100.1, 0.1, posture, state_at(100.1), ASKED, range_rate=-0.1)
+    assert old[1] is Reason.TOO_FAST
 
 
 def test_the_nearest_point_counts_where_it_is_nearer_than_the_plane() -> None:
@@ -132,25 +154,27 @@ def test_the_nearest_point_counts_where_it_is_nearer_than_the_plane() -> None:
 
 
 @pytest.mark.parametrize(
-    ("distance", "range_rate", "reason"),
+    ("distance", "range_rate", "reason", "sent"),
     [
-        (1.0, -0.29, None),
-        (1.0, -0.31, Reason.TOO_FAST),
+        (1.0, -0.29, None, 0.3),
+        # 0.04 m/s too fast, of the 0.2 m/s (two thirds of what is allowed) that brake in full.
+        (1.0, -0.34, Reason.TOO_FAST, -0.1),
+        (1.0, -0.6, Reason.TOO_FAST, -0.5),
         # 70 mm are left: 0.1 m/s for 0.7 s.
-        (0.42, -0.09, None),
-        (0.42, -0.11, Reason.TOO_FAST),
-        (0.42, 0.5, None),
+        (0.42, -0.09, None, 0.3),
+        (0.42, -0.14, Reason.TOO_FAST, -0.3),
+        (0.42, 0.5, None, 0.3),
     ],
 )
 def test_closing_speed_is_limited_by_the_way_that_is_left(
-    distance: float, range_rate: float, reason: Reason | None
+    distance: float, range_rate: float, reason: Reason | None, sent: float
 ) -> None:
     posture = posture_at(distance)
     effort, found = engaged().check(
         100.0, 0.0, posture, state_at(100.0), ASKED, range_rate=range_rate
     )
     assert found is reason
-    assert effort.forward == (ASKED.forward if reason is None else -0.5)
+    assert effort.forward == pytest.approx(sent, abs=1e-5)
 
 
 @pytest.mark.parametrize(("speed", "reason"), [(0.25, None), (0.4, Reason.TOO_FAST)])

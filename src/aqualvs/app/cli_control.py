@@ -15,10 +15,11 @@ def tune(
         typer.Option("-o", "--output", help="Gains file; printed if left out.", show_default=False),
     ] = None,
     delay_ms: Annotated[
-        float, typer.Option(help="Usual delay from the exposure to the vehicle.")
-    ] = 100.0,
+        float,
+        typer.Option(help="Usual delay from the exposure to the vehicle. Less makes it faster."),
+    ] = 120.0,
     greatest_delay_ms: Annotated[
-        float, typer.Option(help="Delay that it must stand. Less makes it faster.")
+        float, typer.Option(help="Delay at which it must still be stable.")
     ] = 200.0,
     rate_hz: Annotated[float, typer.Option(help="Frames a second.")] = 25.0,
     current: Annotated[float, typer.Option(help="Greatest current in m/s.")] = 0.5,

@@ -1,7 +1,7 @@
 """Many short dives with everything drawn at random: what the safety of the loop rests on."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
@@ -154,7 +154,7 @@ def dive_and_measure(dive: RandomDive) -> DiveResult:
 def random_dives(
     model: VehicleModel,
     gains: ControlGains,
-    seeds: range,
+    seeds: Iterable[int],
     *,
     spread: Spread | None = None,
     workers: int = 1,

@@ -21,7 +21,6 @@ from aqualvs.control.gains import ControlGains
 from aqualvs.control.mission import HoldMission
 from aqualvs.control.missions_follow import FollowMission
 from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.tune import TuneOptions, tune
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle_models import VehicleModel
@@ -34,14 +33,6 @@ STEP_S, HOLD_END_S, FOLLOW_END_S = 40.0, 52.0, 70.0
 """When the step comes, and when the two runs end."""
 CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1.0))
 """The inside of a cage of 10 m radius, that sways and rocks."""
-
-
-def trial_gains(model: VehicleModel) -> ControlGains:
-    """Return the gains for these trials: tuned for delays up to 0.12 s, where 0.08 s is usual.
-
-    Those that come with the package stand 0.2 s, and are a quarter to a third slower.
-    """
-    return tune(model, TuneOptions(delay=0.08, greatest_delay=0.12)).gains
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,21 +56,25 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
-    """Return what to say of gains: margins at the usual delay and in the worst case, steps."""
+    """Return what to say of gains: margins at both delays, as it is and at worst; steps."""
     usual, most = options.delay, options.greatest_delay
     lines = [
-        f"{model.name}: margins at the usual delay, {1e3 * usual:.0f} ms, and in the worst corner "
-        f"(delay {1e3 * most:.0f} ms, mass x{options.mass_factor:g}, drag x{options.drag_factor:g} "
-        f"either way, current to {options.current:g} m/s)",
-        f"  {'':14}crossover    phase   gain   delay  modulus",
+        f"{model.name}: margins with the model as it is, and in the worst corner (mass "
+        f"x{options.mass_factor:g}, drag x{options.drag_factor:g} either way, current to "
+        f"{options.current:g} m/s)",
+        f"  {'':26}crossover    phase   gain   delay  modulus",
     ]
     rows = (
-        ("range, usual", tuned.range_usual),
-        ("range, worst", tuned.range_worst),
-        ("yaw, usual", tuned.yaw_usual),
-        ("yaw, worst", tuned.yaw_worst),
+        ("range", usual, "as it is", tuned.range_usual),
+        ("range", usual, "worst", tuned.range_corner),
+        ("range", most, "worst", tuned.range_late),
+        ("yaw", usual, "as it is", tuned.yaw_usual),
+        ("yaw", most, "worst", tuned.yaw_late),
     )
-    lines += [f"  {name:14}{_row(one)}" for name, one in rows]
+    lines += [
+        f"  {axis:5} {1e3 * delay:4.0f} ms, {which:9}  {_row(one)}"
+        for axis, delay, which, one in rows
+    ]
     for delay in (usual, most):
         step = StepOptions(delay=delay, frame=options.frame)
         answer = simulate_step(model, tuned.gains, step)

@@ -38,7 +38,7 @@ class Decision:
     effort : Effort
         What may be sent; neutral unless engaged.
     reason : Reason or None
-        Why it is not what the controller asked for.
+        Why it is not what the controller asked for, or why that is no more than to stay.
     guidance : Guidance
         What the mission wanted.
     engaged : bool
@@ -144,11 +144,11 @@ class NetPilot:
         return Decision(effort, reason, guidance, self.engaged)
 
     def _end(self, guidance: Guidance) -> Reason | None:
-        """Give the vehicle back where the mission has ended; return why."""
-        ended = _ENDS.get(guidance.stage)
-        if ended is not None:
-            self.gate.stop(ended)
-        return ended
+        """Give the vehicle back where the target stayed away; return why."""
+        if guidance.stage is not Stage.GAVE_UP:
+            return None
+        self.gate.stop(Reason.GAVE_UP)
+        return Reason.GAVE_UP
 
     def _other_stream(self, time_s: float) -> bool:
         """Return whether frame times have jumped back; then all that was seen is forgotten."""
@@ -213,14 +213,15 @@ class NetPilot:
 # Frames that the network held up may be so late; older ones are of another stream.
 _LATE_S = 0.5
 _IDLE = Guidance(setpoint=None, stage=Stage.IDLE)
-_ENDS = {Stage.OVER: Reason.MISSION_OVER, Stage.GAVE_UP: Reason.GAVE_UP}
 
 
 def _mission_says(guidance: Guidance) -> Reason | None:
-    """Return why a mission asks for nothing."""
+    """Return why a mission asks for nothing, or for no more than to stay."""
     if guidance.stage is Stage.WAITING:
         return Reason.NO_POSTURE
-    return Reason.NO_SETPOINT if guidance.setpoint is None else None
+    if guidance.setpoint is None:
+        return Reason.NO_SETPOINT
+    return Reason.MISSION_OVER if guidance.stage is Stage.OVER else None
 
 
 @dataclass(frozen=True, slots=True)

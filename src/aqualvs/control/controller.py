@@ -199,7 +199,7 @@ class RangeYawController:
         asked, found = (mending - ramp.seen_rate) / c, -rate / c
         swing = self._swell.update(step, asked - found)
         push, schedule = self._against_drag(ahead)
-        push += schedule * self._swing_gain * swing - ramp.change / c
+        push += schedule[0] * self._swing_gain * swing - ramp.change / c
         force = vehicle.mass * self._speed.update(
             self._time_s, asked, found, forward=push, schedule=schedule
         )
@@ -211,12 +211,12 @@ class RangeYawController:
         wanted = gains.position * (range - self._range_ramp.seen)
         return min(max(wanted, -gains.greatest_speed), gains.greatest_speed)
 
-    def _against_drag(self, ahead: float) -> tuple[float, float]:
+    def _against_drag(self, ahead: float) -> tuple[float, tuple[float, float]]:
         """Return the acceleration that keeps a speed, beyond what the integral gives.
 
-        The integral keeps the vehicle in its place: it tells how fast the water passes there. The
-        second number is the factor on the gains in that water: drag damps the vehicle as the
-        speed's gain does, and lets it be greater.
+        The integral keeps the vehicle in its place: it tells how fast the water passes there. With
+        it come the factors on the gains in that water: drag damps the vehicle as the speed's gain
+        does, and lets gain and integral be greater.
         """
         vehicle = self.gains.vehicle
         held = vehicle.mass * self._speed.integral

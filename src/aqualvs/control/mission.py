@@ -22,19 +22,19 @@ class Stage(StrEnum):
     WAITING = "waiting"
     """Without the target: neutral, it may come back."""
     OVER = "over"
-    """All done."""
+    """All done: holding where it ended, until the pilot takes over."""
     GAVE_UP = "gave_up"
     """The target stayed away for too long."""
 
     @property
     def ended(self) -> bool:
-        """Whether it never goes on by itself."""
+        """Whether the mission never goes on by itself."""
         return self in (Stage.OVER, Stage.GAVE_UP)
 
     @property
     def halts(self) -> bool:
         """Whether there must be no thrust."""
-        return self.ended or self in (Stage.IDLE, Stage.WAITING)
+        return self in (Stage.IDLE, Stage.WAITING, Stage.GAVE_UP)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,14 +165,14 @@ class LossWatch:
 
 
 class HoldMission:
-    """Hold a range and yaw, for some time or for good.
+    """Hold a range and yaw, for some time or for good; after that time it holds on.
 
     Parameters
     ----------
     setpoint : Setpoint or None
         Kept in `setpoint`, which may be set anew at any time.
     duration : float, optional
-        Seconds with the target; endless if left out.
+        Seconds with the target after which it is `Stage.OVER`; endless if left out.
     loss : LossOptions, optional
         What to do without the target.
     """
@@ -209,8 +209,7 @@ class HoldMission:
         """Return the setpoint, at rest."""
         lost = self._watch.update(now_s, posture is not None)
         self._spent_s += self._watch.spent_s
-        if self._spent_s >= self._duration:
-            return Guidance(setpoint=None, stage=Stage.OVER)
         if lost is Stage.GAVE_UP:
             return Guidance(setpoint=None, stage=lost)
-        return Guidance(setpoint=self.setpoint, stage=lost or Stage.HOLDING)
+        here = Stage.OVER if self._spent_s >= self._duration else Stage.HOLDING
+        return Guidance(setpoint=self.setpoint, stage=lost or here)

@@ -154,11 +154,9 @@ class FollowMission:
 
 
 def paced(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Guidance:
-    """Return the guidance along the net, or of its end, or of a lost target."""
-    if done:
-        return Guidance(setpoint=None, stage=Stage.OVER)
+    """Return the guidance along the net, or at its end, or without the target."""
     if lost is Stage.GAVE_UP:
         return Guidance(setpoint=None, stage=lost)
-    if lost is not None:
-        return Guidance(setpoint=setpoint, stage=lost)
+    if lost is not None or done:
+        return Guidance(setpoint=setpoint, stage=lost or Stage.OVER)
     return Guidance(setpoint=setpoint, sway=sway, stage=Stage.FOLLOWING)

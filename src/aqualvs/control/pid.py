@@ -133,7 +133,7 @@ class Pid:
         measured: float,
         rate: float | None = None,
         forward: float = 0.0,
-        schedule: float = 1.0,
+        schedule: tuple[float, float] = (1.0, 1.0),
     ) -> float:
         """Return the output for a measurement.
 
@@ -147,11 +147,11 @@ class Pid:
             The measurement's rate, where it is known; else it is filtered from differences.
         forward : float
             Added to the output.
-        schedule : float
-            Factor on proportional and integral gain, for a plant that is known to change.
+        schedule : (float, float)
+            Factors on proportional and integral gain, for a plant that is known to change.
         """
         step = time_s - self._time_s
-        values = (time_s, setpoint, measured, forward, schedule, 0.0 if rate is None else rate)
+        values = (time_s, setpoint, measured, forward, *schedule, 0.0 if rate is None else rate)
         longest = self.options.longest_step
         if not all(map(math.isfinite, values)) or -longest <= step <= 0.0:
             return self._output
@@ -171,11 +171,13 @@ class Pid:
         share = step / (step + self.options.derivative_time)
         return self._rate + share * (slope - self._rate)
 
-    def _moved(self, step: float, error: float, forward: float, schedule: float) -> float:
+    def _moved(
+        self, step: float, error: float, forward: float, schedule: tuple[float, float]
+    ) -> float:
         """Return the output, and integrate unless that drives it further beyond its limits."""
         options = self.options
-        growth = options.integral * schedule * error * step
-        straight = options.proportional * schedule * error
+        growth = options.integral * schedule[1] * error * step
+        straight = options.proportional * schedule[0] * error
         rest = straight - options.derivative * self._rate + forward
         wanted = rest + self._integral + growth
         allowed = self._limited(self._near_last(wanted, step))

@@ -54,7 +54,7 @@ _WORDS = {
     Reason.TOO_CLOSE: "closer than the least range; backing away",
     Reason.TOO_FAST: "closing in too fast; braking",
     Reason.NO_SETPOINT: "no range is set to hold",
-    Reason.MISSION_OVER: "the plan is done; stopped until engaged again",
+    Reason.MISSION_OVER: "the plan is done; holding until the pilot takes over",
     Reason.GAVE_UP: "the target was lost for too long; stopped until engaged again",
 }
 _TAKES_OVER = frozenset(
@@ -64,7 +64,6 @@ _TAKES_OVER = frozenset(
         Reason.DISARMED,
         Reason.PILOT_MODE,
         Reason.PILOT_STICKS,
-        Reason.MISSION_OVER,
         Reason.GAVE_UP,
     }
 )
@@ -91,9 +90,11 @@ class SafetyLimits:
         allowed shrinks with the way that is left.
     retreat_effort : float
         With which it backs away from too close; more where the controller asks for more. Must
-        exceed the thrusters' dead band.
+        exceed the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: whoever
+        still comes closer is pushed by the water.
     brake_effort : float
-        With which it brakes what closes in too fast; likewise.
+        With which it brakes what closes in by two thirds or more faster than allowed; likewise.
+        Below it is less in proportion: braking is not to throw the vehicle out of sight.
     """
 
     posture_age: float = 0.15
@@ -191,7 +192,8 @@ class SafetyGate:
             return NEUTRAL, refused or Reason.NO_POSTURE
         near = min(posture.range, posture.nearest)
         closing = self._closing_speed(now_s - posture_age_s, near, range_rate)
-        return self._guarded(effort, near, closing)
+        # What came closer goes on coming closer while nobody sees it.
+        return self._guarded(effort, near - max(closing, 0.0) * posture_age_s, closing)
 
     def _clock_refuses(self, now_s: float) -> Reason | None:
         backwards = not now_s >= self._last_s
@@ -241,17 +243,28 @@ class SafetyGate:
             return 0.0
         return (first - last) / (last_s - first_s)
 
+    def _retreat(self, within: float) -> float:
+        """Return the effort with which it backs away so far within the least range."""
+        gentle, firm = self.limits.retreat_effort, self.limits.brake_effort
+        return gentle + max(firm - gentle, 0.0) * min(within / _FIRM_WITHIN_M, 1.0)
+
     def _guarded(self, effort: Effort, near: float, closing: float) -> tuple[Effort, Reason | None]:
         """Return the effort without what brings the target too close."""
         limits = self.limits
         left = near - limits.least_range
         if left < 0.0:
-            return _backing(effort, limits.retreat_effort), Reason.TOO_CLOSE
-        if closing > min(limits.approach_speed, left / limits.stopping_time):
-            return _backing(effort, limits.brake_effort), Reason.TOO_FAST
+            return _backing(effort, self._retreat(-left)), Reason.TOO_CLOSE
+        allowed = min(limits.approach_speed, left / limits.stopping_time)
+        if closing > allowed:
+            share = min((closing - allowed) / (_FIRM_ABOVE * allowed + 1e-6), 1.0)
+            return _backing(effort, share * limits.brake_effort), Reason.TOO_FAST
         return _clipped(effort), None
 
 
+# The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat is
+# firm before.
+_FIRM_WITHIN_M = 0.05
+_FIRM_ABOVE = 2.0 / 3.0
 # Postures that far apart tell the closing speed to some cm/s in spite of their noise.
 _SPEED_WINDOW_S = 0.4
 _LEAST_WINDOW_S = 0.15

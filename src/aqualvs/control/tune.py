@@ -5,14 +5,15 @@ drag's slope b over mass, behind its thrusters' lag and the delay of picture, li
 With the gains `speed` k1, `position` k0 and `integral` ki, and the band H about the swell's period,
 the open loop is
 
-    L(s) = (g k1 (1 + ki / (k1 s) + 0.7 H(s)) (s + k0) + b k0) / (s (s + b)) / (lag s + 1)
+    L(s) = ((g k1 (1 + 1.2 H(s)) + h ki / s) (s + k0) + b k0) / (s (s + b)) / (lag s + 1)
            exp(-delay s),
 
-g = 1 + 0.5 b / k1 being the controller's schedule in moving water. k0 = 0.35 k1 and ki = 0.2 k1²
-place the poles without swell, lag, delay and drag at 0.17 k1 and at (0.42 +- 0.49 j) k1, damped by
-0.65. So one number is left; it is the greatest for which the modulus margin stays at
-`least_modulus` in every corner: mass and drag off by the factors asked for, the greatest delay,
-water at rest and at the greatest current.
+g = 1 + 0.8 b / k1, at most 2.2, and h = 1 + 1.2 b / k1, at most 6, being the controller's schedule
+in moving water. The shares k0 = 0.3 k1, ki = 0.25 k1² and that of H were chosen among some hundred:
+they let little of swell and of changes of the current through at given margins, over all three
+vehicles. So one number is left; it is the greatest for which the modulus margin stays at
+`least_modulus` with the usual delay, and at `least_late_modulus` with the greatest, in every
+corner: mass and drag off by the factors asked for, water at rest and at the greatest current.
 
 Yaw: the autopilot keeps turning rates with a lag, that of its shaping, its rate loop and the
 thrusters; L(s) = (kp s + ki) / s² / (lag s + 1) exp(-delay s) with ki = 0.15 kp², and kp the
@@ -39,8 +40,8 @@ from aqualvs.control.tune_model import Turning, facts_of, tidy, turning_of
 from aqualvs.errors import OptionError
 from aqualvs.simulation.vehicle_models import VehicleModel
 
-_POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.35, 0.2, 0.15
-_SWELL = 0.7
+_POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.3, 0.25, 0.15
+_SWELL = 1.2
 # In the thrusters' dead band the autopilot follows a turning rate so many times later.
 _SLUGGISH = 4.0
 # Where the bisection of a gain begins and ends, in 1/s.
@@ -56,7 +57,7 @@ class TuneOptions:
     delay : float
         From the exposure to the effort at the vehicle, in seconds: what it usually is.
     greatest_delay : float
-        What it may become.
+        What it may become; performance may suffer there, stability must not.
     frame : float
         Seconds between frames; half of it counts as delay, for efforts are held so long.
     mass_factor, drag_factor : float
@@ -64,19 +65,22 @@ class TuneOptions:
     current : float
         Greatest speed of the water, in m/s.
     least_modulus : float
-        Least distance of the loop from -1 in the worst corner, where all is off at once; at the
-        usual delay, with the model as it is, it comes out at about twice that.
+        Least distance of the loop from -1 at the usual delay, in the worst corner, where mass, drag
+        and current are off at once.
+    least_late_modulus : float
+        As much at the greatest delay.
     least_yaw_modulus : float
-        As much for the yaw, which has less to fight.
+        Of the yaw at the greatest delay; it has less to fight.
     """
 
-    delay: float = 0.1
+    delay: float = 0.12
     greatest_delay: float = 0.2
     frame: float = 0.04
     mass_factor: float = 1.2
     drag_factor: float = 2.0
     current: float = 0.5
-    least_modulus: float = 0.3
+    least_modulus: float = 0.35
+    least_late_modulus: float = 0.2
     least_yaw_modulus: float = 0.45
 
     def __post_init__(self) -> None:
@@ -96,11 +100,12 @@ class TuneOptions:
                 f"tune: frame {self.frame:g} s, factors {self.mass_factor:g} and "
                 f"{self.drag_factor:g}; the first is positive, the others are at least 1"
             )
-        moduli = (self.least_modulus, self.least_yaw_modulus)
+        moduli = (self.least_modulus, self.least_late_modulus, self.least_yaw_modulus)
         if not (self.current >= 0.0 and 0.0 < min(moduli) <= max(moduli) < 1.0):
             raise OptionError(
-                f"tune: current {self.current:g} m/s, least moduli {moduli[0]:g} and "
-                f"{moduli[1]:g}; the first is 0 or more, the others between 0 and 1"
+                f"tune: current {self.current:g} m/s, least moduli "
+                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 or more, the others "
+                "between 0 and 1"
             )
 
 
@@ -111,15 +116,20 @@ class Tuned:
     Attributes
     ----------
     gains : ControlGains
-    range_usual, range_worst, yaw_usual, yaw_worst : Margins
-        At the usual delay with the model as it is, and in the worst corner.
+    range_usual, yaw_usual : Margins
+        At the usual delay with the model as it is, in still water.
+    range_corner : Margins
+        At the usual delay in the worst corner.
+    range_late, yaw_late : Margins
+        At the greatest delay in the worst corner.
     """
 
     gains: ControlGains
     range_usual: Margins
-    range_worst: Margins
+    range_corner: Margins
+    range_late: Margins
     yaw_usual: Margins
-    yaw_worst: Margins
+    yaw_late: Margins
 
 
 def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
@@ -141,17 +151,26 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     def of_yaw(k: float) -> YawGains:
         return _yaw_gains(k, turn.lag() + usual)
 
-    k1 = _greatest(
-        model.name, lambda k: _range_worst(facts, lag, of_range(k), options), options.least_modulus
-    )
+    def range_worst(of: RangeGains, delay: float) -> Margins:
+        return _range_worst(facts, lag, of, delay, options)
+
+    def range_is_enough(k: float) -> bool:
+        of = of_range(k)
+        return _enough(range_worst(of, options.delay), options.least_modulus) and _enough(
+            range_worst(of, options.greatest_delay), options.least_late_modulus
+        )
+
+    k1 = _greatest(model.name, range_is_enough)
     kp = _greatest(
-        model.name, lambda k: _yaw_worst(turn, of_yaw(k), options), options.least_yaw_modulus
+        model.name,
+        lambda k: _enough(_yaw_worst(turn, of_yaw(k), options), options.least_yaw_modulus),
     )
     gains = ControlGains(vehicle=facts, range=of_range(k1), yaw=of_yaw(kp))
     return Tuned(
         gains,
         margins(_range_loop(facts, lag, gains.range, usual, 0.0)),
-        _range_worst(facts, lag, gains.range, options),
+        range_worst(gains.range, options.delay),
+        range_worst(gains.range, options.greatest_delay),
         margins(_yaw_loop(turn.lag(), gains.yaw, usual)),
         _yaw_worst(turn, gains.yaw, options),
     )
@@ -191,9 +210,11 @@ def _range_loop(
     swell = np.array([1.0, 2.0 * zeta * w, w * w])
     swings = gains.swell * np.array([2.0 * zeta * w, 0.0])
     known = slope / facts.mass
-    pushes = np.polymul([gains.speed, gains.integral], swell)
-    pushes = np.polyadd(pushes, gains.speed * np.polymul([1.0, 0.0], swings))
-    above = gain_schedule(gains, known) * np.polymul(pushes, [1.0, gains.position])
+    of_speed, of_integral = gain_schedule(gains, known)
+    speed, integral = of_speed * gains.speed, of_integral * gains.integral
+    pushes = np.polymul([speed, integral], swell)
+    pushes = np.polyadd(pushes, speed * np.polymul([1.0, 0.0], swings))
+    above = np.polymul(pushes, [1.0, gains.position])
     # Drag is put in beforehand at the speed asked for, which follows the position.
     ahead = known * gains.position
     above = np.polyadd(above, ahead * np.polymul([1.0, 0.0], swell)) / mass
@@ -202,11 +223,11 @@ def _range_loop(
 
 
 def _range_worst(
-    facts: VehicleFacts, lag: float, gains: RangeGains, options: TuneOptions
+    facts: VehicleFacts, lag: float, gains: RangeGains, delay: float, options: TuneOptions
 ) -> Margins:
-    delay = options.greatest_delay + 0.5 * options.frame
+    whole = delay + 0.5 * options.frame
     return worst(
-        margins(_range_loop(facts, lag, gains, delay, current, mass, drag))
+        margins(_range_loop(facts, lag, gains, whole, current, mass, drag))
         for mass, drag, current in _corners(options)
     )
 
@@ -227,17 +248,15 @@ def _yaw_worst(turning: Turning, gains: YawGains, options: TuneOptions) -> Margi
     return worst(margins(_yaw_loop(lag, gains, delay)) for lag in lags)
 
 
-def _greatest(name: str, of: Callable[[float], Margins], least: float) -> float:
-    """Return the greatest gain whose worst modulus margin is enough, by bisection."""
+def _enough(found: Margins, least: float) -> bool:
+    return found.stable and found.modulus >= least
 
-    def enough(gain: float) -> bool:
-        found = of(gain)
-        return found.stable and found.modulus >= least
 
+def _greatest(name: str, enough: Callable[[float], bool]) -> float:
+    """Return the greatest gain whose margins are enough, by bisection."""
     if not enough(_LEAST):
         raise OptionError(
-            f"tune {name}: no gains leave a modulus margin of {least:g}; lower the greatest delay, "
-            "or the margin"
+            f"tune {name}: no gains leave the margins asked for; lower the delays, or the margins"
         )
     low, high = _LEAST, _GREATEST
     while high > 1.005 * low:
