@@ -83,8 +83,8 @@ def _lit_by(
     solid, clear = strong & np.isfinite(reach), strong & (bubble < reach)
     points = np.concatenate(
         [
-            (origins + reach[:, None] * directions)[solid],
-            (origins + bubble[:, None] * directions)[clear],
+            origins[solid] + reach[solid, None] * directions[solid],
+            origins[clear] + bubble[clear, None] * directions[clear],
         ]
     )
     on_bubbles = np.full(int(clear.sum()), Label.BUBBLE, dtype=np.int32)

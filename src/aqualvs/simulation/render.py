@@ -87,8 +87,19 @@ class Renderer:
         image = expose(spread(light, scene.water, scene.sensor), scene.sensor, rng)
         return Picture(image, find_lit_points(self.rig, surfaces, sheets))
 
-    def radiance(self, scene: Scene, t: float = 0.0) -> NDArray[np.float32]:
+    def radiance(
+        self, scene: Scene, t: float = 0.0, where: BoolArray | None = None
+    ) -> NDArray[np.float32]:
         """Return what reaches the lens at time `t`, before blur, noise and saturation.
+
+        Parameters
+        ----------
+        scene : Scene
+            At time `t`.
+        t : float
+            In seconds.
+        where : bool array, shape (height, width), optional
+            Pixels that must be traced; others may lack all light but that of marine snow.
 
         Returns
         -------
@@ -96,7 +107,7 @@ class Renderer:
             Red, green, blue; 1 is the sensor's full scale at gain 1. Zero where the lens model
             or the housing lets no light through.
         """
-        return self._radiance(scene, t, *self._pack(scene, t))
+        return self._radiance(scene, t, *self._pack(scene, t), where)
 
     def lit_points(self, scene: Scene, t: float = 0.0) -> LitPoints:
         """Return the truth of the stripes at time `t` without rendering a picture."""
@@ -109,7 +120,12 @@ class Renderer:
         return surfaces, light_sheets(self.rig, self.sources, surfaces)
 
     def _radiance(
-        self, scene: Scene, t: float, surfaces: Surfaces, sheets: Sheets
+        self,
+        scene: Scene,
+        t: float,
+        surfaces: Surfaces,
+        sheets: Sheets,
+        where: BoolArray | None = None,
     ) -> NDArray[np.float32]:
         width, height = self.rig.size_px
         camera = self.rig.camera()
@@ -117,6 +133,8 @@ class Renderer:
         members = tile_members(camera, self.rig.size_px, surfaces)
         everything = np.arange(len(surfaces.ellipsoids), dtype=np.int64)
         light, rays = pack_light(scene, t), self._corners
+        if where is not None:
+            rays = rays.only(where)
 
         def render_band(band: tuple[int, int]) -> None:
             _render(band, rays, self.samples, surfaces, members, everything, sheets, light, out)
@@ -134,6 +152,14 @@ class CornerRays(NamedTuple):
     origins: FloatArray
     directions: FloatArray
     valid: BoolArray
+
+    def only(self, where: BoolArray) -> "CornerRays":
+        """Return the same rays, invalid but at the corners of some pixels (height, width)."""
+        wanted = np.zeros_like(self.valid)
+        for rows in (slice(None, -1), slice(1, None)):
+            for columns in (slice(None, -1), slice(1, None)):
+                wanted[rows, columns] |= where
+        return self._replace(valid=self.valid & wanted)
 
 
 def corner_rays(rig: Rig) -> CornerRays:

@@ -1,0 +1,73 @@
+"""The command line of the benchmark: signatures only; bodies are imported when they run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def benchmark(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[LEVEL|DIVE]...",
+            help="Which levels or dives; all if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(help="Frames of every dive, for a quick look.", show_default=False),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a set that is there.")
+    ] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List levels and dives and exit.")] = False,
+) -> None:
+    """Render the benchmark set."""
+    from aqualvs.app import score_make as body
+    from aqualvs.errors import OptionError
+
+    if list_:
+        body.tell_dives(typer.echo)
+        return
+    if out is None:
+        raise OptionError("--out: missing; give the folder to write")
+    body.make_set(out, names or [], typer.echo, n_frames=frames, overwrite=overwrite)
+
+
+def score(
+    truth: Annotated[
+        Path, typer.Option(help="Folder of the set, from 'aqualvs benchmark'.", show_default=False)
+    ],
+    results: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=PATH]...",
+            help="What a system answered: a folder with DIVE.csv or DIVE/posture.csv, or one CSV "
+            "with a column dive.",
+            show_default=False,
+        ),
+    ] = None,
+    own: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run aqualvs and its baselines over the set into this folder, and score them too.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder for scores.csv, .json and .md.", show_default=False
+        ),
+    ] = None,
+    dives: Annotated[bool, typer.Option("--dives", help="Show every dive in the table.")] = False,
+) -> None:
+    """Score systems."""
+    from aqualvs.app import score as body
+
+    body.score_and_tell(results or [], truth, typer.echo, own=own, out=out, dives=dives)

@@ -1,0 +1,101 @@
+"""The systems that come with aqualvs, run over a benchmark set: itself, and what it is held to."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from aqualvs.app.disk import writing
+from aqualvs.app.outputs import POSTURE_BARE_CSV
+from aqualvs.app.run import RunRequest, run
+from aqualvs.app.run_inputs import scanner_options
+from aqualvs.app.score_set import TARGET_FILE, BenchmarkSet
+from aqualvs.app.target_file import target_facts
+from aqualvs.scanning.target import TargetKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnSystem:
+    """Options of `aqualvs run`.
+
+    Attributes
+    ----------
+    name : str
+    detector : {"ridge", "threshold"}
+    mesh_filter : {"none", "paper"}
+    fit : {"robust", "pseudo_inverse"}
+    no_dome : bool
+    """
+
+    name: str
+    detector: str = "ridge"
+    mesh_filter: str = "none"
+    fit: str = "robust"
+    no_dome: bool = False
+
+
+OWN_SYSTEMS = (
+    OwnSystem(name="aqualvs"),
+    OwnSystem(name="no-dome", no_dome=True),
+    OwnSystem(name="threshold", detector="threshold"),
+    OwnSystem(name="paper-filter", mesh_filter="paper"),
+    OwnSystem(name="paper", detector="threshold", mesh_filter="paper", fit="pseudo_inverse"),
+)
+"""aqualvs as it is; without its dome model; with the paper's detector; with the paper's filter for
+nets, which is told the net; and with the paper's detector, filter and fit, dome modelled."""
+
+BARE_LENS = "bare-lens"
+"""What aqualvs found, triangulated again without the dome: the stripes are told apart with it."""
+
+
+def run_own(benchmark: BenchmarkSet, folder: Path, tell: Callable[[str], object]) -> list[str]:
+    """Measure every dive of a set with every system of `OWN_SYSTEMS`.
+
+    Parameters
+    ----------
+    benchmark : BenchmarkSet
+    folder : Path
+        A run goes to SYSTEM/DIVE in it; what is there is replaced.
+    tell : callable
+        Takes one line of text.
+
+    Returns
+    -------
+    arguments : list of str
+        NAME=PATH of every system, to be scored.
+
+    Raises
+    ------
+    AqualvsError
+        If a dive cannot be read or the folder not be written.
+    """
+    for system in OWN_SYSTEMS:
+        for dive in benchmark.dives:
+            run(_request(system, benchmark.folder / dive.name, folder / system.name / dive.name))
+        tell(f"{system.name}: {len(benchmark.dives)} dives measured into {folder / system.name}")
+    bare = folder / BARE_LENS
+    with writing(bare):
+        bare.mkdir(exist_ok=True)
+        for dive in benchmark.dives:
+            found = folder / OWN_SYSTEMS[0].name / dive.name / POSTURE_BARE_CSV
+            shutil.copyfile(found, bare / f"{dive.name}.csv")
+    names = [*(system.name for system in OWN_SYSTEMS), BARE_LENS]
+    return [f"{name}={folder / name}" for name in names]
+
+
+def _request(system: OwnSystem, source: Path, out: Path) -> RunRequest:
+    """Return what to run; a wall is no net, so no filter for nets is laid over it."""
+    target, mesh_filter = "auto", "none"
+    if system.mesh_filter == "paper":
+        told = str(source / TARGET_FILE)
+        if target_facts(told).kind is not TargetKind.SOLID:
+            target, mesh_filter = told, system.mesh_filter
+    return RunRequest(
+        source=str(source / "dive.mp4"),
+        rig=source / "rig.yaml",
+        out=out,
+        overwrite=True,
+        no_dome=system.no_dome,
+        scanner=scanner_options(target, system.detector, mesh_filter, system.fit),
+        report=False,
+    )

@@ -1,0 +1,139 @@
+"""`aqualvs design`: from options to tables, a rig that works, and pictures."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from aqualvs.app.cli import main
+from aqualvs.app.design.command import designed_rig
+from aqualvs.app.design.file import EXAMPLE, design_of_rig
+from aqualvs.app.design.predict import predict
+from aqualvs.geometry.transforms import SE3
+from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanning.scan import Frame
+from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenarios import load_scenario
+from shell_cases import rig_file
+
+SMALL = ["--image", "720x576", "--fov-deg", "48", "--dome-mm", "44.25:5.75"]
+SMALL += ["--lens-mm", "0,20,0", "--range-mm", "300:900", "--no-changes"]
+# Slightly askew, as lasers are.
+MOUNTS = [
+    {"name": "lower", "position_mm": [5, 0, -160], "stripe_deg": 2},
+    {"name": "left", "position_mm": [-160, 0, -5], "stripe_deg": 91},
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What one call with a file and options writes."""
+    folder = tmp_path_factory.mktemp("design")
+    content = {**yaml.safe_load(EXAMPLE), "mounts": MOUNTS}
+    del content["lasers"]
+    (folder / "design.yaml").write_text(yaml.safe_dump(content))
+    assert main(["design", str(folder / "design.yaml"), *SMALL, "-o", str(folder / "out")]) == 0
+    return folder / "out"
+
+
+def test_help_has_an_example(capsys):
+    assert main(["design", "--help"]) == 0
+    assert "Example: aqualvs design" in capsys.readouterr().out
+
+
+def test_the_example_is_a_design_file(tmp_path, capsys):
+    assert main(["design", "--example"]) == 0
+    path = tmp_path / "design.yaml"
+    path.write_text(capsys.readouterr().out)
+    assert main(["design", str(path), "--no-changes"]) == 0
+    said = capsys.readouterr().out
+    assert "rov: 1920x1080 px" in said
+    for words in ("upper_left", "Expected error", "Tolerances at", "Lens ahead", "strands"):
+        assert words in said
+    assert max(map(len, said.splitlines()[3:9])) <= 80
+
+
+def test_options_take_the_place_of_the_files_values(tmp_path, capsys):
+    path = tmp_path / "design.yaml"
+    main(["design", "--example"])
+    path.write_text(capsys.readouterr().out)
+    options = ["--lens-mm", "0,12,0", "--lasers", "2", "--no-changes", "--no-tilt"]
+    assert main(["design", str(path), *options]) == 0
+    said = capsys.readouterr().out
+    assert "lens at (0, 12, 0) mm" in said
+    assert "upper_left" not in said
+    assert "Laser 'lower' is in the picture at" in said
+
+
+def test_the_rig_it_writes_is_sane_and_measures_as_predicted(folder, capsys):
+    assert main(["check", str(folder / "rig.yaml")]) == 0
+    assert "This rig is sane" in capsys.readouterr().out
+    rig = load_rig(folder / "rig.yaml")
+    assert [laser.name for laser in rig.lasers] == ["lower", "left"]
+    assert rig.solved_from["design"]["mounts"][0]["position_mm"] == [5.0, 0.0, -160.0]
+    scene = load_scenario("wall").scene_at(0.5)
+    for wall_range in (0.35, 0.8):
+        ahead = SE3(np.eye(3), np.array([0.0, wall_range, 0.0]))
+        picture = Renderer(rig, threads=1).render(
+            replace(scene, dome_from_scene=ahead), 0.5, np.random.default_rng(1)
+        )
+        luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+        posture = Scanner(rig).process(Frame(0, 0.5, luma, chroma)).posture
+        assert posture, posture
+        told = predict(design_of_rig(rig), [wall_range]).wall[0]
+        found = np.array([posture.range - wall_range, posture.pitch, posture.yaw])
+        # Four sigma, and 0.01 % for the glow of the sheets in the water.
+        assert np.all(np.abs(found) < 4.0 * told + [1e-4 * wall_range, 0.0, 0.0])
+        # The scanner's own sigma, from real residuals, is the prediction's.
+        stated = np.sqrt(np.diag(posture.covariance))
+        np.testing.assert_allclose(stated, told, rtol=0.3)
+
+
+def test_it_draws_two_pictures(folder):
+    for name in ("errors.png", "picture.png"):
+        image = cv2.imread(str(folder / name))
+        assert image.shape[1] > 1000
+        # Something is drawn: not one colour.
+        assert image.std() > 10.0
+
+
+def test_a_rig_that_exists_is_judged_as_it_is_and_tilted_best(tmp_path, capsys):
+    path = rig_file(tmp_path)
+    assert main(["design", "--rig", str(path), "--no-changes"]) == 0
+    said = capsys.readouterr().out
+    assert "As it is" in said
+    assert "Tilted best, its errors are" in said
+    assert main(["design", "--rig", str(path), "--no-changes", "--no-tilt"]) == 0
+    said = capsys.readouterr().out
+    assert "As it is" not in said
+    assert "19.9" in said  # The lower laser's tilt, asin(0.340) = 19.9 degrees.
+
+
+def test_the_note_of_the_mounts_is_read_back_by_the_rig_file(tmp_path):
+    rig = designed_rig(design_of_rig(example_rig()))
+    note = yaml.safe_load(yaml.safe_dump(dict(rig.solved_from)))
+    assert [one["name"] for one in note["design"]["mounts"]] == ["lower", "left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--image", "1920"], "--image 1920: write 2 numbers as NxN"),
+        (["--lens-mm", "0,a,0"], "--lens-mm 0,a,0: write 3 numbers"),
+        (["--range-mm", "900:300"], "nearest range first"),
+        (["--lasers", "0"], "lasers.count is 0"),
+        (["no.yaml"], "no such file"),
+        (["no.yaml", "--rig", "no.yaml"], "not both"),
+        (["--rig", "no.yaml", "--lasers", "2"], "says lasers itself"),
+    ],
+)
+def test_faults_of_the_user_become_one_line(arguments, words, capsys):
+    assert main(["design", *arguments]) == 2
+    complaint = capsys.readouterr().err
+    assert words in complaint
+    assert complaint.count("\n") == 1
