@@ -54,14 +54,20 @@ def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
     OSError
         If a picture cannot be written.
     """
+    written = []
+    for name, figure in drawn_follow_figures(log).items():
+        path = out / f"{name}.png"
+        figure.savefig(path, dpi=_DPI)
+        written.append(path)
+    return written
+
+
+def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
+    """Return the same pictures by name, not yet written."""
     from matplotlib import rc_context
 
-    written = []
     with rc_context(_STYLE):
-        for name, draw in (("figure_22.png", _motion), ("figure_23.png", _control)):
-            draw(log).savefig(out / name, dpi=_DPI)
-            written.append(out / name)
-    return written
+        return {"figure_22": _motion(log), "figure_23": _control(log)}
 
 
 def _motion(log: LoopLog) -> "Figure":

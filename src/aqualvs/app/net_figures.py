@@ -84,20 +84,24 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path
     OSError
         If a picture cannot be written.
     """
+    written = []
+    for name, figure in drawn_figures(reflections, options).items():
+        path = out / f"{name}.png"
+        figure.savefig(path, dpi=_DPI)
+        written.append(path)
+    return written
+
+
+def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> "dict[str, Figure]":
+    """Return the same pictures by name, not yet written."""
     from matplotlib import rc_context
 
-    pictures = {
-        "figure_13.png": _all_reflections,
-        "figure_14.png": _filtered,
-        "laser_plane_image.png": _binary_image,
-    }
-    written = []
     with rc_context(_STYLE):
-        for name, draw in pictures.items():
-            figure = draw(reflections, options)
-            figure.savefig(out / name, dpi=_DPI)
-            written.append(out / name)
-    return written
+        return {
+            "figure_13": _all_reflections(reflections, options),
+            "figure_14": _filtered(reflections, options),
+            "laser_plane_image": _binary_image(reflections, options),
+        }
 
 
 def _figure(width_in: float, height_in: float) -> "Figure":

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import TypeAlias
 
 from rich.console import Console
@@ -20,6 +21,7 @@ Tick: TypeAlias = Callable[[int], None]
 
 # Until the first frame is done; compiled code is kept for the next run.
 _FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
+_HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
 class _Rate(ProgressColumn):
@@ -36,8 +38,18 @@ class _Rate(ProgressColumn):
 
 
 @contextlib.contextmanager
+def hidden_progress() -> Iterator[None]:
+    """Show no bars of what is done inside: two at a time overwrite each other."""
+    token = _HIDDEN.set(True)
+    try:
+        yield
+    finally:
+        _HIDDEN.reset(token)
+
+
+@contextlib.contextmanager
 def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
-    """Show a progress bar; nothing where standard error is not a terminal.
+    """Show a progress bar; nothing where standard error is not a terminal, or bars are hidden.
 
     Parameters
     ----------
@@ -60,7 +72,7 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
         TimeRemainingColumn(),
         console=console,
         transient=True,
-        disable=not console.is_terminal,
+        disable=_HIDDEN.get() or not console.is_terminal,
     )
     with bar:
         task = bar.add_task(f"{label} {_FIRST_RUN}", total=n_frames)

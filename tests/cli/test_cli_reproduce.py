@@ -1,0 +1,37 @@
+"""`aqualvs reproduce` from the command line."""
+
+import pytest
+
+from aqualvs.app.cli import main
+from aqualvs.app.reproduce import catalogue
+
+
+def test_unknown_experiment_is_one_line_and_exit_code_2(tmp_path, capsys):
+    assert main(["reproduce", "nets", "-o", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("aqualvs: error: nets: no such experiment; choose from rig,")
+    assert said.err.count("\n") == 1
+
+
+def test_folder_that_is_a_file_is_exit_code_2(tmp_path, capsys):
+    (tmp_path / "out").write_text("")
+    assert main(["reproduce", "rig", "-o", str(tmp_path / "out")]) == 2
+    assert "choose another folder" in capsys.readouterr().err
+
+
+def test_list_names_every_experiment(capsys):
+    assert main(["reproduce", "--list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(catalogue.MODULES)
+
+
+@pytest.mark.parametrize("name", ["rig"])
+def test_experiment_is_run_and_its_page_written(tmp_path, capsys, name):
+    out = tmp_path / "out"
+    assert main(["reproduce", name, "-o", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"[1/1] {name}: ")
+    assert f"page: {out / 'reproduce.html'}" in said
+    assert (out / "results.json").is_file()
+    assert (out / "reproduce.html").stat().st_size > 20_000
