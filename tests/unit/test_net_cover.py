@@ -1,5 +1,7 @@
 """Kinds of dashes and solidity, from made-up dashes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,14 +13,16 @@ from aqualvs.scanning.net_lines import NetSignal
 from aqualvs.scanning.net_track import LatticeFitter
 from aqualvs.scanning.net_twine import Twine
 
-BAR, STEP, HALF = 0.05, 5e-4, 0.4
+BAR, STEP, HALF, HEIGHT = 0.05, 5e-4, 0.4, 100.0
 NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0, np.ones(2))
 TURN = np.deg2rad(40.0)
-# Body 2.4 mm, halo 0.6 mm and 0.2 steps of the search lines.
+# Body 2.4 mm, halo 0.6 mm and a share of a step of the search lines.
 TWINE = Twine(2.5e-3, 2e-4, 2.4e-3, 3e-3, 0.6e-3, 2e-4)
 
 
-def view_of(shift: float, grown: float = 0.0, turn: float = TURN) -> NetView:
+def view_of(
+    shift: float, grown: float = 0.0, turn: float = TURN, height: float = HEIGHT
+) -> NetView:
     """What two lasers, turned from level and upright, show of a square net.
 
     Dashes are as long as the twine says, and a share `grown` of them 4 mm longer.
@@ -33,7 +37,7 @@ def view_of(shift: float, grown: float = 0.0, turn: float = TURN) -> NetView:
         for k in range(2):
             across = abs(t[k])
             slant = abs(search[i, k]) / (across * square)
-            usual = TWINE.usual(np.array(across), np.array(slant), np.array(STEP))
+            usual = TWINE.usual(*(np.array(v) for v in (across, slant, STEP, HEIGHT)))
             for s in (np.arange(-15, 16) - shift) * BAR / t[k]:
                 n += 2
                 length = float(usual) + (4e-3 if n % 5 < 5.0 * grown else 0.0)
@@ -49,17 +53,17 @@ def view_of(shift: float, grown: float = 0.0, turn: float = TURN) -> NetView:
         along=np.tile(along, (2, 1)),
         step=np.full(state.shape, STEP),
         state=state,
-        height=np.where(state == 2, 100.0, 0.0),
+        height=np.where(state == 2, height, 0.0),
         width=np.where(state == 2, 4e-3, 0.0),
         beyond=np.zeros(state.shape, np.bool_),
     )
     return find_dashes(signal)
 
 
-def laid(grown: float = 0.0, turn: float = TURN) -> list[LaidView]:
+def laid(grown: float = 0.0, turn: float = TURN, height: float = HEIGHT) -> list[LaidView]:
     fitter, found = LatticeFitter(NET), []
     for shift in np.linspace(0.0, 0.9, 10):
-        view = view_of(shift, grown, turn)
+        view = view_of(shift, grown, turn, height)
         fit = fitter.assign(view.dashes, np.full(2, -shift * BAR))
         found.append(LaidView(view, fit, np.full(2, shift * BAR)))
     return found
@@ -74,7 +78,7 @@ def test_dashes_are_sorted_by_laser_and_family() -> None:
     assert slanted.across == pytest.approx(np.sin(TURN))
     assert slanted.slant == pytest.approx(1.0 / (np.sin(TURN) * np.cos(TURN)))
     for kind in (level, slanted):
-        usual = TWINE.usual(*(np.array(v) for v in (kind.across, kind.slant, STEP)))
+        usual = TWINE.usual(*(np.array(v) for v in (kind.across, kind.slant, STEP, HEIGHT)))
         assert kind.length == pytest.approx(float(usual), abs=STEP)
         # Width square to the line: the search line leans.
         assert kind.width == pytest.approx(4e-3 * np.cos(TURN))
@@ -93,6 +97,14 @@ def test_growth_is_not_taken_for_twine() -> None:
     assert kinds[0, 0].length == pytest.approx(bare[0, 0].length, rel=0.1)
 
 
+def test_noise_is_not_taken_for_growth() -> None:
+    bright = {(k.laser, k.family): k for k in dash_kinds(NET, laid(grown=0.4))}
+    # So faint that noise alone explains how dashes differ: the usual ones count, which are long.
+    faint = {(k.laser, k.family): k for k in dash_kinds(NET, laid(grown=0.4, height=7.0))}
+    assert faint[0, 0].spread == pytest.approx(bright[0, 0].spread)
+    assert faint[0, 0].length > bright[0, 0].length + 2e-3
+
+
 def test_solidity_is_that_of_the_bodies() -> None:
     found = measure_solidity(NET, TWINE, laid())
     assert found is not None
@@ -101,6 +113,16 @@ def test_solidity_is_that_of_the_bodies() -> None:
     assert solidity == pytest.approx(2.0 * share - share**2, abs=0.01)
     # The halo's 0.2 mm on 20 dashes a metre of either family, and what slant adds.
     assert 0.005 < sigma < 0.025
+
+
+def test_openings_of_few_pixels_are_told_less_well() -> None:
+    near = laid()
+    far = [replace(one, view=replace(one.view, pixel=10.0 * one.view.pixel)) for one in near]
+    found = [measure_solidity(NET, TWINE, frames) for frames in (near, far)]
+    assert found[0] is not None
+    assert found[1] is not None
+    assert found[1][0] == found[0][0]
+    assert found[1][1] > 1.3 * found[0][1]
 
 
 def test_growth_is_solid() -> None:

@@ -39,7 +39,8 @@ def signal_of(*states: str, beyond: str = "", back: bool = False) -> NetSignal:
 def test_dashes_have_place_and_length() -> None:
     view = find_dashes(signal_of("..###....#####.."))
     np.testing.assert_allclose(view.dashes.along, [3 * STEP, 11 * STEP])
-    np.testing.assert_allclose(view.dashes.length, [3 * STEP, 5 * STEP])
+    # Towards the dark the light falls to 0.4 of its peak a tenth of a step beyond each end.
+    np.testing.assert_allclose(view.dashes.length, [3.2 * STEP, 5.2 * STEP])
     assert view.dashes.whole.all()
     assert view.seen_length == pytest.approx(16 * STEP)
     np.testing.assert_allclose(view.step, STEP)
@@ -55,6 +56,32 @@ def test_a_dash_cut_off_is_not_whole() -> None:
     np.testing.assert_array_equal(view.dashes.whole, [False, True, False, False, True])
     np.testing.assert_array_equal(view.dashes.laser, [0, 0, 0, 1, 1])
     np.testing.assert_array_equal(view.span_laser, [0, 0, 1, 1])
+
+
+def measured(heights: list[float], widths: list[float] | None = None) -> tuple[float, float]:
+    """Length in steps, and width, of the one dash that has these heights."""
+    signal = signal_of(".." + "#" * len(heights) + "..")
+    signal.height[0, 2:-2] = heights
+    if widths is not None:
+        signal.width[0, 2:-2] = widths
+    dashes = find_dashes(signal).dashes
+    assert len(dashes) == 1
+    return float(dashes.length[0]) / STEP, float(dashes.width[0])
+
+
+def test_a_dash_ends_where_its_light_falls_below_a_share_of_its_peak() -> None:
+    # 40 of 100 lies a quarter of a step from 30 towards 70, at both ends.
+    assert measured([30.0, 70.0, 100.0, 70.0, 30.0])[0] == pytest.approx(3.5)
+    # Exposure does not count.
+    assert measured([15.0, 35.0, 50.0, 35.0, 15.0])[0] == pytest.approx(3.5)
+    # A faint tail does not lengthen it, a dark middle does not count.
+    assert measured([30.0, 70.0, 100.0, 70.0, 30.0, 20.0, 12.0])[0] == pytest.approx(3.5)
+    assert measured([100.0, 20.0, 20.0, 100.0])[0] == pytest.approx(2.0 + 2.0 * 0.25 + 2.0 * 0.1)
+
+
+def test_a_dash_is_as_wide_as_where_it_is_bright() -> None:
+    heights, widths = [50.0, 90.0, 100.0, 40.0], [9e-3, 3e-3, 5e-3, 9e-3]
+    assert measured(heights, widths)[1] == pytest.approx(4e-3)
 
 
 def test_gaps_lie_between_dashes() -> None:

@@ -94,6 +94,43 @@ def test_a_fast_vehicle_is_followed_if_it_says_how_fast() -> None:
     assert np.hypot(*ends[1]) < 2e-3
 
 
+@pytest.mark.parametrize("mesh", list(Mesh))
+@pytest.mark.parametrize("heading", [0.2, 2.0, 4.5])
+def test_a_dive_that_begins_at_full_speed_is_followed(mesh: Mesh, heading: float) -> None:
+    net, rng = lattice(mesh), np.random.default_rng(7)
+    # 0.4 bars a frame; and the posture of the first frame is askew.
+    velocity = 0.4 * net.bar * FPS * np.array([np.cos(heading), np.sin(heading)])
+    askew = 0.25 * net.bar * np.array([np.sin(heading), -np.cos(heading)])
+    seen = [crossings(net, velocity * i / FPS + askew * (i == 0), rng) for i in range(40)]
+    times = np.arange(40) / FPS
+    fitter, track = LatticeFitter(net), NetTrack()
+    assert track.begins(0.0)
+    start = fitter.start(seen[:8], times[:8])
+    assert start is not None
+    np.testing.assert_allclose(start.velocity, velocity, atol=0.02)
+    for i in range(40):
+        track.step(fitter, seen[i], times[i], start=start)
+    assert not track.begins(times[-1])
+    off = track.place - velocity * times[-1]
+    # Of the first frame's posture nothing is left but what the place began with.
+    assert np.hypot(*off) < 0.3 * net.bar
+
+
+def test_the_slowest_of_the_velocities_that_look_alike_is_taken() -> None:
+    net, rng = lattice(bar=0.015), np.random.default_rng(8)
+    seen = [crossings(net, np.zeros(2), rng) for _ in range(8)]
+    # A whole mesh a frame would be 0.375 m/s.
+    start = LatticeFitter(net).start(seen, np.arange(8) / FPS)
+    assert start is not None
+    assert np.hypot(*start.velocity) < 0.02
+
+
+def test_too_few_frames_tell_no_velocity() -> None:
+    net, rng = lattice(), np.random.default_rng(9)
+    seen = [crossings(net, np.zeros(2), rng) for _ in range(3)]
+    assert LatticeFitter(net).start(seen, np.arange(3) / FPS) is None
+
+
 def test_a_net_measured_anew_goes_on_where_it_was() -> None:
     rng = np.random.default_rng(3)
     net = lattice()

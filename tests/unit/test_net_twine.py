@@ -1,5 +1,7 @@
 """Twine from made-up kinds of dashes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,15 +9,19 @@ from hypothesis import strategies as st
 
 from aqualvs.scanning.net_twine import DashKind, measure_twine
 
-# How much wider than the twine its light is where search lines are STEP apart, and sheet's widths:
-# lit, and at half height; as `net_twine` expects them.
-STEP, HALO = 6e-4, 0.72e-3
-SHEET, HALF_HEIGHT = 4.2e-3, 4.87e-3
+# Silhouette of a diameter, how much of it is lit and what blur adds at the usual height with search
+# lines STEP apart; widths of the sheet, lit and at half height; as `net_twine` expects them.
+BODY, SEEN, STEP, PIXEL, HALO = 0.95, 0.81, 6e-4, 6e-4, 0.778e-3
+SHEET, HALF_HEIGHT = 3.5e-3, 4.655e-3
 
 
-def kinds_of(twine: float, across: list[float], slant: list[float]) -> list[DashKind]:
-    """Dashes exactly as the model has them; a silhouette is 0.95 of the diameter."""
-    lit = 0.95 * twine + HALO
+def kinds_of(
+    twine: float, across: list[float], slant: list[float], height: float = 100.0
+) -> list[DashKind]:
+    """Dashes exactly as the model has them."""
+    body = BODY * twine
+    # Brighter dashes are longer.
+    lit = SEEN * body + HALO + 0.4e-3 * np.log(height / 100.0)
     return [
         DashKind(
             laser=i % 3,
@@ -23,9 +29,12 @@ def kinds_of(twine: float, across: list[float], slant: list[float]) -> list[Dash
             across=a,
             slant=k,
             length=float(np.hypot(lit / a, SHEET * k)),
-            width=float((HALF_HEIGHT**-3 + (k * a / (lit + 0.33e-3)) ** 3) ** (-1.0 / 3.0)),
-            height=120.0,
+            width=float(
+                (HALF_HEIGHT**-2.5 + (k * a / (body + 1.2 * PIXEL)) ** 2.5) ** (-1.0 / 2.5)
+            ),
+            height=height,
             step=STEP,
+            pixel=PIXEL,
             spread=0.1,
             count=100,
         )
@@ -50,9 +59,7 @@ def test_twine_is_found_at_any_angles(twine: float, angles: list[float]) -> None
 
 def test_one_kind_that_lies_does_not_decide() -> None:
     kinds = kinds_of(3e-3, [1.0, 0.9, 0.8, 0.95], [0.0, 0.3, 0.5, 0.2])
-    wrong = kinds[0].__class__(
-        **{**{f: getattr(kinds[0], f) for f in kinds[0].__slots__}, "length": 9e-3}
-    )
+    wrong = replace(kinds[0], length=9e-3)
     found = measure_twine([*kinds[1:], wrong])
     assert found is not None
     assert found.thickness == pytest.approx(3e-3, rel=0.12)
@@ -71,9 +78,9 @@ def test_excess_is_what_is_not_twine() -> None:
     kinds = kinds_of(2.5e-3, across.tolist(), slant.tolist())
     found = measure_twine(kinds)
     assert found is not None
-    excess, sigma = found.excess(across, slant, np.full(3, STEP))
+    excess, sigma = found.excess(across, slant, np.full(3, STEP), np.full(3, 100.0))
     length = np.array([kind.length for kind in kinds])
-    body = 0.95 * 2.5e-3 / across
+    body = BODY * 2.5e-3 / across
     np.testing.assert_allclose(length - excess, body, rtol=0.08)
     assert np.all(sigma > 0.0)
 
@@ -83,8 +90,31 @@ def test_known_twine_measures_the_halo() -> None:
     found = measure_twine(kinds, known=1.6e-3)
     assert found is not None
     assert found.thickness == pytest.approx(1.6e-3)
-    # 0.38 mm of what was twine is halo now.
-    assert found.halo + 0.2 * STEP == pytest.approx(HALO + 0.95 * 0.4e-3, rel=0.1)
+    # What is lit is as before: what was twine is halo now.
+    lit = found.usual(np.ones(1), np.zeros(1), np.full(1, STEP), np.full(1, 100.0))
+    assert lit[0] == pytest.approx(SEEN * BODY * 2.0e-3 + HALO, rel=0.05)
+    assert found.halo == pytest.approx(lit[0] - BODY * 1.6e-3 - 0.28 * STEP)
+
+
+@pytest.mark.parametrize("height", [30.0, 200.0])
+def test_brightness_is_not_taken_for_thickness(height: float) -> None:
+    found = measure_twine(kinds_of(2.0e-3, [1.0, 0.9, 0.7], [0.0, 0.2, 0.6], height))
+    assert found is not None
+    assert found.thickness == pytest.approx(2.0e-3, rel=0.05)
+
+
+def test_faint_and_far_strands_are_less_certain() -> None:
+    across, slant = [1.0, 0.9, 0.7], [0.0, 0.2, 0.6]
+    near = measure_twine(kinds_of(2.0e-3, across, slant))
+    faint = measure_twine(kinds_of(2.0e-3, across, slant, 30.0))
+    far = measure_twine(
+        [replace(k, step=2.0 * STEP, pixel=2.0 * PIXEL) for k in kinds_of(2.0e-3, across, slant)]
+    )
+    assert near is not None
+    assert faint is not None
+    assert far is not None
+    assert faint.sigma > 1.5 * near.sigma
+    assert far.sigma > 1.55 * near.sigma
 
 
 def test_no_dashes_no_twine() -> None:

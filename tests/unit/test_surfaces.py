@@ -224,3 +224,13 @@ def test_which_of_several_is_the_target() -> None:
     # What lies outside the working range is only taken where there is nothing inside.
     assert choose([wall, net], TargetKind.AUTO, (0.7, 1.0)) is wall
     assert choose([wall, net], TargetKind.AUTO, (0.1, 0.2)) is net
+
+
+def test_specks_on_a_plane_are_no_net_before_a_wall_of_light() -> None:
+    """Caustics: a few dozen lines share a plane by chance, beside a wall's thousand."""
+    wall = surface(0.6, 1200.0, False)
+    specks = surface(0.45, 84.0, True)
+    few_strands = surface(0.45, 190.0, True)
+    assert choose([wall, replace(specks, voice=400.0)], TargetKind.AUTO) is wall
+    near = replace(few_strands, voice=400.0)
+    assert choose([wall, near], TargetKind.AUTO) is near

@@ -20,6 +20,7 @@ _CLOUD = 15_000
 _LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
 _NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label", "used")
 _OPTIONAL = ("quality",)
+_NONE = np.empty(0, np.int64)
 MAX_LASERS = 16
 
 QUALITY_EDGES = np.linspace(0.0, 1.0, 41)
@@ -196,19 +197,21 @@ def _add(
     row = np.searchsorted(track.frame, batch["frame"]).clip(max=len(track) - 1)
     laser = batch["laser"].astype(np.int64)
     known = (track.frame[row] == batch["frame"]) & (laser >= 0) & (laser < MAX_LASERS)
-    batch = {name: column[known] for name, column in batch.items()}
-    row, laser = row[known], laser[known]
+    if not known.all():
+        batch = {name: column[known] for name, column in batch.items()}
+        row, laser = row[known], laser[known]
     label = batch["label"].astype(np.int64).clip(0, len(Label) - 1)
     points = np.stack([batch["x_m"], batch["y_m"], batch["z_m"]], axis=-1).astype(np.float64)
     np.add.at(summary.labels, (laser, label), 1)
     _keep_samples(summary, batch, laser, label, points, sample_frames)
-    target = batch["used"] & np.isfinite(points).all(axis=1)
-    np.add.at(summary.on_target, (row[target], laser[target]), 1)
+    target = np.flatnonzero(batch["used"] & np.isfinite(points).all(axis=1))
+    row, laser, points = row[target], laser[target], points[target]
+    np.add.at(summary.on_target, (row, laser), 1)
     if "quality" in batch:
         quality = batch["quality"][target].astype(np.float64)
-        _count(summary.quality, QUALITY_EDGES, laser[target], quality)
-    _add_residuals(summary, track, row[target], laser[target], points[target])
-    return _grow_cloud(summary, points[target], laser[target], keys, rng)
+        _count(summary.quality, QUALITY_EDGES, laser, quality)
+    _add_residuals(summary, track, row, laser, points)
+    return _grow_cloud(summary, points, laser, keys, rng)
 
 
 def _keep_samples(
@@ -220,8 +223,14 @@ def _keep_samples(
     sample_frames: list[int],
 ) -> None:
     """Keep the points of sample frames; a frame may go on in the next batch."""
-    for frame in np.intersect1d(batch["frame"], sample_frames).tolist():
-        mine = batch["frame"] == frame
+    numbers = batch["frame"]
+    if not len(numbers):
+        return
+    first, last = int(numbers.min()), int(numbers.max())
+    for frame in sample_frames:
+        mine = np.flatnonzero(numbers == frame) if first <= frame <= last else _NONE
+        if not len(mine):
+            continue
         pixels = np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64)
         new = FramePoints(laser[mine], label[mine], batch["used"][mine], pixels, points[mine])
         old = summary.samples.get(frame)
@@ -251,8 +260,13 @@ def _add_residuals(
 ) -> None:
     valid = track.valid[row]
     row, laser, points = row[valid], laser[valid], points[valid]
-    normal, distance = plane_of_posture(track.posture[row])
-    residual_mm = 1e3 * (np.einsum("ij,ij->i", normal, points) - distance)
+    if not len(row):
+        return
+    # Of many points to a frame, all share its plane.
+    first = int(row.min())
+    normal, distance = plane_of_posture(track.posture[first : int(row.max()) + 1])
+    of_frame = normal[row - first]
+    residual_mm = 1e3 * (np.einsum("ij,ij->i", of_frame, points) - distance[row - first])
     np.add.at(summary.squares_mm2, row, residual_mm**2)
     np.add.at(summary.n_squares, row, 1)
     _count(summary.residual, RESIDUAL_EDGES_MM, laser, residual_mm)
@@ -266,7 +280,12 @@ def _grow_cloud(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Keep the points with the smallest of all random keys: a uniform sample of any stream."""
-    keys = np.concatenate([keys, rng.random(len(points))])
+    drawn = rng.random(len(points))
+    if len(keys) == _CLOUD:
+        # Of many points only the few whose key is small enough are looked at again.
+        small = np.flatnonzero(drawn < keys.max())
+        drawn, points, laser = drawn[small], points[small], laser[small]
+    keys = np.concatenate([keys, drawn])
     points = np.concatenate([summary.cloud_in_dome, points])
     laser = np.concatenate([summary.cloud_laser, laser])
     if len(keys) > _CLOUD:

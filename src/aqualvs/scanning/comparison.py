@@ -50,7 +50,10 @@ class BareLensComparison:
             return Refusal(Reason.TOO_FEW_POINTS, "a bare lens would see too few of the points")
         points, laser = found.points_in_dome[found.valid], laser[found.valid]
         sigma_px = np.ones(len(points))
-        start = np.asarray(np.linalg.lstsq(points, sigma_px)[0], dtype=np.float64)
+        try:
+            start = np.linalg.solve(points.T @ points, points.sum(axis=0))
+        except np.linalg.LinAlgError:
+            return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
         fit = fit_robust(
             points,
             found.sensitivity[found.valid],

@@ -10,7 +10,7 @@ from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.stripe import Returns, StripeDetector, StripeOptions
 from aqualvs.scanning.threshold import ThresholdDetector, ThresholdOptions
-from aqualvs.scanning.view import FrameView, SearchView
+from aqualvs.scanning.view import FrameViews, SearchView
 
 
 class Detector(Protocol):
@@ -43,13 +43,12 @@ class FrameDetector:
         options: DetectorOptions,
     ) -> None:
         self._size_px = size_px
-        self._views: dict[SearchAxis, FrameView] = {}
+        self._views = FrameViews(size_px, max((search.line_px for search in searches), default=1))
         self._detectors: dict[SearchAxis, Detector] = {}
         for axis in SearchAxis:
             mine = [search for search in searches if search.axis is axis and search.visible]
             if mine:
                 self._detectors[axis] = _make_detector(size_px, axis, mine, options)
-                self._views[axis] = FrameView(size_px, axis, mine[0].line_px)
 
     def detect(self, frame: Frame) -> dict[SearchAxis, Returns]:
         """Find the returns of every search direction.
@@ -69,10 +68,8 @@ class FrameDetector:
         height, width = frame.luma.shape
         if (width, height) != self._size_px:
             raise ValueError(f"frame is {width} x {height} but the rig's image is {self._size_px}")
-        found: dict[SearchAxis, Returns] = {}
-        for axis, detector in self._detectors.items():
-            found[axis] = detector.detect(self._views[axis].of(frame))
-        return found
+        views = self._views.of(frame)
+        return {axis: detector.detect(views[axis]) for axis, detector in self._detectors.items()}
 
 
 def _make_detector(
@@ -81,11 +78,8 @@ def _make_detector(
     searches: Sequence[StripeSearch],
     options: DetectorOptions,
 ) -> Detector:
-    width, height = size_px
-    length = height if axis is SearchAxis.ALONG_Y else width
     lowest: IntArray = np.min([search.lowest for search in searches], axis=0)
     highest: IntArray = np.max([search.highest for search in searches], axis=0)
     if isinstance(options, ThresholdOptions):
-        return ThresholdDetector(length, len(lowest), lowest, highest, options)
-    reach_px = max(8, round(options.reach_share * width))
-    return StripeDetector(length, len(lowest), lowest, highest, reach_px, options)
+        return ThresholdDetector(axis, size_px, lowest, highest, options)
+    return StripeDetector(axis, size_px, lowest, highest, options)

@@ -21,6 +21,11 @@ from aqualvs.scanning.surfaces import Surface, in_lit_cell, lit_cells
 _BEST_SIGMA_PX = 0.1
 # A surface is a fish if this share of its light lies in bent stretches.
 _MOSTLY = 0.5
+_NOWHERE = np.empty(0)
+# Compiled code takes numbers more easily than members of an enumeration.
+_SOLID, _FISH, _BUBBLE = np.uint8(Label.SOLID), np.uint8(Label.FISH), np.uint8(Label.BUBBLE)
+_BACKGROUND, _CLUTTER = np.uint8(Label.BACKGROUND), np.uint8(Label.CLUTTER)
+_AMBIGUOUS, _OUT_OF_RANGE = np.uint8(Label.AMBIGUOUS), np.uint8(Label.OUT_OF_RANGE)
 
 
 def label_readings(
@@ -143,20 +148,53 @@ def _label_loose(
     working_range: tuple[float, float],
 ) -> None:
     """Label what lies on no surface by its shape, in place."""
-    rows = np.flatnonzero(loose)
-    stretch, several = readings.stretch[rows], shared[rows]
-    kind = np.where(several, Label.AMBIGUOUS, Label.CLUTTER)
-    points = readings.points[rows]
-    distance = np.linalg.norm(points, axis=1)
-    outside = (distance < working_range[0]) | (distance > working_range[1])
-    kind[outside & ~several] = Label.OUT_OF_RANGE
-    straight = shapes.straight()[stretch] & ~several
-    kind[straight] = Label.SOLID
-    if target is not None:
-        kind[straight & (target.height(points) > 0.0)] = Label.BACKGROUND
-    kind[shapes.bent()[stretch]] = Label.FISH
-    kind[shapes.round(_bright(readings.height))[stretch]] = Label.BUBBLE
-    label[rows] = kind
+    behind = _NOWHERE if target is None else target.height(readings.points)
+    _tell_by_shape(
+        loose,
+        shared,
+        readings.stretch,
+        readings.points,
+        behind,
+        shapes.straight(),
+        shapes.bent(),
+        shapes.round(_bright(readings.height)),
+        working_range,
+        label,
+    )
+
+
+@borrowing_kernel
+def _tell_by_shape(
+    loose: BoolArray,
+    shared: BoolArray,
+    stretch: IntArray,
+    points: FloatArray,
+    behind: FloatArray,
+    straight: BoolArray,
+    bent: BoolArray,
+    spot: BoolArray,
+    working_range: tuple[float, float],
+    label: NDArray[np.uint8],
+) -> None:
+    """Write the labels; `behind` is the distance behind the target, empty where there is none."""
+    for i in range(loose.shape[0]):
+        if not loose[i]:
+            continue
+        s = stretch[i]
+        kind = _AMBIGUOUS
+        if not shared[i]:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            distance = np.sqrt(x * x + y * y + z * z)
+            outside = distance < working_range[0] or distance > working_range[1]
+            kind = _OUT_OF_RANGE if outside else _CLUTTER
+            if straight[s]:
+                is_behind = behind.shape[0] > 0 and behind[i] > 0.0
+                kind = _BACKGROUND if is_behind else _SOLID
+        if spot[s]:
+            kind = _BUBBLE
+        elif bent[s]:
+            kind = _FISH
+        label[i] = kind
 
 
 def _bright(height: FloatArray) -> float:

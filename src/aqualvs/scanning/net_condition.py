@@ -20,7 +20,7 @@ from aqualvs.scanning.net_hypotheses import Mesh
 from aqualvs.scanning.net_lattice import NetLattice, find_lattice
 from aqualvs.scanning.net_lines import LineState, NetReader, NetSignal
 from aqualvs.scanning.net_spectrum import Crossings
-from aqualvs.scanning.net_track import LatticeFitter, NetTrack
+from aqualvs.scanning.net_track import START_FRAMES, START_S, LatticeFitter, NetTrack, Start
 from aqualvs.scanning.net_twine import Twine, measure_twine
 from aqualvs.scanning.scan import Scan
 
@@ -277,17 +277,26 @@ class NetCondition:
     def _follow(self, lattice: NetLattice, seen: _Seen) -> list[LaidView]:
         """Lay the lattice onto every frame, keep track of the way and look for holes."""
         fitter, laid = LatticeFitter(lattice), []
-        for view, crossed, velocity in zip(
-            seen.views, seen.crossings, seen.velocities, strict=True
-        ):
-            shift = self._track.step(fitter, crossed, view.time_s, velocity)
+        for i, view in enumerate(seen.views):
+            start = self._start(fitter, seen, i) if self._track.begins(view.time_s) else None
+            shift = self._track.step(
+                fitter, seen.crossings[i], view.time_s, seen.velocities[i], start
+            )
             if shift is None:
                 continue
             place = self._track.place
             laid.append(LaidView(view, fitter.assign(view.dashes, shift.place), place))
-            self._map.add(lattice, view, place, self._track.piece)
+            self._map.add(lattice, view, shift.place, place, self._track.piece)
         self._map.update(lattice)
         return laid
+
+    def _start(self, fitter: LatticeFitter, seen: _Seen, first: int) -> Start | None:
+        """Look ahead where the track begins; not where another sensor tells the velocity."""
+        if seen.velocities[first] is not None:
+            return None
+        times = np.array([view.time_s for view in seen.views[first : first + START_FRAMES]])
+        times = times[times - times[0] < START_S]
+        return fitter.start(seen.crossings[first : first + len(times)], times)
 
     def _usable(self) -> BoolArray:
         """Search lines (L, J) that each laser's fan reaches, as the dive shows it so far."""

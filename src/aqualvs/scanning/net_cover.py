@@ -15,14 +15,16 @@ from aqualvs.scanning.net_dashes import NetView
 from aqualvs.scanning.net_hypotheses import Mesh
 from aqualvs.scanning.net_lattice import NetLattice
 from aqualvs.scanning.net_track import Fit
-from aqualvs.scanning.net_twine import DashKind, Twine
+from aqualvs.scanning.net_twine import USUAL_HEIGHT, DashKind, Twine
 
 # Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
 _LEAST_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
 _LEAST_DASHES = 6
 # Growth lengthens dashes, and makes them differ; up to this share of all light on a kind's dashes
-# they are bare still, less the more they differ. Measured on simulated dives.
-_BARE_SHARE, _LESS_BARE, _LEAST_BARE = 0.4, 0.63, 0.12
+# they are bare still, less the more they differ. Measured on simulated dives. They also differ by
+# noise, which is so many grey levels.
+_BARE_SHARE, _LESS_BARE, _LEAST_BARE = 0.4, 0.9, 0.08
+_NOISE = 6.0
 _SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
 _WIDTH_QUANTILE = 0.4
 # Sines of smaller angles say no more than that a strand runs along the line.
@@ -30,6 +32,9 @@ _NEARLY_ALONG = 0.02
 # Dashes of more search lines may be lost (`segments`).
 _MOST_LINES = 20.0
 _BLOCKS = 6
+# Errors of solidity for dashes that run together or are not seen, as shares: of any net, and per
+# pixel in the distance of two strands (simulated dives).
+_SHARE_ERROR, _UNRESOLVED = 0.04, 1.5
 # Growth so far apart along the net, in metres, is independent.
 _ALIKE = 0.02
 # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
@@ -93,7 +98,7 @@ def _angles(lattice: NetLattice, one: LaidView) -> _Angles:
 def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind]:
     """Sort whole dashes that lie clearly on one strand by laser and family."""
     rows = [_rows(lattice, one) for one in frames]
-    table = np.concatenate(rows) if rows else np.empty((0, 8))
+    table = np.concatenate(rows) if rows else np.empty((0, 9))
     kinds = np.unique(table[:, :2], axis=0)
     each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
     each = [mine for mine in each if len(mine) >= _LEAST_DASHES]
@@ -109,8 +114,9 @@ def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind
 
 def _kind(mine: FloatArray, spread: float) -> DashKind:
     """Take dashes (rows as `_rows` makes them) together."""
-    across, slant, height, step = np.median(mine[:, [2, 3, 6, 7]], axis=0)
-    share = float(np.clip(_BARE_SHARE - _LESS_BARE * spread, _LEAST_BARE, _BARE_SHARE))
+    across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
+    grown = np.sqrt(max(spread**2 - (_NOISE / max(height, 1.0)) ** 2, 0.0))
+    share = float(np.clip(_BARE_SHARE - _LESS_BARE * grown, _LEAST_BARE, _BARE_SHARE))
     return DashKind(
         laser=int(mine[0, 0]),
         family=int(mine[0, 1]),
@@ -120,6 +126,7 @@ def _kind(mine: FloatArray, spread: float) -> DashKind:
         width=float(np.quantile(mine[:, 5], _WIDTH_QUANTILE)),
         height=float(height),
         step=float(step),
+        pixel=float(pixel),
         spread=spread,
         count=len(mine),
     )
@@ -149,6 +156,7 @@ def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
         dashes.width * angles.square,
         dashes.height,
         one.view.step[dashes.laser],
+        np.full(len(dashes), one.view.pixel),
     ]
     return np.stack([column[clear].astype(np.float64) for column in columns], axis=1)
 
@@ -170,10 +178,11 @@ def measure_solidity(
     rows = []
     for i, one in enumerate(frames):
         dashes, family = one.view.dashes, one.fit.family
-        angles, step = _angles(lattice, one), one.view.step[dashes.laser]
-        excess, sigma = twine.excess(angles.across, angles.slant, step)
+        angles = _angles(lattice, one)
+        at = angles.across, angles.slant, one.view.step[dashes.laser], dashes.height
+        excess, sigma = twine.excess(*at)
         # A dash that is cut off, or lies along the edge of the light, has its share of the halo.
-        share = np.minimum(dashes.length / twine.usual(angles.across, angles.slant, step), 1.0)
+        share = np.minimum(dashes.length / twine.usual(*at), 1.0)
         share = np.where(dashes.whole, share, 0.5 * share)
         mine = dashes.length - excess * share
         rows.append(np.c_[family, mine, dashes.place + one.place][counts[dashes.laser, family]])
@@ -184,11 +193,12 @@ def measure_solidity(
         return None
     solidity = _family_sum(body, seen, counts)
     blocks = np.array_split(np.arange(len(frames)), min(_BLOCKS, len(frames)))
-    shares = [_family_sum(body[b], seen[b], counts) for b in blocks]
-    chance = float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else 0.1
-    chance = float(np.hypot(chance, solidity * _spread_of_mean(np.concatenate(rows))))
-    sigma_solidity = float(np.hypot(chance, _family_sum(error, seen, counts)))
-    return float(np.clip(solidity, 0.0, 1.0)), sigma_solidity
+    parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
+    chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
+    unresolved = _UNRESOLVED * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
+    shares = [_spread_of_mean(np.concatenate(rows)), _SHARE_ERROR, unresolved]
+    sigmas = [chance, _family_sum(error, seen, counts), *(solidity * one for one in shares)]
+    return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
 
 
 def _spread_of_mean(rows: FloatArray) -> float:
@@ -245,7 +255,8 @@ def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
     """
     line, search = np.nan_to_num(view.direction), np.nan_to_num(view.search)
     angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
-    lines = twine.usual(angles.across, angles.slant, view.step[:, None]) / view.step[:, None]
+    step = view.step[:, None]
+    lines = twine.usual(angles.across, angles.slant, step, USUAL_HEIGHT) / step
     good: BoolArray = lines < _MOST_LINES
     best = lines.argmin(axis=0)
     good[best, np.arange(len(best))] = True

@@ -11,6 +11,9 @@ from aqualvs.scanning.net_spectrum import Crossings
 
 # A dark gap of one search line does not end a dash: compression and specks make such gaps.
 _BRIDGED = 1
+# A dash is as long as its light stands above this share of its peak, whatever the exposure; above
+# the greater one it is as wide as it gets.
+_LEVEL, _BRIGHT = 0.4, 0.8
 # Dark pieces so many times longer than most (this quantile) are holes; a lattice is not looked for
 # there.
 _HOLE, _MOST = 2.5, 0.8
@@ -29,9 +32,9 @@ class Dashes:
     place : array, shape (N, 2)
         The same in `net`.
     length : array, shape (N,)
-        Lit length along the line, in metres.
+        Length along the line within which its light is above a share of its peak, in metres.
     height, width : array, shape (N,)
-        Peak height (grey levels) and greatest width across the search line (m) of its returns.
+        Peak height (grey levels) and, where it is bright, mean width across the search line (m).
     whole : bool array, shape (N,)
         Whether both ends were seen: what is cut off says nothing about length.
     """
@@ -185,10 +188,7 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
 
 
 def crossings_of(view: NetView) -> Crossings:
-    """Return a frame's crossings for the search of the lattice.
-
-    Dashes cut off are left out, and so is what looks like a hole.
-    """
+    """Return a frame's crossings to find the lattice: no dash cut off, nothing like a hole."""
     gaps, dashes = view.gaps, view.dashes
     inner = gaps.length[gaps.closed.all(axis=1)]
     longest = _HOLE * float(np.quantile(inner, _MOST)) if len(inner) else np.inf
@@ -291,8 +291,7 @@ def _cut_span(
 ) -> tuple[int, int]:
     """Append the dashes and gaps of one span; the new counts."""
     n_lines = state.shape[1]
-    j, dark_from = begin, begin
-    before = -1
+    j, dark_from, before = begin, begin, -1
     while j < end:
         if state[i, _turned(j, n_lines, back)] != 2:
             j += 1
@@ -303,15 +302,19 @@ def _cut_span(
                 last = j
             j += 1
         j = last + 1
-        length, peak, widest = 0.0, 0.0, 0.0
+        peak, wide, n_bright = 0.0, 0.0, 0
+        for a in range(first, last + 1):
+            peak = max(peak, height[i, _turned(a, n_lines, back)])
         for a in range(first, last + 1):
             b = _turned(a, n_lines, back)
-            length += step[i, b]
-            peak = max(peak, height[i, b])
-            widest = max(widest, width[i, b])
+            if height[i, b] >= _BRIGHT * peak:
+                wide += width[i, b]
+                n_bright += 1
+        length = _length_above(i, first, last, back, _LEVEL * peak, step, height)
         low, high = _ends(i, first, last, back, along, step)
         dash[n, 0], dash[n, 1] = i, 1.0 if first > begin and last < end - 1 else 0.0
-        dash[n, 2], dash[n, 3], dash[n, 4], dash[n, 5] = 0.5 * (low + high), length, peak, widest
+        dash[n, 2], dash[n, 3] = 0.5 * (low + high), length
+        dash[n, 4], dash[n, 5] = peak, wide / n_bright
         if first > dark_from:
             _put_gap(i, dark_from, first - 1, back, along, step, beyond, gap, k, dash, before, n)
             k += 1
@@ -321,6 +324,27 @@ def _cut_span(
         _put_gap(i, dark_from, end - 1, back, along, step, beyond, gap, k, dash, before, -1)
         k += 1
     return n, k
+
+
+@kernel
+def _length_above(
+    i: int, first: int, last: int, back: bool, level: float, step: FloatArray, height: FloatArray
+) -> float:
+    """Metres of a run of search lines above a level; heights change evenly, beyond it is dark."""
+    n_lines = step.shape[1]
+    length, before = 0.0, 0.0
+    for a in range(first, last + 1):
+        b = _turned(a, n_lines, back)
+        here = height[i, b]
+        after = height[i, _turned(a + 1, n_lines, back)] if a < last else 0.0
+        if here >= level:
+            length += step[i, b]
+            if before < level:
+                length += step[i, b] * ((here - level) / (here - before) - 0.5)
+            if after < level:
+                length += step[i, b] * ((here - level) / (here - after) - 0.5)
+        before = here
+    return length
 
 
 @kernel

@@ -1,42 +1,47 @@
 """Holes: places on the net where strands that the lattice predicts are missing.
 
-Along a laser's line neighbouring strands are no farther apart than the lattice allows. A longer
-dark piece is a look through a hole, anything shorter a look at sound net. Looks from many places
-are put together on a map that is fixed to the net; what most looks go through is a hole.
+Every crossing of a laser's line with a strand that should be there is looked at: seen, or missed.
+Looks from many places are put together on a map that is fixed to the net. However often the same
+piece of strand was looked at from much the same place, it counts once; how often strands that are
+there are missed is told by the dive itself.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import ndimage
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.scanning.net_cover import crossing_rates, long_gaps
 from aqualvs.scanning.net_dashes import NetView
+from aqualvs.scanning.net_discs import RIM, Disc, find_discs, local_sums
 from aqualvs.scanning.net_hypotheses import Mesh
 from aqualvs.scanning.net_lattice import NetLattice
+from aqualvs.scanning.net_strands import Strands, predicted_strands
 
-# Through a hole as much light is seen on what is behind the net as elsewhere, but for this share.
-_LET_THROUGH = 0.5
-# Side of the map's cells, in bars; cells of a hole are no farther apart than so many bars.
-_CELL, _REACH = 0.4, 0.8
-# Frames count as looks of their own when the vehicle has moved this far, in bars; when it moved
-# farther a look weighs as many such moves, up to a limit.
-_LOOK, _MOST_WEIGHT = 0.2, 2.0
-# Looks at a cell that count at most.
-_MOST_LOOKS = 25.0
-# Of the looks at a cell of a hole this share goes through.
-_THROUGH = 0.6
-# A hole: greater and smaller extent in bars, area in squares of a bar. And looks through it that
-# are so many bars long together, where nothing speaks against it; sound looks in and around it
-# count against it.
-_LEAST_EXTENT, _LEAST_WIDTH, _LEAST_AREA = 2.0, 1.5, 2.0
-_LEAST_SEEN, _AGAINST = 20.0, 0.9
+# Side of the map's cells, in bars: looks of one laser at one cell are alike.
+_CELL = 0.4
+# Pieces of strand that are always dark without a hole, as a share; light where the net has a hole
+# (a fish, a loose end); and how much the looks at one cell say at most against a hole.
+_DARK, _FALSE_LIGHT, _MOST_SOUND = 0.03, 0.03, 4.0
+# Of one laser's crossings with one family, so many count as seen beforehand: with few, the share
+# that is missed is not known. The same for a piece of its line, so many ranges long.
+# Where this share takes turns, all that is missed there counts; where more is missed than the last
+# share, missing strands tell nothing.
+_BEFORE, _BEFORE_HERE, _HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.1, 0.12, 0.3
+# Where more than this share is missed between strands that are seen, the lattice is not the net's.
+_MOST_MISSED = 0.3
+# Missing strands so near to each other, in bars, and with so much evidence, may be a hole; so far
+# around, strands tell where it ends.
+_NEAR, _LEAST_NEAR, _AROUND = 1.5, 9.0, 6.5
+# Discs no farther apart than this are one hole, in bars.
+_TOUCH = 1.2
+# A frame's foot is kept for every so many bars that the vehicle moves.
+_LOOK = 0.2
 # Cells farther from the vehicle than this are settled, in metres.
 _SETTLED = 2.0
-_ROW = 1 << 24
-_BLOCK = np.ones((3, 3), np.bool_)
+_ROW, _LASERS = 1 << 24, 1 << 5
+# Squares of a side's 24th part measure the area of discs that overlap.
+_SQUARES = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,40 +83,46 @@ class Hole:
     n_looks: int
 
 
-@dataclass(frozen=True, slots=True)
-class Looks:
-    """Looks of one frame, as pieces of line in `net`.
+@dataclass(slots=True)
+class _Looks:
+    """Looks at cells, each of one laser and one outcome; n of them.
 
     Attributes
     ----------
-    begin, end : array, shape (K, 2)
-        Ends of the pieces, in metres.
-    through : bool array, shape (K,)
-        Whether they go through a hole, or end on strands.
+    keys : int array, shape (n,)
+        Cell, laser, and whether the strands were missed.
+    sums : array, shape (n, 4)
+        Number of looks, sums of their places and of what they say for a hole.
     """
 
-    begin: FloatArray
-    end: FloatArray
-    through: BoolArray
+    keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    sums: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
+    def added(self, keys: IntArray, rows: FloatArray) -> "_Looks":
+        """Return these and more of them."""
+        every, index = np.unique(np.concatenate([self.keys, keys]), return_inverse=True)
+        both = np.concatenate([self.sums, rows])
+        sums = [np.bincount(index, column, minlength=len(every)) for column in both.T]
+        return _Looks(every, np.stack(sums, axis=1))
 
-def find_looks(lattice: NetLattice, view: NetView) -> Looks:
-    """Tell where a frame's lines cross sound net and where holes."""
-    gaps = view.gaps
-    long = long_gaps(lattice, view)
-    # A hole lets light through; what is dark without is hidden by something.
-    hole = long & (gaps.beyond >= _LET_THROUGH * view.beyond[gaps.laser])
-    sound = ~long & gaps.closed.all(axis=1)
-    # A hole begins, on average, half a usual gap after the last strand beside it.
-    inset = 0.5 / (crossing_rates(lattice, view) @ lattice.density)
-    ends = np.where(
-        hole[:, None],
-        gaps.ends + inset[gaps.laser, None] * gaps.closed * [1.0, -1.0],
-        gaps.middles,
-    )
-    told = (hole | sound) & (ends[:, 1] > ends[:, 0])
-    laser = gaps.laser[told]
-    return Looks(view.at(laser, ends[told, 0]), view.at(laser, ends[told, 1]), hole[told])
+    def kept(self, mask: BoolArray) -> "_Looks":
+        """Return some of them."""
+        return _Looks(self.keys[mask], self.sums[mask])
+
+    @property
+    def places(self) -> FloatArray:
+        """Mean places, shape (n, 2)."""
+        return self.sums[:, 1:3] / self.sums[:, :1]
+
+    def weights(self) -> FloatArray:
+        """Say how much each speaks for a hole (n,): as one look, less where both were seen."""
+        number = self.sums[:, 0]
+        cell, missed = self.keys >> 1, self.keys & 1
+        _, index = np.unique(cell, return_inverse=True)
+        told = np.bincount(index, number)[index]
+        margin = np.maximum(2.0 * number - told, 0.0) / told
+        mean = self.sums[:, 3] / number
+        return np.where(missed == 1, mean, np.maximum(mean * number, -_MOST_SOUND)) * margin
 
 
 @dataclass(slots=True)
@@ -125,22 +136,24 @@ class HoleMap:
     """
 
     holes: list[Hole] = field(default_factory=list)
-    _cell: float = 0.0
+    _bar: float = 0.0
     _piece: int = -1
-    _keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    _sound: FloatArray = field(default_factory=lambda: np.empty(0))
-    _through: FloatArray = field(default_factory=lambda: np.empty(0))
-    _waiting: list[tuple[IntArray, BoolArray, float]] = field(default_factory=list)
-    _looks: dict[tuple[int, int], tuple[int, float, FloatArray]] = field(default_factory=dict)
+    _looks: _Looks = field(default_factory=_Looks)
+    _meshes: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    _waiting: list[tuple[Strands, FloatArray, float]] = field(default_factory=list)
+    _feet: dict[tuple[int, int], tuple[int, float, FloatArray]] = field(default_factory=dict)
     _last: FloatArray | None = None
-    _settled_cells: int = 0
+    _settled_meshes: int = 0
+    _mesh: float = 0.0
 
     @property
     def area(self) -> float:
-        """Area of net that was looked at, in square metres: the cells that lines passed."""
-        return (self._settled_cells + len(self._keys)) * self._cell**2
+        """Area of the meshes that were looked at, in square metres."""
+        return (self._settled_meshes + len(self._meshes)) * self._mesh**2
 
-    def add(self, lattice: NetLattice, view: NetView, place: FloatArray, piece: int) -> None:
+    def add(
+        self, lattice: NetLattice, view: NetView, knot: FloatArray, place: FloatArray, piece: int
+    ) -> None:
         """Add a frame's looks.
 
         Parameters
@@ -149,26 +162,24 @@ class HoleMap:
             Of the stretch.
         view : NetView
             What the frame shows.
+        knot : array, shape (2,)
+            Where the lattice lies in `net` (`Shift.place`), in metres.
         place : array, shape (2,)
             Where the origin of `net` lies on the map, in metres.
         piece : int
             As `NetTrack.piece`: a new piece starts a new map.
         """
-        if self._cell == 0.0:
-            self._cell = _CELL * lattice.bar
+        if self._bar == 0.0:
+            self._bar, self._mesh = lattice.bar, float(np.sqrt(opening_area(lattice)))
         if piece != self._piece:
+            # What the vehicle lost its way in may be a hole.
+            self.update(lattice)
             self._start_over(piece)
-        weight = 1.0
-        if self._last is not None:
-            weight = float(np.hypot(*(place - self._last))) / (_LOOK * lattice.bar)
-            if weight < 1.0:
-                return
         self._last = place.copy()
-        keys, through = _cells(find_looks(lattice, view), place, self._cell)
-        # A look stands for the net that was passed since the one before.
-        self._waiting.append((keys, through, min(weight, _MOST_WEIGHT)))
-        column, row = np.floor(place / (_LOOK * lattice.bar)).astype(int)
-        self._looks.setdefault((int(column), int(row)), (view.index, view.time_s, place.copy()))
+        strands = predicted_strands(lattice, view, knot)
+        self._waiting.append((strands, place.copy(), _HERE * view.range))
+        column, row = np.floor(place / (_LOOK * self._bar)).astype(int)
+        self._feet.setdefault((int(column), int(row)), (view.index, view.time_s, place.copy()))
 
     def update(self, lattice: NetLattice) -> None:
         """Find the holes in what was added so far; earlier finds are corrected."""
@@ -183,104 +194,102 @@ class HoleMap:
         self._settle()
 
     def _start_over(self, piece: int) -> None:
-        self._merge()
-        self._settled_cells += len(self._keys)
-        self._keys, self._sound = np.empty(0, np.int64), np.empty(0)
-        self._through, self._looks = np.empty(0), {}
+        self._settled_meshes += len(self._meshes)
+        self._meshes = np.empty(0, np.int64)
+        self._looks, self._feet = _Looks(), {}
         self._piece, self._last = piece, None
 
     def _merge(self) -> None:
         if not self._waiting:
             return
-        fresh = np.concatenate([keys for keys, _, _ in self._waiting])
-        through = np.concatenate([through for _, through, _ in self._waiting])
-        weight = np.repeat(
-            [weight for _, _, weight in self._waiting], [len(one[0]) for one in self._waiting]
+        strands = [one for one, _, _ in self._waiting]
+        place = np.concatenate([one.place + foot for one, foot, _ in self._waiting])
+        here = np.concatenate([np.floor(one.along / part) for one, _, part in self._waiting])
+        laser, family, missed, run, closed = (
+            np.concatenate([getattr(one, name) for one in strands])
+            for name in ("laser", "family", "missed", "run", "closed")
         )
-        keys, index = np.unique(np.concatenate([self._keys, fresh]), return_inverse=True)
-        old, new = index[: len(self._keys)], index[len(self._keys) :]
-        sound, passed = np.zeros(len(keys)), np.zeros(len(keys))
-        sound[old], passed[old] = self._sound, self._through
-        sound += np.bincount(new[~through], weight[~through], minlength=len(keys))
-        passed += np.bincount(new[through], weight[through], minlength=len(keys))
-        # What was looked at for long counts no more than what was passed slowly.
-        kept = np.minimum(1.0, _MOST_LOOKS / np.maximum(sound + passed, 1.0))
-        self._keys, self._sound, self._through = keys, kept * sound, kept * passed
         self._waiting = []
-
-    def _centres(self) -> FloatArray:
-        """Middles of the cells on the map, shape (n, 2)."""
-        row = np.floor_divide(self._keys + _ROW // 2, _ROW)
-        column = self._keys - row * _ROW
-        return (np.stack([column, row], axis=1) + 0.5) * self._cell
+        between = float(np.sum(1.0 / run[closed]))
+        if between > _MOST_MISSED * (between + np.count_nonzero(~missed)):
+            return
+        share = np.maximum(
+            _missed_share(laser, family, missed, run), _missed_here(laser, here, missed)
+        )
+        dark = np.where(share < _TOO_MANY, -np.log(_DARK + share), 0.0)
+        says = np.where(missed, dark, np.log(_FALSE_LIGHT / (1.0 - share)))
+        column, row = np.floor(place / (_CELL * self._bar)).astype(np.int64).T
+        keys = ((column + _ROW * row) * _LASERS + laser) * 2 + missed
+        self._looks = self._looks.added(keys, np.c_[np.ones(len(keys)), place, says])
+        column, row = np.floor(place / self._mesh).astype(np.int64).T
+        self._meshes = np.unique(np.concatenate([self._meshes, column + _ROW * row]))
 
     def _near(self, hole: Hole) -> bool:
         """Whether a hole lies where the map is still open."""
-        if not len(self._keys):
+        if self._last is None:
             return False
-        away = np.abs(self._centres() - hole.place).max(axis=1)
-        return bool(away.min() < self._cell)
+        return bool(np.abs(hole.place - self._last).max() < _SETTLED)
 
     def _find(self, lattice: NetLattice) -> list[Hole]:
-        total = self._sound + self._through
-        open_ = (self._through >= 1.0) & (self._through > _THROUGH * total)
-        if np.count_nonzero(open_) < 2:
-            return []
-        centres = self._centres()
-        group = _groups(centres[open_], _REACH * lattice.bar)
-        rows = np.flatnonzero(open_)
-        found = []
-        for number in range(group.max() + 1):
-            hole = self._hole(lattice, rows[group == number], centres)
-            if hole is not None:
-                found.append(hole)
+        places, weights = self._looks.places, self._looks.weights()
+        bar = lattice.bar
+        likely = np.flatnonzero(weights > 0.0)
+        near = local_sums(places[likely], weights[likely], _NEAR * bar)
+        likely = likely[near > _LEAST_NEAR]
+        found, left = [], weights.copy()
+        for group in _groups(places[likely], 2.0 * _NEAR * bar):
+            seeds = places[likely[group]]
+            low, high = seeds.min(axis=0) - _AROUND * bar, seeds.max(axis=0) + _AROUND * bar
+            around = np.all((places > low) & (places < high), axis=1)
+            discs = find_discs(places[around], left[around], bar)
+            for disc in discs:
+                # Another group has this hole in its surroundings as well.
+                left[np.hypot(*(places - disc.middle).T) < disc.radius + RIM * bar] = 0.0
+            found += [
+                self._hole(lattice, some, places[around], weights[around])
+                for some in _touching(discs, _TOUCH * bar)
+            ]
         return found
 
-    def _hole(self, lattice: NetLattice, rows: IntArray, centres: FloatArray) -> Hole | None:
-        """Measure a group of cells, or None where it is too small or too little seen."""
-        bar = lattice.bar
-        seen = float(self._through[rows].sum()) * self._cell / bar
-        places = centres[rows]
-        size = places.max(axis=0) - places.min(axis=0) + self._cell
-        # Cells between the lines of sight belong to the hole where no look says otherwise.
-        filled, inside = _filled(places, centres, self._cell, _REACH * bar)
-        area = filled * self._cell**2
-        if size.max() < _LEAST_EXTENT * bar or size.min() < _LEAST_WIDTH * bar:
-            return None
-        if area < _LEAST_AREA * bar**2:
-            return None
-        through, sound = float(self._through[inside].sum()), float(self._sound[inside].sum())
-        if seen * (through - _AGAINST * sound) < _LEAST_SEEN * (through + sound):
-            return None
-        weight = self._through[rows]
-        middle = (places * weight[:, None]).sum(axis=0) / weight.sum()
-        nearest = min(self._looks.values(), key=lambda look: float(np.hypot(*(look[2] - middle))))
-        # Cells on the hole's edge see both sides of it; half of them are left out all around.
-        diameter = float(np.sqrt(4.0 * area / np.pi)) + self._cell
+    def _hole(
+        self, lattice: NetLattice, discs: list[Disc], places: FloatArray, weights: FloatArray
+    ) -> Hole:
+        """Put the discs of a hole together."""
+        middle, extent, area = _outline(discs)
+        nearest = min(self._feet.values(), key=lambda foot: float(np.hypot(*(foot[2] - middle))))
+        diameter = float(np.sqrt(4.0 * area / np.pi))
+        radius = np.array([disc.radius for disc in discs])
+        sigma = float(np.hypot.reduce([2.0 * disc.sigma * disc.radius for disc in discs]))
+        inside = np.zeros(len(places), np.bool_)
+        for disc in discs:
+            inside |= np.hypot(*(places - disc.middle).T) < disc.radius
         return Hole(
             piece=self._piece,
             place=middle,
-            extent=(float(size[0]), float(size[1])),
+            extent=extent,
             diameter=diameter,
-            sigma_diameter=0.5 * bar,
+            sigma_diameter=sigma / float(np.hypot.reduce(radius)),
             missing_meshes=area / opening_area(lattice),
             frame=nearest[0],
             time_s=nearest[1],
             from_foot=middle - nearest[2],
-            n_looks=int(weight.max()),
+            n_looks=int(np.count_nonzero(inside & (weights > 0.0))),
         )
 
     def _settle(self) -> None:
         """Forget cells that the vehicle has left behind."""
-        if self._last is None or not len(self._keys):
+        if self._last is None or not len(self._looks.keys):
             return
-        close = np.abs(self._centres() - self._last).max(axis=1) < _SETTLED
-        self._settled_cells += int(np.count_nonzero(~close))
-        self._keys = self._keys[close]
-        self._sound, self._through = self._sound[close], self._through[close]
-        self._looks = {
+        close = np.abs(self._looks.places - self._last).max(axis=1) < _SETTLED
+        self._looks = self._looks.kept(close)
+        row = np.floor_divide(self._meshes + _ROW // 2, _ROW)
+        at = np.stack([self._meshes - row * _ROW, row], axis=1) * self._mesh
+        close = np.abs(at - self._last).max(axis=1) < _SETTLED
+        self._settled_meshes += int(np.count_nonzero(~close))
+        self._meshes = self._meshes[close]
+        self._feet = {
             key: one
-            for key, one in self._looks.items()
+            for key, one in self._feet.items()
             if np.abs(one[2] - self._last).max() < _SETTLED
         }
 
@@ -293,47 +302,86 @@ def opening_area(lattice: NetLattice) -> float:
     return float(1.0 / abs(a[0] * b[1] - a[1] * b[0]))
 
 
-def _cells(looks: Looks, place: FloatArray, cell: float) -> tuple[IntArray, BoolArray]:
-    """Keys of the cells that looks pass, and whether through a hole; each once a look."""
-    length = np.hypot(*(looks.end - looks.begin).T)
-    pieces = np.maximum(np.ceil(2.0 * length / cell), 1.0).astype(np.int64)
-    number = np.repeat(np.arange(len(pieces)), pieces)
-    share = (np.arange(len(number)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / (
-        pieces[number]
-    )
-    at = looks.begin[number] + share[:, None] * (looks.end - looks.begin)[number] + place
-    column, row = np.floor(at / cell).astype(np.int64).T
-    keys = np.unique(np.stack([column + _ROW * row, looks.through[number]], axis=1), axis=0)
-    return keys[:, 0], keys[:, 1] == 1
+def _missed_share(
+    laser: IntArray, family: IntArray, missed: BoolArray, run: IntArray
+) -> FloatArray:
+    """Share of strands that are missed though they are there, for every crossing (N,).
+
+    Told from single ones, between others that are seen, of the same laser and family.
+    """
+    kind = laser * (int(family.max(initial=0)) + 1) + family
+    seen = np.bincount(kind[~missed], minlength=int(kind.max(initial=0)) + 1)
+    single = np.bincount(kind[missed & (run == 1)], minlength=len(seen))
+    share = (single + _DARK * _BEFORE) / (seen + single + _BEFORE)
+    return np.asarray(share[kind])
 
 
-def _groups(places: FloatArray, reach: float) -> IntArray:
-    """Give a number to every group of places that steps of up to `reach` connect."""
-    grid, index = _raster(places, reach / 2.0)
-    labels, _ = ndimage.label(ndimage.binary_dilation(grid, _BLOCK), _BLOCK)
-    numbers = labels[tuple(index.T)]
-    _, group = np.unique(numbers, return_inverse=True)
-    return np.asarray(group, np.int64)
+def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatArray:
+    """Share of strands that are missed on a piece of a laser's line, for every crossing (N,).
+
+    Where light is scarce, seen and missed take turns as the net passes by; where a hole passes by
+    they do so once or twice.
+    """
+    _, kind = np.unique(np.stack([laser, here.astype(np.int64)]), axis=1, return_inverse=True)
+    order = np.argsort(kind, kind="stable")
+    again = kind[order][1:] == kind[order][:-1]
+    turned = again & (missed[order][1:] != missed[order][:-1])
+    n = int(kind.max(initial=0)) + 1
+    pairs = np.bincount(kind[order][1:], again, minlength=n) + _BEFORE_HERE
+    turns = np.bincount(kind[order][1:], turned, minlength=n) + 2.0 * _DARK * _BEFORE_HERE
+    # Of two in random order, 2 p (1 - p) differ.
+    share = 0.5 - np.sqrt(np.maximum(0.25 - 0.5 * turns / pairs, 0.0))
+    every = np.bincount(kind, missed, minlength=n) / np.bincount(kind, minlength=n)
+    return np.asarray(np.where(share > _SCARCE, np.maximum(share, every), share)[kind])
 
 
-def _filled(
-    places: FloatArray, others: FloatArray, cell: float, reach: float
-) -> tuple[int, BoolArray]:
-    """Close the gaps between cells; how many cells that makes, and which others lie among them."""
-    steps = max(round(reach / cell), 1)
-    grid, _ = _raster(places, cell)
-    closed = ndimage.binary_closing(np.pad(grid, steps + 1), _BLOCK, iterations=steps)
-    index = np.floor((others - places.min(axis=0)) / cell + 1e-9).astype(np.int64) + steps + 2
-    inside = np.all((index >= 0) & (index < closed.shape), axis=1)
-    inside[inside] = closed[tuple(index[inside].T)]
-    return int(np.count_nonzero(closed)), inside
+def _groups(places: FloatArray, reach: float) -> list[IntArray]:
+    """Return the indices of groups of places that steps of up to `reach` connect."""
+    left = np.ones(len(places), np.bool_)
+    groups = []
+    while left.any():
+        group = np.flatnonzero(left)[:1]
+        fresh = group
+        left[group] = False
+        while len(fresh):
+            apart = np.hypot(*(places[left][:, None] - places[fresh]).transpose(2, 0, 1))
+            fresh = np.flatnonzero(left)[np.any(apart < reach, axis=1)]
+            left[fresh] = False
+            group = np.r_[group, fresh]
+        groups.append(group)
+    return groups
 
 
-def _raster(places: FloatArray, cell: float) -> tuple[BoolArray, IntArray]:
-    index = np.floor((places - places.min(axis=0)) / cell + 1e-9).astype(np.int64) + 1
-    grid = np.zeros(index.max(axis=0) + 2, np.bool_)
-    grid[tuple(index.T)] = True
-    return grid, index
+def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
+    """Put discs that touch together."""
+    groups: list[list[Disc]] = []
+    for disc in discs:
+        mine = [
+            group
+            for group in groups
+            if any(
+                np.hypot(*(disc.middle - one.middle)) < disc.radius + one.radius + apart
+                for one in group
+            )
+        ]
+        groups = [group for group in groups if not any(group is one for one in mine)]
+        groups.append([disc, *(one for group in mine for one in group)])
+    return groups
+
+
+def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], float]:
+    """Middle (2,), width and height, and area that discs cover together."""
+    middles, radii = np.array([d.middle for d in discs]), np.array([d.radius for d in discs])
+    low = (middles - radii[:, None]).min(axis=0)
+    high = (middles + radii[:, None]).max(axis=0)
+    size = high - low
+    if len(discs) == 1:
+        return middles[0], (float(size[0]), float(size[1])), float(np.pi * radii[0] ** 2)
+    share = (np.arange(_SQUARES) + 0.5) / _SQUARES
+    at = low + np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * size
+    inside = np.any(np.hypot(*(at[:, None] - middles).transpose(2, 0, 1)) < radii, axis=1)
+    area = float(np.mean(inside) * size[0] * size[1])
+    return at[inside].mean(axis=0), (float(size[0]), float(size[1])), area
 
 
 def _same(one: Hole, other: Hole) -> bool:

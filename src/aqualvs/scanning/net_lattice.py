@@ -130,7 +130,7 @@ def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
     for angle in np.deg2rad(_TURNS):
         found = refine(Hypothesis(before.mesh, before.basis @ turned(angle).T), spectrum, 3)
         if found.score >= enough:
-            return refine(found, spectrum, 6)
+            return refine(found, spectrum, 5)
     return None
 
 
@@ -152,7 +152,7 @@ def _sigma(best: Hypothesis, frames: Sequence[Crossings]) -> float:
     bars = []
     for block in blocks:
         spectrum = Spectrum.of([frames[i] for i in block])
-        bars.append(bar_of(refine(best, spectrum, 4)))
+        bars.append(bar_of(refine(best, spectrum, 3)))
     return float(np.hypot(np.std(bars, ddof=1) / np.sqrt(len(bars)), _SEARCH_ERROR * size))
 
 

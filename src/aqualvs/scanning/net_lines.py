@@ -206,6 +206,7 @@ class NetReader:
         on_net = (np.abs(in_net[:, 2]) < off) & (points.label == Label.NET)
         height, width = (np.zeros(lines.along.shape) for _ in range(2))
         px = np.sqrt(np.sum(points.points_in_dome**2, axis=1)) / self.rig.focal_px
+        folded = (points.label == Label.NET) & ~on_net
         lit = laser[on_net], row[on_net]
         np.maximum.at(height, lit, points.intensity[on_net])
         np.maximum.at(width, lit, (points.width * px)[on_net])
@@ -215,6 +216,8 @@ class NetReader:
         hidden = hidden_lines(
             points, in_net, row, position, self._line_px, eye, sources, lines, off
         ) | self._near_crossings(lines, width, distance)
+        # Where the net leaves its plane nothing is known of the plane.
+        hidden[laser[folded], row[folded]] = True
         with np.errstate(invalid="ignore"):
             seen = (lines.position > self._lowest) & (lines.position < self._highest) & ~hidden
         state = np.where(seen, np.where(height > 0.0, LineState.LIT, LineState.DARK), 0)

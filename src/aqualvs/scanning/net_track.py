@@ -5,6 +5,7 @@ vehicle moved before (a Kalman filter with constant velocity). So the move from 
 be foreseen to better than half a mesh: say how fast the vehicle goes where another sensor knows it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,9 +31,21 @@ _ROUNDS, _STIFF = 4, 100.0
 # Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and the
 # foot of the perpendicular on the net in one frame (m): the posture trembles.
 _VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
+# Velocities at which a piece of track may begin (m/s): greatest, step, standard deviation before
+# and after it was found; and from so many frames at least.
+_FASTEST, _STEP, _USUAL, _FOUND = 0.45, 0.0125, 0.2, 0.04
+_LEAST_FRAMES = 4
+# By a whole mesh in every frame the net may move faster and look the same: the slowest velocity
+# with this share of the best match is taken, and the best one so near to it (m/s).
+_AS_GOOD, _SAME_VELOCITY = 0.9, 0.05
+# How well such a beginning knows the place, in metres.
+_PLACE = 2e-3
 # Where the place is not known to this any more, in metres, a new piece of track begins; after so
 # many seconds the velocity counts for nothing either.
 _LOST, _FORGOTTEN = 0.05, 3.0
+
+START_FRAMES, START_S = 8, 0.5
+"""A track begins with so many frames, within so many seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +90,22 @@ class Shift:
 
     place: FloatArray
     information: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How some frames, one after another, lie on a lattice.
+
+    Attributes
+    ----------
+    place : array, shape (2,)
+        Where the lattice lies in the first, as `Shift.place`.
+    velocity : array, shape (2,)
+        Of the vehicle along the net, in m/s.
+    """
+
+    place: FloatArray
+    velocity: FloatArray
 
 
 class LatticeFitter:
@@ -129,6 +158,39 @@ class LatticeFitter:
         if match < max(_LEAST_SHARE * full, _LEAST_DEVIATIONS * np.sqrt(0.5 * full)):
             return None
         return Shift(place, information)
+
+    def start(self, crossings: Sequence[Crossings], times_s: FloatArray) -> Start | None:
+        """Find place and velocity that some frames have in common; None where they are too few.
+
+        A single frame may lie askew, and from frame to frame the net may move by nearly half a
+        mesh: together they tell the one from the other.
+
+        Parameters
+        ----------
+        crossings : sequence of Crossings
+            Of the frames; the velocity changes little meanwhile.
+        times_s : array, shape (n,)
+            Their times.
+        """
+        usable = [i for i, one in enumerate(crossings) if len(one.place) >= _LEAST_CROSSINGS]
+        if len(usable) < _LEAST_FRAMES:
+            return None
+        size = np.hypot(*self._waves.T)
+        longest = size < 1.2 * size.min()
+        waves, share = self._waves[longest], np.arange(-_FASTEST, _FASTEST + _STEP, _STEP)
+        velocity = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
+        rate = velocity @ waves.T
+        total = np.zeros(rate.shape, np.complex128)
+        for i in usable:
+            sums = self._amplitude[longest] * _sums(crossings[i], waves)
+            total += sums * np.exp(2j * np.pi * rate * (times_s[i] - times_s[0]))
+        speed = np.hypot(*velocity.T)
+        score = 2.0 * np.abs(total).sum(axis=1) - speed**2 / (2.0 * _USUAL**2)
+        slowest = np.argmin(np.where(score >= _AS_GOOD * score.max(), speed, np.inf))
+        near = np.hypot(*(velocity - velocity[slowest]).T) < _SAME_VELOCITY
+        best = int(np.argmax(np.where(near, score, -np.inf)))
+        match = (self._swings[:, longest] @ total[best]).real
+        return Start(self._away[np.argmax(match)], velocity[best])
 
     def _about(
         self, sums: NDArray[np.complex128], place: FloatArray
@@ -245,12 +307,17 @@ class NetTrack:
         """As above."""
         return self._state[2:].copy()
 
+    def begins(self, time_s: float) -> bool:
+        """Whether nothing is known of place and velocity at a time."""
+        return self._origin is None or time_s - self._time_s > _FORGOTTEN
+
     def step(
         self,
         fitter: LatticeFitter,
         crossings: Crossings,
         time_s: float,
         velocity: FloatArray | None = None,
+        start: Start | None = None,
     ) -> Shift | None:
         """Take the next frame; None where it does not tell where the net lies.
 
@@ -264,10 +331,12 @@ class NetTrack:
             Of the frame.
         velocity : array, shape (2,), optional
             Of the vehicle along the net, right and up, if another sensor knows it.
+        start : Start, optional
+            What this frame and the next have in common, where the track begins.
         """
         state, covariance = self._ahead(time_s, velocity)
         if self._origin is None or covariance[:2, :2].trace() > _LOST**2:
-            return self._begin(fitter, crossings, time_s, state)
+            return self._begin(fitter, crossings, time_s, state, start)
         if self._lattice is not fitter.lattice:
             shift = fitter.shift(crossings)
             if shift is not None:
@@ -299,17 +368,29 @@ class NetTrack:
         return move @ state, move @ covariance @ move.T + np.kron(noise, np.eye(2))
 
     def _begin(
-        self, fitter: LatticeFitter, crossings: Crossings, time_s: float, state: FloatArray
+        self,
+        fitter: LatticeFitter,
+        crossings: Crossings,
+        time_s: float,
+        state: FloatArray,
+        start: Start | None,
     ) -> Shift | None:
         """Begin a piece of track, at the state to be expected if the one before is not long ago."""
-        shift = fitter.shift(crossings)
+        if start is None:
+            shift = fitter.shift(crossings)
+        else:
+            shift = fitter.shift(crossings, start.place, np.eye(2) / _PLACE**2)
         if shift is None:
             return None
-        if self._origin is None or time_s - self._time_s > _FORGOTTEN:
+        covariance = _at_first()
+        if self.begins(time_s):
             state = np.r_[self.place, 0.0, 0.0]
+            if start is not None:
+                state[2:] = start.velocity
+                covariance[2:, 2:] = _FOUND**2 * np.eye(2)
         self.piece += self._origin is not None
         self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
-        self._take(state, _at_first(), time_s)
+        self._take(state, covariance, time_s)
         return shift
 
     def _take(self, state: FloatArray, covariance: FloatArray, time_s: float) -> None:

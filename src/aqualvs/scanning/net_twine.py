@@ -4,13 +4,15 @@ The light on a strand is where strand and laser sheet overlap: a parallelogram w
 Search lines meet it over a length that follows in quadrature from strand and sheet, and across the
 line it is as wide as the sheet or as the strand lets it be, whichever is less:
 
-    length² = (d / sin a)² + (w k)²,        width⁻³ = (r w)⁻³ + (k sin a / (d + e))³,
+    length² = (l / sin a)² + (w k)²,        width⁻ᵖ = (r w)⁻ᵖ + (k sin a / (d + e))ᵖ,
 
-with the crossing angle a, the sheet's lit width w and the slant k, by which the strand runs away
-from the search lines on its way across the sheet. Dashes at several angles tell strand and sheet
-apart; r and e say how a width at half height compares with what is lit. What the detector takes
-for lit reaches beyond the twine: blur of lens and water, brightness far above the faintest stripe
-that counts. How far was measured in simulation; the uncertainty holds what it varied.
+with the silhouette d, its lit width l, the crossing angle a, the sheet's lit width w and the slant
+k, by which the strand runs away from the search lines on its way across the sheet. Dashes at
+several angles tell strand and sheet apart; r says how the sheet's width at half height compares
+with its lit one. A dash ends where its light falls below a share of its own peak (`net_dashes`), so
+that its length depends on brightness little: l is less than d, because round strands are dim at
+their edges, and more by blur. How much was measured in simulation; the uncertainty holds what it
+varied.
 """
 
 import math
@@ -21,24 +23,30 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 
-# How much wider than the twine its light is, in metres and in steps of the search lines, and what
-# that varies: 170 simulated dives at 0.3 to 1.0 m with two rigs, in clear and in turbid water.
-_HALO, _HALO_STEPS, _SIGMA_HALO = 0.60e-3, 0.2, 0.19e-3
-# Where the light is fainter than this, in grey levels, the halo depends on it and is less certain.
-_FAINT, _SIGMA_FAINT = 45.0, 0.4e-3
+# Lit width of a strand: so much of its silhouette, and so much more in metres, in steps of the
+# search lines, and in metres per logarithm of its height over the usual one in grey levels (bright
+# tops are cut off, faint edges are lost). From simulated dives in clear and turbid water at 0.3 to
+# 1.0 m with two rigs, hardly fouled, whose twine was known.
+_SEEN, _HALO, _HALO_STEPS, _HALO_HEIGHT = 0.81, 0.61e-3, 0.28, 0.4e-3
+_LEAST_HEIGHT = 25.0
+USUAL_HEIGHT = np.array(100.0)
+"""Height of a dash at which `Twine.halo` holds, in grey levels."""
+# What that varies in steps; and as a share of the strand where there is no light at all, less up to
+# a height at which strands are no longer seen in part.
+_SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.12, 0.3, 90.0
 # The silhouette of twisted twine is on average narrower than its diameter.
 _SILHOUETTE = 0.95
-# Width of a strand at half height less its lit width, in metres (same dives).
-_STRAND_MORE = 0.45e-3
-# Before any dash was seen: lit width of a strand and of the sheet in metres, width of the sheet at
-# half height over its lit width; and their spreads as logarithms.
-_USUAL, _SPREAD = np.log([2.5e-3, 4.2e-3, 1.16]), np.array([1.5, 0.25, 0.12])
+# Width of a strand at half height less its silhouette, in pixels; and the exponent p (same dives).
+_STRAND_MORE, _CORNER = 1.2, 2.5
+# Before any dash was seen: silhouette of a strand and lit width of the sheet in metres, the sheet's
+# width at half height over its lit one; and their spreads as logarithms.
+_USUAL, _SPREAD = np.log([2.2e-3, 3.5e-3, 1.33]), np.array([1.5, 0.2, 0.1])
 # Errors of a kind's length and width: relative, relative for one dash, and in search lines.
-_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.06, 0.08, 0.3, 0.2
+_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.045, 0.2, 0.2, 0.2
 # Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
-_SPREAD_ERROR = 0.25
+_SPREAD_ERROR = 0.15
 # The model holds the less the more slanted the strand is.
-_SLANT_ERROR = 0.4
+_SLANT_ERROR = 0.25
 # Uncertainty of what slant adds to a dash, as a share.
 _SLANT_TOLD = 0.1
 _ROUNDS = 40
@@ -64,6 +72,8 @@ class DashKind:
         Of its light, in grey levels.
     step : float
         Length of laser line that a search line stands for, in metres.
+    pixel : float
+        Size of a pixel on the net, in metres.
     spread : float
         Logarithm of long dashes over short ones: how much growth there is.
     count : int
@@ -78,6 +88,7 @@ class DashKind:
     width: float
     height: float
     step: float
+    pixel: float
     spread: float
     count: int
 
@@ -106,17 +117,19 @@ class Twine:
     halo: float
     sigma_halo: float
 
-    def usual(self, across: FloatArray, slant: FloatArray, step: FloatArray) -> FloatArray:
-        """Length of dashes, in metres, by crossing angle, slant and step as in `DashKind`."""
-        lit = self.body + self.halo + _HALO_STEPS * step
+    def usual(
+        self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
+    ) -> FloatArray:
+        """Length of dashes, in metres, by crossing angle, slant, step, height as in `DashKind`."""
+        lit = self.body + self.halo + _beyond(step, height)
         return np.asarray(np.hypot(lit / across, self.sheet * slant))
 
     def excess(
-        self, across: FloatArray, slant: FloatArray, step: FloatArray
+        self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return what of `usual` is not twine, in metres, and its standard deviation."""
-        usual = self.usual(across, slant, step)
-        straight = (self.body + self.halo + _HALO_STEPS * step) / across
+        usual = self.usual(across, slant, step, height)
+        straight = (self.body + self.halo + _beyond(step, height)) / across
         sigma = np.hypot(self.sigma_halo / across, _SLANT_TOLD * (usual - straight))
         return usual - self.body / across, np.asarray(sigma)
 
@@ -138,37 +151,39 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
     sigma_strand = float(strand * np.sqrt(covariance[0, 0]))
     if known is not None:
         body = _SILHOUETTE * known
-        return Twine(known, 0.0, body, float(sheet), float(strand) - body, sigma_strand)
-    faint = max(1.0 - float(np.median([k.height for k in kinds])) / _FAINT, 0.0)
-    sigma = math.hypot(sigma_strand, math.hypot(_SIGMA_HALO, _SIGMA_FAINT * faint))
-    body = _positive(float(strand) - _HALO, math.hypot(sigma, 0.1 * float(strand)))
+        halo = _SEEN * float(strand) + _HALO - body
+        return Twine(known, 0.0, body, float(sheet), halo, _SEEN * sigma_strand)
+    step, height = np.median([[k.step, k.height] for k in kinds], axis=0)
+    faint = max(1.0 - float(height) / _FAINT, 0.0)
+    of_halo = math.hypot(_SIGMA_HALO * float(step), _SIGMA_FAINT * faint * float(strand)) / _SEEN
+    sigma = math.hypot(sigma_strand, of_halo)
+    body = float(strand)
     return Twine(
         thickness=body / _SILHOUETTE,
         sigma=sigma / _SILHOUETTE,
         body=body,
         sheet=float(sheet),
-        halo=float(strand) - body,
-        sigma_halo=sigma,
+        halo=_HALO - (1.0 - _SEEN) * body,
+        sigma_halo=_SEEN * sigma,
     )
 
 
-def _positive(value: float, sigma: float) -> float:
-    """Return the expectation of what was measured as `value` and cannot be negative."""
-    x = value / sigma
-    if x < -4.0:
-        return sigma / 4.0
-    below = 0.5 * (1.0 + math.erf(x / math.sqrt(2.0)))
-    return value + sigma * math.exp(-0.5 * x * x) / (math.sqrt(2.0 * math.pi) * below)
+def _beyond(step: FloatArray, height: FloatArray) -> FloatArray:
+    """How much wider a strand is lit than where steps are short and its height is usual, in m."""
+    bright = np.log(np.maximum(height, _LEAST_HEIGHT) / USUAL_HEIGHT)
+    return np.asarray(_HALO_STEPS * step + _HALO_HEIGHT * bright)
 
 
 def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
-    """Logarithms (3,) of strand, sheet and sheet's half-height ratio, and their covariance.
+    """Logarithms (3,) of silhouette, sheet and sheet's half-height ratio, and their covariance.
 
     Gauss-Newton; lengths and widths far off count less (Huber's weights).
     """
-    across, slant, length, width, step, count = np.array(
-        [[k.across, k.slant, k.length, k.width, k.step, k.count] for k in kinds], np.float64
+    across, slant, length, width, step, pixel, height, count = np.array(
+        [[k.across, k.slant, k.length, k.width, k.step, k.pixel, k.height, k.count] for k in kinds],
+        np.float64,
     ).T
+    blur = _HALO + _beyond(step, height), _STRAND_MORE * pixel
     seen = np.log(np.r_[length, width])
     grown = _SPREAD_ERROR * np.array([k.spread for k in kinds])
     of_length = np.hypot(np.hypot(_LENGTH_ERROR, grown), _ERROR_PX * step / length)
@@ -177,9 +192,9 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
     error *= np.tile(1.0 + _SLANT_ERROR * slant, 2)
     prior = np.diag(_SPREAD**-2)
     at, normal = _USUAL.copy(), prior
-    at[0] = np.log(np.clip(0.8 * np.min(length * across), 3e-4, 2e-2))
+    at[0] = np.log(np.clip(np.min(length * across) - _HALO, 3e-4, 2e-2))
     for _ in range(_ROUNDS):
-        expected, slope = _model(at, across, slant, step)
+        expected, slope = _model(at, across, slant, *blur)
         off = (seen - expected) / error
         jacobian = slope / error[:, None]
         weight = 1.0 / np.maximum(np.abs(off), 1.0)
@@ -192,19 +207,19 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
 
 
 def _model(
-    at: FloatArray, across: FloatArray, slant: FloatArray, step: FloatArray
+    at: FloatArray, across: FloatArray, slant: FloatArray, halo: FloatArray, more: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Logarithms (2K,) of lengths, then widths, and their derivatives (2K, 3) by `at`."""
     strand, sheet, ratio = np.exp(at)
-    lit = strand + _HALO_STEPS * step
+    lit = _SEEN * strand + halo
     one, other = (lit / across) ** 2, (sheet * slant) ** 2
     by_strand = one / (one + other)
-    wide = strand + _STRAND_MORE
-    full, clipped = (ratio * sheet) ** -3, (slant * across / wide) ** 3
+    wide = strand + more
+    full, clipped = (ratio * sheet) ** -_CORNER, (slant * across / wide) ** _CORNER
     by_clip = clipped / (full + clipped)
     slope = np.zeros((2, len(across), 3))
-    slope[0, :, 0], slope[0, :, 1] = by_strand * strand / lit, 1.0 - by_strand
+    slope[0, :, 0], slope[0, :, 1] = by_strand * _SEEN * strand / lit, 1.0 - by_strand
     slope[1, :, 0] = by_clip * strand / wide
     slope[1, :, 1] = slope[1, :, 2] = 1.0 - by_clip
-    expected = np.r_[0.5 * np.log(one + other), -np.log(full + clipped) / 3.0]
+    expected = np.r_[0.5 * np.log(one + other), -np.log(full + clipped) / _CORNER]
     return expected, slope.reshape(-1, 3)

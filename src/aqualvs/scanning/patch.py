@@ -7,6 +7,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.quadric_kernels import heights_over
 
 FLAT = np.zeros(6)
 """Coefficients (a, b, c, p, q, r) of a plane."""
@@ -40,9 +41,9 @@ class Patch:
 
     def height(self, points: FloatArray) -> FloatArray:
         """Return by how much points (N, 3) lie behind the patch, along the base's normal, in m."""
-        terms = height_terms(points @ self.right, points @ self.up)
-        off: FloatArray = self.base.signed_distance(points) - terms @ self.coefficients
-        return off
+        return heights_over(
+            points, self.base.normal, self.base.offset, self.right, self.up, self.coefficients
+        )
 
     def packed(self) -> FloatArray:
         """Return the patch as 16 numbers for kernels: normal, offset, right, up, coefficients."""
@@ -80,11 +81,6 @@ def flat_patch(plane: Plane) -> Patch:
     right, ahead = b / level, -a / level
     up = np.array([ahead * c, -right * c, right * b - ahead * a])
     return Patch(plane, np.array([right, ahead, 0.0]), up, FLAT)
-
-
-def height_terms(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the terms (N, 6) of heights at u and v, shape (N,), for the six coefficients."""
-    return np.stack([np.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], axis=-1)
 
 
 def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:

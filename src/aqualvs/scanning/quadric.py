@@ -20,11 +20,20 @@ from aqualvs.scanning.patch import (
     Patch,
     PatchFit,
     flat_patch,
-    height_terms,
     nearest_tangent,
     tangent_covariance,
 )
 from aqualvs.scanning.plane_fit import SharedError
+from aqualvs.scanning.quadric_kernels import (
+    GATE_PX,
+    GATE_SHARE,
+    N,
+    add_shared,
+    curvature_in_sigmas,
+    grow,
+    over_plane,
+    reweight,
+)
 from aqualvs.scanning.readings import Observations
 
 __all__ = (
@@ -43,25 +52,13 @@ __all__ = (
 LEAST_BEND = 0.003
 """By so much of the range a net must bend where it is seen, or it is flat."""
 
-# Growth: steps, and the gate in shares of the range and in pixels.
-_STEPS = 16
-_GATE_SHARE = 0.004
-_GATE_PX = 1.2
 _WIDE_GATE = 3.0
-_TUKEY = 4.685
-_REWEIGHTS = 6
-# What is expected of nets before looking, in 1/m: bent by a metre's radius, hardly twisted.
-_SIGMA_CURVATURE = 2.0
-_SIGMA_TWIST = 0.5
 # The residual asks for curvature when it gains so much of the light or of the scatter ...
 _MORE_LIGHT = 1.10
 _LESS_SCATTER = 0.6
 # ... and the curvature is no chance.
 _SIGNIFICANT = 6.0
 _HINT = 2.0
-# Steeper bends than a radius of half a metre are something else.
-_STRONGEST = 2.0
-_MIN_PIECES = 12
 # Strands on a bend err together more than on a plane: found on simulated nets.
 _LOOSENED = 1.5
 
@@ -78,18 +75,8 @@ def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) ->
     plane : Plane
         The fit.
     """
-    flat = flat_patch(plane)
-    terms = height_terms(seen.points @ flat.right, seen.points @ flat.up)
-    height = plane.signed_distance(seen.points)
-    sigma = np.abs(seen.sensitivity @ plane.normal) * seen.sigma_px
-    solved = _solve(terms, height, weights / sigma**2)
-    if solved is None or len(height) <= len(FLAT):
-        return False
-    coefficients, normal = solved
-    off = (height - terms @ coefficients) / sigma
-    scale = np.sqrt(np.sum(weights * off**2) / (len(height) - len(FLAT)))
-    sigmas = np.sqrt(np.diag(np.linalg.inv(normal))[3:]) * max(scale, 1.0)
-    return bool(np.abs(coefficients[3:] / sigmas).max() > _HINT)
+    terms, height, per_px = _over(seen, plane, flat_patch(plane))
+    return bool(curvature_in_sigmas(terms, height, per_px * seen.sigma_px, weights) > _HINT)
 
 
 def fit_patch(
@@ -162,111 +149,50 @@ def _fit_over(
 ) -> _Attempt | None:
     """Fit a patch over a plane, grown from some observations or from those in so many gates."""
     flat = flat_patch(plane)
-    u, v = seen.points @ flat.right, seen.points @ flat.up
-    terms = height_terms(u, v)
-    height = plane.signed_distance(seen.points)
-    per_px = np.abs(seen.sensitivity @ plane.normal)
-    gate = np.hypot(_GATE_SHARE * plane.offset, _GATE_PX * per_px)
+    terms, height, per_px = _over(seen, plane, flat)
+    gate = np.hypot(GATE_SHARE * plane.offset, GATE_PX * per_px)
     sigma = per_px * seen.sigma_px
     on_plane = np.abs(height) < gate
-    inside = np.abs(height) < start * gate if isinstance(start, float) else start
-    found = _grow(terms, height, gate, inside)
-    if found is None:
+    inside = np.abs(height) < start * gate if isinstance(start, float) else start.copy()
+    coefficients, weights, inverse = np.zeros(N), np.empty(len(height)), np.empty((N, N))
+    if not grow(terms, height, gate, inside, coefficients):
         return None
-    coefficients, inside = found
-    if np.count_nonzero(inside) < _MIN_PIECES:
-        return None
-    coefficients, normal, weights, scale = _reweighted(terms, height, sigma, inside, coefficients)
-    covariance = np.asarray(np.linalg.inv(normal), np.float64) * max(scale, 1.0) ** 2
-    covariance += _shared(terms, per_px, sigma, weights, seen, normal, shared)
-    patch = Patch(plane, flat.right, flat.up, coefficients)
-    off = height - terms @ coefficients
-    rms = float(np.sqrt(np.sum(weights * off**2) / np.sum(weights)))
-    fit = PatchFit(patch, covariance, weights, rms)
+    scale, rms = reweight(terms, height, sigma, inside, coefficients, weights, inverse)
+    covariance = inverse * max(scale, 1.0) ** 2
+    pull = weights * per_px / sigma**2
+    add_shared(
+        terms,
+        pull,
+        seen.line,
+        seen.laser,
+        shared.shift_px,
+        shared.tilt_px,
+        inverse,
+        covariance,
+    )
+    fit = PatchFit(Patch(plane, flat.right, flat.up, coefficients), covariance, weights, rms)
     asked = _asked_for(fit, terms, height, inside, on_plane, plane.offset, least_bend)
     return _Attempt(fit, asked)
 
 
-def _prior() -> FloatArray:
-    sigmas = np.array([np.inf, np.inf, np.inf, _SIGMA_CURVATURE, _SIGMA_TWIST, _SIGMA_CURVATURE])
-    return np.diag(1.0 / sigmas**2)
-
-
-def _solve(
-    terms: FloatArray, height: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    normal = (terms * weight[:, None]).T @ terms + _prior()
-    if np.linalg.cond(normal) > 1e14:
-        return None
-    solution = np.asarray(np.linalg.solve(normal, terms.T @ (weight * height)), np.float64)
-    return solution, normal
-
-
-def _grow(
-    terms: FloatArray,
-    height: FloatArray,
-    gate: FloatArray,
-    inside: BoolArray,
-) -> tuple[FloatArray, BoolArray] | None:
-    """Refit and take in what the fit predicts until nothing changes."""
-    coefficients = FLAT
-    for _ in range(_STEPS):
-        if np.count_nonzero(inside) < _MIN_PIECES:
-            return None
-        solved = _solve(terms[inside], height[inside], 1.0 / gate[inside] ** 2)
-        if solved is None or np.abs(solved[0][3:]).max() > _STRONGEST:
-            return None
-        coefficients = solved[0]
-        now = np.abs(height - terms @ coefficients) < gate
-        if np.array_equal(now, inside):
-            break
-        inside = now
-    return coefficients, inside
-
-
-def _reweighted(
-    terms: FloatArray,
-    height: FloatArray,
-    sigma: FloatArray,
-    inside: BoolArray,
-    coefficients: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Tukey's biweight from the grown fit: coefficients, normal matrix, weights, scale."""
-    scale = 1.0
-    normal = np.eye(6)
-    weights = inside.astype(np.float64)
-    for _ in range(_REWEIGHTS):
-        z = (height - terms @ coefficients) / sigma
-        scale = max(1.4826 * float(np.median(np.abs(z[inside]))), 0.1)
-        weights = np.where(inside, np.maximum(1.0 - (z / (_TUKEY * scale)) ** 2, 0.0) ** 2, 0.0)
-        solved = _solve(terms, height, weights / sigma**2)
-        if solved is None:
-            break
-        coefficients, normal = solved
-    return coefficients, normal, weights, scale
-
-
-def _shared(
-    terms: FloatArray,
-    per_px: FloatArray,
-    sigma: FloatArray,
-    weights: FloatArray,
-    seen: Observations,
-    normal: FloatArray,
-    shared: SharedError,
-) -> FloatArray:
-    """Covariance of a shift and a tilt that all of a laser's stripe may share."""
-    inverse = np.linalg.inv(normal)
-    total = np.zeros((6, 6))
-    pull = terms * (weights * per_px / sigma**2)[:, None]
-    for laser in np.unique(seen.laser):
-        mine = seen.laser == laser
-        line = seen.line[mine]
-        along = 2.0 * (line - line.min()) / max(np.ptp(line), 1.0) - 1.0
-        for size, mode in ((shared.shift_px, np.ones_like(along)), (shared.tilt_px, along)):
-            shift = size * inverse @ (pull[mine].T @ mode)
-            total += np.outer(shift, shift)
-    return total
+def _over(
+    seen: Observations, plane: Plane, flat: Patch
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the terms of the observations' places, their heights, and these by the pixel."""
+    n = len(seen.line)
+    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
+    over_plane(
+        seen.points,
+        seen.sensitivity,
+        plane.normal,
+        plane.offset,
+        flat.right,
+        flat.up,
+        terms,
+        height,
+        per_px,
+    )
+    return terms, height, per_px
 
 
 def _asked_for(

@@ -1,7 +1,8 @@
 """Runs: unbroken stretches of marked pixels along search lines, found without looking everywhere.
 
 The search image is divided into cells of `BLOCK` positions by 8 lines; only cells that a laser's
-band reaches, and where something is green, are looked at, 8 lines (one machine word) at a time.
+band reaches, and where something is green, are looked at, one machine word at a time: a word is 8
+lines where lines are columns, and 8 positions where they are rows.
 """
 
 import numpy as np
@@ -9,14 +10,22 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
+from aqualvs.scanning.byte_words import (
+    HIGH_BITS,
+    at_least,
+    first_marked,
+    same_in_all,
+    without_first,
+)
 from aqualvs.scanning.contrast import BLOCK, U8Array
+from aqualvs.scanning.green_cells import cells_in_band
 
-_HIGH_BITS = np.uint64(0x8080808080808080)
-_ONE = np.uint64(1)
+_NOTHING = np.uint64(0)
+_BYTE, _TOP_BYTE = np.uint64(8), np.uint64(56)
 
 
-class RunFinder:
-    """Finds runs in search images of one shape; allocates once.
+class ColumnRuns:
+    """Finds runs in search images of one shape whose lines are columns; allocates once.
 
     Parameters
     ----------
@@ -36,7 +45,7 @@ class RunFinder:
     """
 
     def __init__(self, length: int, lowest: IntArray, highest: IntArray, capacity: int) -> None:
-        self.in_band = _cells_in_band(length, lowest, highest)
+        self.in_band = cells_in_band(length, lowest, highest)
         self.capacity = capacity
         self._lowest, self._highest = lowest, highest
         n_words = self.in_band.shape[1]
@@ -53,9 +62,9 @@ class RunFinder:
 
         Parameters
         ----------
-        image : uint8 array, shape (length, n_lines)
-            Search lines are columns.
-        background : uint8 array, shape (n_blocks, n_lines)
+        image : uint8 array, shape (length, 8 n_words)
+            Search lines are columns; 255 beyond the last.
+        background : uint8 array, shape (n_blocks, 8 n_words)
             Of the image.
         min_contrast : int
             Least height above it, in grey levels.
@@ -68,7 +77,7 @@ class RunFinder:
             (line, first, last), ordered by line, then by position. A view: overwritten by the next
             call.
         """
-        n = _find_runs(
+        n = _find_in_columns(
             image,
             background,
             np.uint8(min_contrast),
@@ -84,57 +93,65 @@ class RunFinder:
         return self._ordered[:n]
 
 
-def _cells_in_band(length: int, lowest: IntArray, highest: IntArray) -> BoolArray:
-    """Mark the cells of `BLOCK` positions by 8 lines that any line's interval reaches."""
-    n_blocks, n_words = -(-length // BLOCK), -(-len(lowest) // 8)
-    blocks = np.arange(n_blocks)[:, None]
-    hit = (blocks >= lowest // BLOCK) & (blocks <= highest // BLOCK) & (lowest <= highest)
-    padded = np.zeros((n_blocks, n_words * 8), np.bool_)
-    padded[:, : len(lowest)] = hit
-    cells: BoolArray = np.any(padded.reshape(n_blocks, n_words, 8), axis=2)
-    return cells
-
-
-@borrowing_kernel
-def mark_green(image: U8Array, background: U8Array, least: np.uint8, green: U8Array) -> None:
-    """Mark, for every `BLOCK` / 2 rows, the columns in which something stands above the background.
+class RowRuns:
+    """Finds runs in search images of one shape whose lines are rows; allocates once.
 
     Parameters
     ----------
-    image : uint8 array, shape (length, n_lines)
-        Chroma at half the size of luma, inverted so that green is high.
-    background : uint8 array, shape (ceil(length / BLOCK), n_lines)
-        Of the image.
-    least : uint8
-        Least contrast.
-    green : uint8 array, shape (n_blocks of luma, at least n_lines)
-        Written up to column n_lines: not zero where marked.
+    length, lowest, highest, capacity
+        As for `ColumnRuns`.
+
+    Attributes
+    ----------
+    in_band : bool array, shape (n_words, n_blocks)
+        Cells that a line's interval reaches.
+    capacity : int
+        As given.
     """
-    length, n_lines = image.shape
-    for b in range(green.shape[0]):
-        for x in range(n_lines):
-            green[b, x] = np.uint8(0)
-        for v in range(b * BLOCK // 2, min((b + 1) * BLOCK // 2, length)):
-            row = v // BLOCK
-            for x in range(n_lines):
-                value, floor = image[v, x], background[row, x]
-                height = np.uint8(value - floor) if value > floor else np.uint8(0)
-                green[b, x] |= np.uint8(255) if height >= least else np.uint8(0)
+
+    def __init__(self, length: int, lowest: IntArray, highest: IntArray, capacity: int) -> None:
+        self.in_band = np.ascontiguousarray(cells_in_band(length, lowest, highest).T)
+        self.capacity = capacity
+        self._length = length
+        self._lowest, self._highest = lowest, highest
+        self._runs = np.empty((capacity, 3), np.int64)
+
+    def find(
+        self, image: U8Array, background: U8Array, min_contrast: int, cells: BoolArray
+    ) -> IntArray:
+        """Find the runs that stand above the background.
+
+        Parameters
+        ----------
+        image : uint8 array, shape (n_lines, 8 n_blocks)
+            Search lines are rows.
+        background : uint8 array, shape (n_lines, n_blocks)
+            Of the image.
+        min_contrast : int
+            Least height above it, in grey levels.
+        cells : bool array, shape (n_words, n_blocks)
+            Where to look.
+
+        Returns
+        -------
+        int array, shape (n, 3)
+            As from `ColumnRuns.find`.
+        """
+        n = _find_in_rows(
+            image.view(np.uint64),
+            background,
+            np.uint16(min_contrast),
+            cells,
+            self._length,
+            self._lowest,
+            self._highest,
+            self._runs,
+        )
+        return self._runs[:n]
 
 
 @borrowing_kernel
-def cells_near_green(in_band: BoolArray, green: NDArray[np.uint32], cells: BoolArray) -> None:
-    """Keep the cells with green in them or in the block before or after (a white core)."""
-    n_blocks, n_words = in_band.shape
-    for b in range(n_blocks):
-        before, after = max(b - 1, 0), min(b + 1, n_blocks - 1)
-        for w in range(n_words):
-            near = green[before, w] | green[b, w] | green[after, w]
-            cells[b, w] = in_band[b, w] and near != 0
-
-
-@borrowing_kernel
-def _find_runs(
+def _find_in_columns(
     image: U8Array,
     background: U8Array,
     least: np.uint8,
@@ -150,18 +167,14 @@ def _find_runs(
 
     Parameters
     ----------
-    image : uint8 array, shape (length, n_lines)
-        Search lines are columns.
-    background : uint8 array, shape (n_blocks, n_lines)
-        Of the image.
+    image, background, cells
+        As in `ColumnRuns.find`.
     least : uint8
         Least contrast.
-    cells : bool array, shape (n_blocks, n_words)
-        Where to look.
     lowest, highest : int array, shape (n_lines,)
         Runs that lie wholly outside are left out.
     marks, words : uint8 array, shape (BLOCK + 1, 8 * n_words), and its view as 64-bit words
-        Scratch, zero beyond n_lines. Holds one block, so that it stays in the nearest cache.
+        Scratch. Holds one block, so that it stays in the nearest cache.
     open_start : int array, shape (8 * n_words,)
         Scratch.
     runs : int array, shape (capacity, 3)
@@ -172,36 +185,34 @@ def _find_runs(
     int
         Number of runs written.
     """
-    length, n_lines = image.shape
+    length = image.shape[0]
     n_blocks, n_words = cells.shape
-    nothing = np.uint64(0)
     n = 0
     for w in range(n_words):
-        words[BLOCK, w] = nothing
+        words[BLOCK, w] = _NOTHING
     for b in range(n_blocks):
         first_row = b * BLOCK
         n_rows = min(BLOCK, length - first_row)
         for r in range(n_rows):
-            for x in range(n_lines):
+            for x in range(marks.shape[1]):
                 value, floor = image[first_row + r, x], background[b, x]
                 height = np.uint8(value - floor) if value > floor else np.uint8(0)
                 marks[r, x] = np.uint8(255) if height >= least else np.uint8(0)
         for w in range(n_words):
             before = words[BLOCK, w]
             if not cells[b, w]:
-                if before != nothing:
+                if before != _NOTHING:
                     n = _close_runs(before, w, first_row - 1, lowest, highest, open_start, runs, n)
-                    words[BLOCK, w] = nothing
+                    words[BLOCK, w] = _NOTHING
                 continue
             for r in range(n_rows):
-                here = words[r, w] & _HIGH_BITS
+                here = words[r, w] & HIGH_BITS
                 starts, ends = here & ~before, before & ~here
                 before = here
-                if starts != nothing:
-                    for k in range(8):
-                        if starts >> np.uint64(8 * k + 7) & _ONE != nothing:
-                            open_start[8 * w + k] = first_row + r
-                if ends != nothing:
+                while starts != _NOTHING:
+                    open_start[8 * w + first_marked(starts)] = first_row + r
+                    starts = without_first(starts)
+                if ends != _NOTHING:
                     last = first_row + r - 1
                     n = _close_runs(ends, w, last, lowest, highest, open_start, runs, n)
             words[BLOCK, w] = before
@@ -222,10 +233,9 @@ def _close_runs(
     n: int,
 ) -> int:
     """Append the runs whose bytes are set and that reach their line's interval; the new count."""
-    for k in range(8):
-        if ends >> np.uint64(8 * k + 7) & _ONE == np.uint64(0):
-            continue
-        x = 8 * w + k
+    while ends != _NOTHING:
+        x = 8 * w + first_marked(ends)
+        ends = without_first(ends)
         if open_start[x] <= highest[x] and last >= lowest[x] and n < runs.shape[0]:
             runs[n, 0], runs[n, 1], runs[n, 2] = x, open_start[x], last
             n += 1
@@ -247,3 +257,60 @@ def _sort_by_line(runs: IntArray, line_start: IntArray, ordered: IntArray) -> No
         line_start[x] += 1
         for k in range(3):
             ordered[row, k] = runs[i, k]
+
+
+@borrowing_kernel
+def _find_in_rows(
+    words: NDArray[np.uint64],
+    background: U8Array,
+    least: np.uint16,
+    cells: BoolArray,
+    length: int,
+    lowest: IntArray,
+    highest: IntArray,
+    runs: IntArray,
+) -> int:
+    """Collect runs (line, first, last) of pixels above the background; 8 positions a look.
+
+    See `_find_in_columns`; `words` are the image's, and what lies beyond `length` is none of it.
+    """
+    n_lines, n_blocks = background.shape
+    n = 0
+    for x in range(n_lines):
+        start = -1
+        before = _NOTHING
+        for b in range(n_blocks):
+            here = _NOTHING
+            if cells[x >> 3, b]:
+                level = np.uint16(background[x, b]) + least
+                if level <= np.uint16(255):
+                    here = at_least(words[x, b], same_in_all(level))
+            elif start < 0:
+                continue
+            shifted = (here << _BYTE) | (before >> _TOP_BYTE)
+            starts, ends = here & ~shifted, shifted & ~here
+            before = here
+            while starts != _NOTHING or ends != _NOTHING:
+                if start < 0:
+                    start = b * BLOCK + first_marked(starts)
+                    starts = without_first(starts)
+                    if ends == _NOTHING:
+                        break
+                last = b * BLOCK + first_marked(ends) - 1
+                ends = without_first(ends)
+                n = _append(x, start, min(last, length - 1), lowest, highest, runs, n)
+                start = -1
+        if start >= 0:
+            n = _append(x, start, length - 1, lowest, highest, runs, n)
+    return n
+
+
+@inline_borrowing_kernel
+def _append(
+    x: int, start: int, last: int, lowest: IntArray, highest: IntArray, runs: IntArray, n: int
+) -> int:
+    """Append a run that reaches its line's interval; the new count."""
+    if start <= last and start <= highest[x] and last >= lowest[x] and n < runs.shape[0]:
+        runs[n, 0], runs[n, 1], runs[n, 2] = x, start, last
+        n += 1
+    return n

@@ -5,17 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
-from aqualvs.scanning.contrast import BLOCK, BackgroundWorkspace, U8Array, flank_background
-from aqualvs.scanning.runs import RunFinder, cells_near_green, mark_green
+from aqualvs.scanning.contrast import BLOCK, U8Array
+from aqualvs.scanning.ground import ColumnGround, RowGround
+from aqualvs.scanning.runs import ColumnRuns, RowRuns
+from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.view import SearchView
 
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
 # Doubling the contrast threshold ends here.
 _HIGHEST_CONTRAST = 120
-_NO_CHROMA = np.empty((0, 0), np.uint8)
+_GREY: U8Array = np.empty((0, 0), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,12 +91,12 @@ class StripeDetector:
 
     Parameters
     ----------
-    length, n_lines : int
-        Shape of the search image: the luma plane, or its transpose for searches along x.
+    axis : SearchAxis
+        Direction of the search lines.
+    size_px : (int, int)
+        Image width and height.
     lowest, highest : int array, shape (n_lines,)
         First and last position of interest on each line (an empty interval skips the line).
-    reach_px : int
-        See `StripeOptions.reach_share`.
     options : StripeOptions
         Options.
 
@@ -106,23 +108,26 @@ class StripeDetector:
 
     def __init__(
         self,
-        length: int,
-        n_lines: int,
+        axis: SearchAxis,
+        size_px: tuple[int, int],
         lowest: IntArray,
         highest: IntArray,
-        reach_px: int,
         options: StripeOptions,
     ) -> None:
         self._options = options
-        self._reach_px = reach_px
-        self._finder = RunFinder(length, lowest, highest, options.max_returns)
-        self._workspace = BackgroundWorkspace(length, n_lines, reach_px)
-        half_length, half_lines = -(-length // 2), -(-n_lines // 2)
-        self._u_workspace = BackgroundWorkspace(half_length, half_lines, -(-reach_px // 2))
-        self._inverted_u: U8Array = np.empty((half_length, half_lines), np.uint8)
-        self._cells = np.empty_like(self._finder.in_band)
-        n_blocks, n_words = self._cells.shape
-        self._green: U8Array = np.zeros((n_blocks, 4 * n_words), np.uint8)
+        self._reach_px = max(8, round(options.reach_share * size_px[0]))
+        along_x = axis is SearchAxis.ALONG_X
+        length = size_px[0] if along_x else size_px[1]
+        finder = RowRuns if along_x else ColumnRuns
+        self._finder = finder(length, lowest, highest, options.max_returns)
+        ground = RowGround if along_x else ColumnGround
+        self._ground = ground(
+            length,
+            len(lowest),
+            self._reach_px,
+            max(1, int(options.min_green_fall)),
+            self._finder.in_band,
+        )
         self._line = np.empty(options.max_returns, np.int64)
         self._measures = np.empty((4, options.max_returns))
 
@@ -134,19 +139,19 @@ class StripeDetector:
         found : Returns
             Copies: they stay valid after the next call.
         """
-        background = flank_background(view.luma, self._workspace)
-        cells = self._cells_of_interest(view.u)
+        background = self._ground.background(view.image)
+        cells = self._finder.in_band if view.green is None else self._ground.near_green(view.green)
         min_contrast = self._options.min_contrast
         while True:
-            runs = self._finder.find(view.luma, background, min_contrast, cells)
+            runs = self._finder.find(view.image, background, min_contrast, cells)
             if len(runs) < self._finder.capacity or min_contrast > _HIGHEST_CONTRAST:
                 break
             # So many runs are noise; stripes stand higher than noise.
             min_contrast *= 2
         n = _measure_runs(
             view.lines,
-            background,
-            view.u_lines if view.u_lines is not None else _NO_CHROMA,
+            self._ground.lines,
+            _GREY if view.green_lines is None else view.green_lines,
             runs,
             self._reach_px,
             self._options.min_green_fall,
@@ -156,17 +161,6 @@ class StripeDetector:
         n = _drop_faint(self._options.min_share, self._line[:n], self._measures[:, :n])
         position, height, width, green_fall = self._measures[:, :n].copy()
         return Returns(self._line[:n].copy(), position, height, width, green_fall)
-
-    def _cells_of_interest(self, u_plane: U8Array | None) -> BoolArray:
-        """Mark the cells that a band reaches and where something is green."""
-        if u_plane is None:
-            return self._finder.in_band
-        np.subtract(255, u_plane, out=self._inverted_u)
-        background = flank_background(self._inverted_u, self._u_workspace)
-        least = np.uint8(max(1, int(self._options.min_green_fall)))
-        mark_green(self._inverted_u, background, least, self._green)
-        cells_near_green(self._finder.in_band, self._green.view(np.uint32), self._cells)
-        return self._cells
 
 
 @inline_borrowing_kernel
@@ -241,27 +235,27 @@ def _half_height_centroid(
 
 
 @inline_borrowing_kernel
-def _green_fall(u_lines: U8Array, x: int, peak: int, width: float) -> float:
+def _green_fall(green_lines: U8Array, x: int, peak: int, width: float) -> float:
     """Fall of U against both flanks, where it is deepest: a saturated core is white, not green."""
     row = x // 2
-    last = u_lines.shape[1] - 1
+    last = green_lines.shape[1] - 1
     edge = int(0.5 * width) + 1
     flank = int(width) + 4
-    here = min(
-        u_lines[row, peak // 2],
-        u_lines[row, max(peak - edge, 0) // 2],
-        u_lines[row, min((peak + edge) // 2, last)],
+    here = max(
+        green_lines[row, peak // 2],
+        green_lines[row, max(peak - edge, 0) // 2],
+        green_lines[row, min((peak + edge) // 2, last)],
     )
-    before = float(u_lines[row, max(peak - flank, 0) // 2])
-    after = float(u_lines[row, min((peak + flank) // 2, last)])
-    return 0.5 * (before + after) - float(here)
+    before = float(green_lines[row, max(peak - flank, 0) // 2])
+    after = float(green_lines[row, min((peak + flank) // 2, last)])
+    return float(here) - 0.5 * (before + after)
 
 
 @borrowing_kernel
 def _measure_runs(
     lines: U8Array,
     background: U8Array,
-    u_lines: U8Array,
+    green_lines: U8Array,
     runs: IntArray,
     reach_px: int,
     min_green_fall: float,
@@ -274,20 +268,20 @@ def _measure_runs(
     for i in range(runs.shape[0]):
         x, start, last = runs[i, 0], runs[i, 1], runs[i, 2]
         first = max(start - reach_px, 0)
-        base = np.int64(background[start // BLOCK, x])
+        base = np.int64(background[x, start // BLOCK])
         while start <= last and n < line.shape[0]:
             peak, end = _next_peak(lines, x, start, last, base)
             # Beyond the run the profile may still be falling towards half height.
             bound = min(last + reach_px, length - 1) if end > last else end
-            height = np.int64(lines[x, peak]) - np.int64(background[peak // BLOCK, x])
+            height = np.int64(lines[x, peak]) - np.int64(background[x, peak // BLOCK])
             centre, width, found = _half_height_centroid(lines, x, peak, first, bound, height)
             first = end
             start = end
             if not found or width > reach_px:
                 continue
             green = np.nan
-            if u_lines.shape[0] > 0:
-                green = _green_fall(u_lines, x, peak, width)
+            if green_lines.shape[0] > 0:
+                green = _green_fall(green_lines, x, peak, width)
                 if green < min_green_fall:
                     continue
             line[n] = x

@@ -196,15 +196,14 @@ def _find_surface(
     plane = np.empty(4)
     if not search_plane(table, laser, laser_start, *working_range, seed, plane):
         return None
-    members = np.zeros(len(free), np.bool_)
-    _collect(table, rows, plane, members)
-    lines, light, voice = (
-        np.bincount(chunks.laser[members], weight[members], n_lasers).astype(np.float64)
-        for weight in (chunks.n_lines, chunks.light, chunks.table[WEIGHT])
+    members, sums = np.zeros(len(free), np.bool_), np.zeros((3, n_lasers))
+    n_members = _collect(
+        table, rows, plane, chunks.n_lines, chunks.light, chunks.laser, members, sums
     )
+    lines, light, voice = sums
     n_lines = int(lines.sum())
     enough = np.count_nonzero(lines >= MIN_LINES_PER_LASER) >= 2 and n_lines >= _MIN_LINES
-    if not enough or np.count_nonzero(members) < _MIN_CHUNKS:
+    if not enough or n_members < _MIN_CHUNKS:
         return None
     if light.sum() < _LEAST_SHARE * chunks.light.sum():
         return None
@@ -226,21 +225,37 @@ def _find_surface(
 
 def _on_two(weight: FloatArray) -> float:
     """Sum over the lasers, the first of them with at most three times the second's share."""
-    second, first = np.sort(weight)[-2:]
-    total = weight.sum()
-    return float(min(total, total - first + MOST_TO_SECOND * second))
+    shares: list[float] = sorted(weight.tolist())
+    total = sum(shares)
+    return min(total, total - shares[-1] + MOST_TO_SECOND * shares[-2])
 
 
 @borrowing_kernel
-def _collect(table: FloatArray, rows: IntArray, plane: FloatArray, members: BoolArray) -> None:
-    """Mark the chunks on the plane."""
+def _collect(
+    table: FloatArray,
+    rows: IntArray,
+    plane: FloatArray,
+    n_lines: IntArray,
+    light: FloatArray,
+    laser: IntArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> int:
+    """Mark the chunks on the plane; their number, and each laser's search lines, light, voice."""
+    n = 0
     for k in range(rows.shape[0]):
         residual = (
             plane[0] * table[X, k] + plane[1] * table[Y, k] + plane[2] * table[Z, k] - plane[3]
         )
         per_px = plane[0] * table[JX, k] + plane[1] * table[JY, k] + plane[2] * table[JZ, k]
         if residual * residual < squared_gate(per_px, plane[3]):
-            members[rows[k]] = True
+            c = rows[k]
+            members[c] = True
+            sums[0, laser[c]] += n_lines[c]
+            sums[1, laser[c]] += light[c]
+            sums[2, laser[c]] += table[WEIGHT, k]
+            n += 1
+    return n
 
 
 @kernel

@@ -5,6 +5,9 @@ from enum import StrEnum
 
 from aqualvs.scanning.surfaces import WORTH_SHARE, Surface
 
+# Specks that share a plane by chance have less than this share of the search lines of the surface
+# that has most; a net before a wall has more.
+_LINES_SHARE = 0.1
 # Among meshes, one reaches far with this share of the widest one's extent.
 _EXTENT_SHARE = 0.75
 # And it is well supported with this share of the best one's support.
@@ -38,7 +41,12 @@ def choose_target(
     near, far = working_range
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.voice for surface in surfaces), default=0.0)
-    meshes = [one for one in surfaces if one.is_mesh and one.voice >= WORTH_SHARE * most]
+    lines = max((surface.n_lines for surface in surfaces), default=0)
+    meshes = [
+        one
+        for one in surfaces
+        if one.is_mesh and one.voice >= WORTH_SHARE * most and one.n_lines >= _LINES_SHARE * lines
+    ]
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.support, default=None)
     net = _nearest_far_reaching(meshes)

@@ -8,7 +8,8 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.contrast import U8Array
-from aqualvs.scanning.runs import RunFinder
+from aqualvs.scanning.runs import ColumnRuns, RowRuns
+from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.view import SearchView
 
@@ -42,8 +43,10 @@ class ThresholdDetector:
 
     Parameters
     ----------
-    length, n_lines : int
-        Shape of the search image.
+    axis : SearchAxis
+        Direction of the search lines.
+    size_px : (int, int)
+        Image width and height.
     lowest, highest : int array, shape (n_lines,)
         First and last position of interest on each line.
     options : ThresholdOptions
@@ -52,20 +55,27 @@ class ThresholdDetector:
 
     def __init__(
         self,
-        length: int,
-        n_lines: int,
+        axis: SearchAxis,
+        size_px: tuple[int, int],
         lowest: IntArray,
         highest: IntArray,
         options: ThresholdOptions,
     ) -> None:
-        self._finder = RunFinder(length, lowest, highest, options.max_returns)
+        along_x = axis is SearchAxis.ALONG_X
+        finder = RowRuns if along_x else ColumnRuns
+        length = size_px[0] if along_x else size_px[1]
+        self._finder = finder(length, lowest, highest, options.max_returns)
+        n_words, n_blocks = self._finder.in_band.shape[:: 1 if along_x else -1]
         # One grey level below the threshold everywhere: what stands above it by one is bright.
-        n_blocks = len(self._finder.in_band)
-        self._background: U8Array = np.full((n_blocks, n_lines), options.level - 1, np.uint8)
+        # Nothing stands above the white of lines beyond the picture.
+        below: U8Array = np.full((8 * n_words, n_blocks), 255, np.uint8)
+        below[: len(lowest)] = options.level - 1
+        background = below[: len(lowest)] if along_x else below.T
+        self._background: U8Array = np.ascontiguousarray(background)
 
     def detect(self, view: SearchView) -> Returns:
         """Find the returns of one frame; colour is not looked at."""
-        runs = self._finder.find(view.luma, self._background, 1, self._finder.in_band)
+        runs = self._finder.find(view.image, self._background, 1, self._finder.in_band)
         n = len(runs)
         return Returns(
             line=runs[:, 0].copy(),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import fft, ndimage, signal
+from scipy import fft, ndimage
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.live.logs.signals import Interpolation, Signal
@@ -121,7 +121,10 @@ def _smooth(values: FloatArray, valid: BoolArray) -> FloatArray:
 
 
 def _convolve(values: FloatArray, window: FloatArray) -> FloatArray:
-    whole: FloatArray = signal.oaconvolve(values, window, mode="full")
+    # A second to import, which only this needs.
+    from scipy.signal import oaconvolve
+
+    whole: FloatArray = oaconvolve(values, window, mode="full")
     reach = len(window) // 2
     return whole[reach : reach + len(values)]
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import signal as dsp
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.live.logs.correlation import Channel, Match, Scores, match_at, scores_of
@@ -214,7 +213,10 @@ def _peaks(scores: Scores, allowed: BoolArray) -> list[float]:
     """Return the offsets of the best peaks, the highest first."""
     height = np.where(allowed, scores.score, 0.0)
     # Padded, since a peak may be the first or the last.
-    tops, _ = dsp.find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))
+    # A second to import, which only this needs.
+    from scipy.signal import find_peaks
+
+    tops, _ = find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))
     ranked = tops[np.argsort(height[tops - 1])[::-1]] - 1
     return [float(scores.offset_s[i]) for i in ranked[: _N_RIVALS + 1]]
 
