@@ -1,0 +1,1 @@
+"""Many dives at once: cut into pieces, measured by many processes, joined again."""

@@ -1,0 +1,124 @@
+"""The batch's Parquet data set: one partition for each dive, in folders `dive=NAME`.
+
+::
+
+    dataset/posture/dive=NAME/posture.parquet   one row for every frame
+    dataset/points/dive=NAME/points.parquet     one row for every stripe point
+    dataset/dives.parquet                       one row for every dive
+"""
+
+import contextlib
+import os
+import shutil
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import csv, parquet
+
+from aqualvs.app.outputs import POINTS_PARQUET, POSTURE_CSV
+from aqualvs.app.posture_csv import POSTURE_COLUMNS
+
+POSTURE_PARQUET = "posture.parquet"
+DIVES_PARQUET = "dives.parquet"
+
+_TYPES = dict.fromkeys(POSTURE_COLUMNS, pa.float64()) | {
+    "frame": pa.int32(),
+    "valid": pa.bool_(),
+    "reason": pa.string(),
+    "n_points": pa.int32(),
+}
+DIVES_SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in ("dive", "source", "rig", "rig_file", "state", "words")),
+        *((name, pa.int64()) for name in ("n_frames", "n_valid")),
+        *(
+            (name, pa.float64())
+            for name in ("duration_s", "range_median_m", "range_min_m", "range_max_m", "n_water")
+        ),
+        ("lasers", pa.string()),
+    ]
+)
+"""Columns of `dives.parquet`; `state` is finished, incomplete or failed, `words` says why."""
+
+
+def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
+    """Put a run's posture and points into the data set, in place of what is there of this dive.
+
+    The points are not stored twice where the file system can give one file two names.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    with _replacing(_posture_path(dataset, name)) as draft:
+        parquet.write_table(posture_table(run_folder / POSTURE_CSV), draft, compression="zstd")
+    with _replacing(_points_path(dataset, name)) as draft:
+        try:
+            os.link(run_folder / POINTS_PARQUET, draft)
+        except OSError:
+            shutil.copyfile(run_folder / POINTS_PARQUET, draft)
+
+
+def holds_dive(dataset: Path, name: str) -> bool:
+    """Return whether both partitions of a dive are there."""
+    return _posture_path(dataset, name).is_file() and _points_path(dataset, name).is_file()
+
+
+def drop_dive(dataset: Path, name: str) -> None:
+    """Remove the partitions of a dive, if they are there."""
+    for path in (_posture_path(dataset, name), _points_path(dataset, name)):
+        shutil.rmtree(path.parent, ignore_errors=True)
+
+
+def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write `dives.parquet`.
+
+    Parameters
+    ----------
+    dataset : Path
+    rows : iterable of mappings
+        With the columns of `DIVES_SCHEMA`; absent ones are null.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=DIVES_SCHEMA)
+    with _replacing(dataset / DIVES_PARQUET) as draft:
+        parquet.write_table(table, draft, compression="zstd")
+
+
+def posture_table(posture_csv: Path) -> Any:
+    """Return `posture.csv` as a table; numbers that a frame has not are null."""
+    convert = csv.ConvertOptions(
+        column_types=_TYPES, null_values=[""], true_values=["1"], false_values=["0"]
+    )
+    # One thread: the process has one core to itself.
+    read = csv.ReadOptions(use_threads=False)
+    return csv.read_csv(posture_csv, read_options=read, convert_options=convert)
+
+
+def _posture_path(dataset: Path, name: str) -> Path:
+    return dataset / "posture" / f"dive={name}" / POSTURE_PARQUET
+
+
+def _points_path(dataset: Path, name: str) -> Path:
+    return dataset / "points" / f"dive={name}" / POINTS_PARQUET
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield the path of a draft that takes the place of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Readers of data sets pass over what begins with an underscore.
+    draft = path.with_name(f"_{path.stem}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        yield draft
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)

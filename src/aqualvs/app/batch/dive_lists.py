@@ -1,0 +1,113 @@
+"""Lists of dives, as CSV or YAML.
+
+::
+
+    dive,rig,name,water_n,temperature_c,salinity
+    north/0412.mp4,rig_april.yaml,north_april,,6.5,34
+    north/0610.mp4,rig_june.yaml,north_june,,9.0,33
+
+or the same as a list of mappings in YAML. Only `dive` is needed; paths are relative to the list.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aqualvs.app.run_inputs import Water
+from aqualvs.errors import OptionError
+
+LIST_SUFFIXES = frozenset({".csv", ".yaml", ".yml"})
+
+_NUMBERS = ("water_n", "temperature_c", "salinity")
+_KEYS = ("dive", "rig", "name", *_NUMBERS)
+
+
+@dataclass(frozen=True, slots=True)
+class ListedDive:
+    """A dive as the user names it.
+
+    Attributes
+    ----------
+    source : Path
+    rig : Path or None
+        None where the list does not say.
+    name : str
+        Empty where the list does not say.
+    water : Water
+        Nothing where the list does not say.
+    """
+
+    source: Path
+    rig: Path | None = None
+    name: str = ""
+    water: Water = field(default_factory=Water)
+
+
+def read_list(path: Path) -> list[ListedDive]:
+    """Read a list of dives.
+
+    Raises
+    ------
+    OptionError
+        If it cannot be read, a row has no dive, or what it says is not understood.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = list(_csv_rows(text) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, csv.Error) as fault:
+        words = str(fault).splitlines()[0]
+        raise OptionError(f"{path}: cannot be read as a list of dives ({words})") from fault
+    if not rows:
+        raise OptionError(f"{path}: lists no dive; give at least one row")
+    return [_listed(row, path, number) for number, row in enumerate(rows, 1)]
+
+
+def _csv_rows(text: str) -> Iterator[Mapping[str, Any]]:
+    for row in csv.DictReader(text.splitlines(), skipinitialspace=True):
+        yield {str(key).strip(): value for key, value in row.items() if value not in ("", None)}
+
+
+def _yaml_rows(text: str, path: Path) -> Iterable[Mapping[str, Any]]:
+    content = yaml.safe_load(text)
+    if isinstance(content, dict) and set(content) == {"dives"}:
+        content = content["dives"]
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+        raise OptionError(
+            f"{path}: no list of dives; give mappings with the keys {', '.join(_KEYS)}"
+        )
+    return content
+
+
+def _listed(row: Mapping[str, Any], path: Path, number: int) -> ListedDive:
+    unknown = sorted(str(key) for key in set(row) - set(_KEYS))
+    if unknown:
+        raise OptionError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
+    if "dive" not in row:
+        raise OptionError(f"{path}: row {number} names no dive; fill in the column 'dive'")
+    rig = row.get("rig")
+    return ListedDive(
+        source=path.parent / str(row["dive"]).strip(),
+        rig=None if rig is None else path.parent / str(rig).strip(),
+        name=str(row.get("name", "")).strip(),
+        water=_water(row, path, number),
+    )
+
+
+def _water(row: Mapping[str, Any], path: Path, number: int) -> Water:
+    values: dict[str, float | None] = {}
+    for key in _NUMBERS:
+        try:
+            values[key] = float(row[key]) if key in row else None
+        except (TypeError, ValueError):
+            raise OptionError(
+                f"{path}: row {number}: {key} is {row[key]!r}; give a number"
+            ) from None
+    return Water(
+        n_water=values["water_n"],
+        temperature_c=values["temperature_c"],
+        salinity=values["salinity"],
+    )

@@ -1,0 +1,185 @@
+"""From the pieces of a dive to its folder, as `aqualvs run` would have written it."""
+
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from aqualvs.app.batch.dataset import holds_dive, put_dive
+from aqualvs.app.batch.joined_tally import joined_ranges, joined_tally
+from aqualvs.app.batch.ledger import clear, seal, sealed
+from aqualvs.app.batch.pieces import PieceResult, peak_bytes, piece_folder, piece_key
+from aqualvs.app.batch.survey import Survey
+from aqualvs.app.batch.thumbnail import range_steps
+from aqualvs.app.batch.work import DiveWork, open_dive, option_facts
+from aqualvs.app.disk import writing
+from aqualvs.app.journal import POINTS_SCHEMA, read_journal
+from aqualvs.app.outputs import (
+    JOURNAL,
+    POINTS_PARQUET,
+    POINTS_PLY,
+    POSTURE_BARE_CSV,
+    POSTURE_CSV,
+    REPORT_HTML,
+    RUN_FILES,
+    RUN_YAML,
+)
+from aqualvs.app.points_export import export_points
+from aqualvs.app.report import write_report
+from aqualvs.app.runfile import RunFile, Status
+from aqualvs.optics.rigfile import rig_to_mapping
+
+JOINED = "joined"
+"""Folder, below a dive's home, with the seal of its result."""
+
+_VERIFIED = (POSTURE_CSV, POSTURE_BARE_CSV, POINTS_PARQUET, POINTS_PLY, RUN_YAML)
+"""Files whose content a later batch checks; the report may be written again by anyone."""
+
+
+class PieceLostError(Exception):
+    """A finished piece is not there any more, or not intact; it must be measured again."""
+
+
+def finished_dive(work: DiveWork, survey: Survey) -> dict[str, Any] | None:
+    """Return the facts of a dive that an earlier batch has finished; None if it has not.
+
+    Its files must be there and intact, and made from the same dive, rig, options and versions.
+    """
+    out = work.request.out
+    facts = sealed(work.home / JOINED, survey.key, out)
+    if facts is None or (work.request.report and not (out / REPORT_HTML).exists()):
+        return None
+    return facts if holds_dive(work.dataset, work.name) else None
+
+
+def join_dive(work: DiveWork, survey: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
+    """Join the pieces of a dive, write its report, and drop the pieces.
+
+    Parameters
+    ----------
+    work : DiveWork
+    survey : Survey
+    results : sequence of PieceResult
+        Of all pieces, in order.
+
+    Returns
+    -------
+    facts : dict
+        Of the dive, for the summary; ready for JSON.
+
+    Raises
+    ------
+    PieceLostError
+        If a piece must be measured again.
+    UnlikeSurveyError
+        If the pieces do not tell all that the whole dive's run would know.
+    AqualvsError
+        If the dive's folder cannot be written.
+    """
+    pieces = [piece_folder(work, survey, number) for number in range(len(survey.spans))]
+    for number, piece in enumerate(pieces):
+        if sealed(piece, piece_key(survey, number)) is None:
+            raise PieceLostError(f"{piece}: is not intact")
+    began_s = time.process_time()
+    out, home = work.request.out, work.home
+    with writing(out), _scratch(home) as draft:
+        _join_files(pieces, draft)
+        facts = _write_run_file(work, survey, results, pieces, draft)
+        if work.request.report:
+            write_report(draft)
+        names = _replace_run(draft, out)
+        put_dive(work.dataset, work.name, out)
+        (home / JOINED).mkdir(parents=True, exist_ok=True)
+        cpu_s = sum(result.cpu_s for result in results) + time.process_time() - began_s
+        peak = max(peak_bytes(), *(result.peak_bytes for result in results))
+        facts |= {"cpu_s": round(cpu_s, 2), "peak_bytes": peak}
+        seal(home / JOINED, survey.key, facts, names, out)
+    for old in home.glob("pieces-*"):
+        clear(old)
+    return facts
+
+
+def _write_run_file(
+    work: DiveWork,
+    survey: Survey,
+    results: Sequence[PieceResult],
+    pieces: Sequence[Path],
+    folder: Path,
+) -> dict[str, Any]:
+    """Write `run.yaml`; returns the facts of the dive."""
+    dive = open_dive(work.request)
+    with dive.source:
+        tally = joined_tally(dive, pieces)
+    fault, summary, rig = results[-1].fault, tally.facts(), rig_to_mapping(dive.rig)
+    run_file = RunFile(folder / RUN_YAML, survey.source, rig, option_facts(dive.request))
+    run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=summary)
+    return {
+        "n_frames": tally.n_frames,
+        "n_valid": tally.n_valid,
+        "duration_s": results[-1].duration_s,
+        "fault": fault,
+        "summary": summary,
+        "range_steps": range_steps(joined_ranges(pieces)),
+        "rig": str(rig.get("name", "")),
+        "rig_file": str(work.request.rig or work.request.source),
+        "n_water": dive.rig.n_water,
+        "source": dict(survey.source),
+        "why_whole": survey.why_whole,
+        "n_pieces": len(pieces),
+    }
+
+
+def _join_files(pieces: Sequence[Path], folder: Path) -> None:
+    """Write rows and points of all pieces as those of one run."""
+    for name in (POSTURE_CSV, POSTURE_BARE_CSV):
+        parts = [piece / name for piece in pieces if (piece / name).exists()]
+        if parts:
+            _join_rows(parts, folder / name)
+    journal = folder / JOURNAL
+    with (
+        pa.OSFile(str(journal), "wb") as file,
+        pa.ipc.new_stream(file, POINTS_SCHEMA) as stream,
+    ):
+        for piece in pieces:
+            for batch in read_journal(piece / JOURNAL):
+                stream.write_batch(batch)
+    export_points(journal, folder / POINTS_PARQUET, folder / POINTS_PLY)
+    journal.unlink()
+
+
+def _join_rows(parts: Sequence[Path], path: Path) -> None:
+    """Write the rows of several CSV files under the head of the first."""
+    with path.open("wb") as whole:
+        for number, part in enumerate(parts):
+            with part.open("rb") as rows:
+                head = rows.readline()
+                if number == 0:
+                    whole.write(head)
+                shutil.copyfileobj(rows, whole)
+
+
+def _replace_run(draft: Path, out: Path) -> list[str]:
+    """Put the files of a run in the place of an older one's; returns the names to be verified."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in RUN_FILES:
+        if (draft / name).exists():
+            os.replace(draft / name, out / name)
+        else:
+            (out / name).unlink(missing_ok=True)
+    return [name for name in _VERIFIED if (out / name).exists()]
+
+
+@contextmanager
+def _scratch(home: Path) -> Iterator[Path]:
+    folder = home / f"joining-{uuid.uuid4().hex[:8]}.part"
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        clear(folder)

@@ -1,0 +1,186 @@
+"""A piece of a dive, measured by itself: rows, points, and notes for the join."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from aqualvs.app.batch.ledger import drafted, seal, sealed
+from aqualvs.app.batch.piece_frames import image_frames, video_frames
+from aqualvs.app.batch.spans import Span, SpanKind
+from aqualvs.app.batch.survey import Survey
+from aqualvs.app.batch.watchers import NoteTaker, write_notes
+from aqualvs.app.batch.work import DiveWork, OpenDive, agreement_for, digest, open_dive
+from aqualvs.app.disk import writing
+from aqualvs.app.journal import PointsJournal
+from aqualvs.app.net_check import net_check
+from aqualvs.app.outputs import JOURNAL, POSTURE_BARE_CSV, POSTURE_CSV
+from aqualvs.app.posture_csv import PostureCsv
+from aqualvs.app.run_bare_lens import RunBareLens
+from aqualvs.app.run_frames import ready, with_losses
+from aqualvs.app.run_inputs import FrameWindow
+from aqualvs.app.run_mcap import ScansFrames
+from aqualvs.errors import SourceError
+from aqualvs.scanning.scan import Frame, Scan
+
+NOTES = "notes.npz"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceResult:
+    """How the measuring of a piece went.
+
+    Attributes
+    ----------
+    number : int
+        Of the piece in its dive.
+    n_frames, n_valid : int
+        Frames, and those with a posture.
+    duration_s : float
+        Time of the last frame.
+    fault : str
+        What ended the source early; empty if nothing did.
+    cpu_s : float
+        Spent on it, by the process that did it; 0 for one that was finished before.
+    peak_bytes : int
+        Most memory that process had so far.
+    reused : bool
+        Whether it was finished before.
+    """
+
+    number: int
+    n_frames: int
+    n_valid: int
+    duration_s: float
+    fault: str
+    cpu_s: float = 0.0
+    peak_bytes: int = 0
+    reused: bool = False
+
+
+def piece_folder(work: DiveWork, survey: Survey, number: int) -> Path:
+    """Return the folder of a piece; another rig, option or version has another."""
+    span = survey.spans[number]
+    kind = f"{span.first:08d}" if span.kind is not SpanKind.WHOLE else "whole"
+    return work.home / f"pieces-{survey.key[:12]}" / kind
+
+
+def piece_key(survey: Survey, number: int) -> str:
+    """Return what a piece is made from, as a short text."""
+    span = survey.spans[number]
+    return digest({"dive": survey.key, "kind": span.kind, "first": span.first, "stop": span.stop})
+
+
+def measure_piece(work: DiveWork, survey: Survey, number: int) -> PieceResult:
+    """Measure one piece of a dive, or take what an earlier batch has finished.
+
+    Raises
+    ------
+    UnlikeSurveyError
+        If the piece does not hold what the survey promised.
+    AqualvsError
+        If the dive cannot be read any more, or the piece not be written.
+    """
+    folder, span = piece_folder(work, survey, number), survey.spans[number]
+    key = piece_key(survey, number)
+    known = sealed(folder, key)
+    if known is not None:
+        return PieceResult(number=number, reused=True, **known)
+    began_s = time.process_time()
+    # The process has one core to itself.
+    cv2.setNumThreads(1)
+    with writing(folder), drafted(folder) as draft:
+        dive = open_dive(work.request)
+        with dive.source:
+            facts, names = _measure(dive, span, draft, _scanner(dive, survey))
+        seal(draft, key, facts, names)
+    return PieceResult(
+        number=number, cpu_s=time.process_time() - began_s, peak_bytes=peak_bytes(), **facts
+    )
+
+
+def peak_bytes() -> int:
+    """Return the most memory that this process has had."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such count.
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _measure(
+    dive: OpenDive, span: Span, folder: Path, scanner: ScansFrames
+) -> tuple[dict[str, Any], list[str]]:
+    """Write a piece into a folder; returns facts and the names of the files."""
+    fault, n_valid, last_s = "", 0, 0.0
+    frames = _frames(dive, span)
+    taker = NoteTaker(span.first, agreement_for(dive), net_check(dive.request.target, dive.rig))
+    with ExitStack() as files:
+        posture = files.enter_context(PostureCsv(folder / POSTURE_CSV))
+        points = files.enter_context(PointsJournal(folder / JOURNAL))
+        bare = files.enter_context(RunBareLens(folder, dive.rig))
+        try:
+            for scan in _scans(dive, span, frames, scanner):
+                points.write(scan)
+                posture.write(scan)
+                bare.write(scan)
+                taker.add(scan)
+                n_valid += bool(scan.posture)
+                last_s = scan.time_s
+        except SourceError as broken_off:
+            fault = str(broken_off)
+    write_notes(taker.notes, folder / NOTES)
+    names = [POSTURE_CSV, JOURNAL, NOTES]
+    if dive.rig.dome is not None:
+        names.append(POSTURE_BARE_CSV)
+    facts = {
+        "n_frames": len(taker.notes),
+        "n_valid": n_valid,
+        "duration_s": last_s,
+        "fault": fault,
+    }
+    return facts, names
+
+
+def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
+    """Return the frames of a piece; the first of them has been decoded."""
+    path = Path(dive.request.source)
+    if span.kind is SpanKind.VIDEO:
+        return video_frames(path, span, dive.rig.size_px)
+    if span.kind is SpanKind.IMAGES:
+        return image_frames(path, span, dive.request.fps or 1.0)
+    return ready(iter(dive.source), dive.source, FrameWindow())
+
+
+def _scans(
+    dive: OpenDive, span: Span, frames: Iterator[Frame], scanner: ScansFrames
+) -> Iterator[Scan]:
+    """Yield the scans of a piece's frames, and those that stand for lost ones."""
+    # A recording tells of lost frames itself.
+    first = None if dive.replay is not None else span.first
+    for lost, frame in with_losses(frames, first, dive.rig.n_water):
+        yield from lost
+        yield scanner.process(frame)
+
+
+class _Kept(threading.local):
+    """The scanner of the last piece, which the next one mostly needs again."""
+
+    key: str = ""
+    scanner: ScansFrames | None = None
+
+
+_KEPT = _Kept()
+
+
+def _scanner(dive: OpenDive, survey: Survey) -> ScansFrames:
+    if dive.replay is not None or dive.request.index_target is not None:
+        return dive.scanner()
+    if _KEPT.key != survey.result_key or _KEPT.scanner is None:
+        _KEPT.key, _KEPT.scanner = survey.result_key, dive.scanner()
+    return _KEPT.scanner

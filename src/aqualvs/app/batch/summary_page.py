@@ -1,0 +1,166 @@
+"""The page about all dives of a batch; it opens anywhere, without a network."""
+
+from collections.abc import Iterator, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from urllib.parse import quote
+
+from aqualvs import __version__
+from aqualvs.app import report_html as html
+from aqualvs.app.batch.records import DiveRecord, DiveState
+from aqualvs.app.batch.thumbnail import range_svg
+from aqualvs.app.outputs import REPORT_HTML
+from aqualvs.app.report_findings import Card
+from aqualvs.app.report_words import clock
+from aqualvs.app.runfile import now
+from aqualvs.errors import OutputError
+
+SUMMARY_HTML = "summary.html"
+
+_HEAD = ("dive", "state", "duration", "frames", "posture", "range, m", "from – to, m", "over time")
+_LOW_SHARE = 0.8
+_MOST_NOTES = 12
+# What a reader of the data set types first.
+_EXAMPLES = {
+    "DuckDB": "SELECT dive, avg(range_m) FROM read_parquet('dataset/posture/**/*.parquet', "
+    "hive_partitioning = true) GROUP BY dive;",
+    "Polars": 'polars.scan_parquet("dataset/posture/**/*.parquet", hive_partitioning=True)',
+    "pandas": 'pandas.read_parquet("dataset/posture", filters=[("valid", "==", True)])',
+}
+
+
+def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
+    """Write `summary.html`.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the batch; reports are in `dives/NAME` below it.
+    records : sequence of DiveRecord
+        In the order of the page.
+
+    Returns
+    -------
+    path : Path
+
+    Raises
+    ------
+    OutputError
+        If the page cannot be written.
+    """
+    path = folder / SUMMARY_HTML
+    template = files("aqualvs.app.batch").joinpath("assets", SUMMARY_HTML)
+    text = Template(template.read_text(encoding="utf-8")).substitute(_parts(folder, records))
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        raise OutputError(
+            f"{path}: cannot be written ({fault.strerror}); free the disk or choose another folder"
+        ) from fault
+    return path
+
+
+def _parts(folder: Path, records: Sequence[DiveRecord]) -> dict[str, str]:
+    ranges = [r.summary[key] for r in records for key in _ENDS if key in r.summary]
+    low, high = (min(ranges), max(ranges)) if ranges else (0.0, 0.0)
+    lead = "Ranges over time share one scale"
+    lead += f", {low:.2f} to {high:.2f} m; a gap is a stretch without a posture." if ranges else "."
+    return {
+        "css": html.asset("report.css"),
+        "title": escape(folder.resolve().name),
+        "subtitle": escape(_rigs(records)),
+        "cards": html.cards(_cards(records)),
+        "warnings": html.notice(list(_notes(records))),
+        "lead": escape(lead),
+        "table": _table(folder, records, low, high),
+        "dataset": "".join(
+            f"<h3>{name}</h3><pre>{escape(code)}</pre>" for name, code in _EXAMPLES.items()
+        ),
+        "footer": escape(f"Written {now()} by aqualvs {__version__}."),
+    }
+
+
+_ENDS = ("range_min_m", "range_max_m")
+
+
+def _rigs(records: Sequence[DiveRecord]) -> str:
+    names = sorted({str(r.facts["rig"]) for r in records if r.facts.get("rig")})
+    if not names:
+        return ""
+    return f"Rig{'s' if len(names) > 1 else ''} " + ", ".join(f"“{name}”" for name in names[:8])
+
+
+def _cards(records: Sequence[DiveRecord]) -> list[Card]:
+    measured = [record for record in records if record.facts]
+    n_frames = sum(record.facts["n_frames"] for record in measured)
+    n_valid = sum(record.facts["n_valid"] for record in measured)
+    seconds = sum(record.facts["duration_s"] for record in measured)
+    counts = {state: sum(r.state is state for r in records) for state in DiveState}
+    others = [f"{n} {state.value}" for state, n in counts.items() if n]
+    share = f"{100 * n_valid / n_frames:.1f} %" if n_frames else "–"
+    return [
+        Card("Dives", str(len(records)), ", ".join(others)),
+        Card("Recorded", clock(seconds), f"{n_frames:,} frames"),
+        Card("Frames with a posture", share, f"{n_valid:,} of {n_frames:,}"),
+    ]
+
+
+def _notes(records: Sequence[DiveRecord]) -> Iterator[str]:
+    """Yield what deserves a look, dive by dive; not more than can be read."""
+    notes = [note for record in records for note in _notes_on(record)]
+    yield from notes[:_MOST_NOTES]
+    if len(notes) > _MOST_NOTES:
+        yield f"and {len(notes) - _MOST_NOTES} more, in the table and in the dives’ own reports"
+
+
+def _notes_on(record: DiveRecord) -> Iterator[str]:
+    if record.state is not DiveState.FINISHED:
+        yield f"{record.name}: {record.state.value}, see the table"
+    for key in ("laser_agreement", "net_check"):
+        words = (record.summary.get(key) or {}).get("words")
+        if words:
+            yield f"{record.name}: {words}"
+
+
+def _table(folder: Path, records: Sequence[DiveRecord], low: float, high: float) -> str:
+    kinds = ["", "", *[' class="n"'] * 2, "", *[' class="n"'] * 2, ""]
+    head = "".join(f"<th{kind}>{cell}</th>" for kind, cell in zip(kinds, _HEAD, strict=True))
+    rows = []
+    for record in records:
+        cells = zip(kinds, _cells(folder, record, low, high), strict=True)
+        bad = ' class="bad"' if record.state is not DiveState.FINISHED else ""
+        rows.append(f"<tr{bad}>{''.join(f'<td{kind}>{cell}</td>' for kind, cell in cells)}</tr>")
+    body = "\n".join(rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n{body}</table></div>'
+
+
+def _cells(folder: Path, record: DiveRecord, low: float, high: float) -> list[str]:
+    """Return the cells of a dive's row as HTML."""
+    why = f'<div class="why">{escape(record.words)}</div>' if record.words else ""
+    head = [_link(folder, record), f"{record.state.value}{why}"]
+    if not record.facts:
+        return [*head, *[""] * (len(_HEAD) - len(head))]
+    summary, share = record.summary, record.summary.get("valid_share", 0.0)
+    low_class = ' class="low"' if share < _LOW_SHARE else ""
+    ends = [summary.get(key) for key in _ENDS]
+    return [
+        *head,
+        clock(record.facts["duration_s"]),
+        f"{record.facts['n_frames']:,}",
+        f'<span class="share"><span class="bar"><i{low_class} style="width:{100 * share:.0f}%">'
+        f"</i></span>{100 * share:.1f} %</span>",
+        f"{summary['range_median_m']:.3f}" if "range_median_m" in summary else "",
+        "" if None in ends else f"{ends[0]:.3f} – {ends[1]:.3f}",
+        range_svg(record.facts["range_steps"], low, high),
+    ]
+
+
+def _link(folder: Path, record: DiveRecord) -> str:
+    name = escape(record.name)
+    title = escape(record.source, quote=True)
+    place = Path("dives") / record.name / REPORT_HTML
+    if not (folder / place).is_file():
+        return f'<span title="{title}">{name}</span>'
+    return f'<a href="{quote(place.as_posix())}" title="{title}">{name}</a>'

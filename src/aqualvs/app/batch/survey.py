@@ -1,0 +1,177 @@
+"""The first look at a dive: whether it can be measured, what it holds, and where it is cut."""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import av
+
+from aqualvs.app.batch.ledger import seal, sealed
+from aqualvs.app.batch.spans import Span, SpanKind, video_spans
+from aqualvs.app.batch.work import DiveWork, OpenDive, digest, open_dive, result_key
+from aqualvs.app.disk import writing
+from aqualvs.app.run_inputs import source_facts
+from aqualvs.live.sources.images import ImageSource, images_in
+from aqualvs.live.sources.video import VideoSource
+
+_MEMORY = "survey"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Survey:
+    """What the first look at a dive has found.
+
+    Attributes
+    ----------
+    source_key : str
+        Of the dive's content; other pictures give another key.
+    result_key : str
+        Of all else that the result depends on.
+    spans : tuple of Span
+        The pieces, at least one.
+    why_whole : str
+        Why the dive is not cut, where it could be longer than a piece; empty if it is.
+    n_bytes : int
+        Size of the source.
+    n_frames : int or None
+        If known.
+    source : mapping
+        For `run.yaml`.
+    """
+
+    source_key: str
+    result_key: str
+    spans: tuple[Span, ...]
+    why_whole: str
+    n_bytes: int
+    n_frames: int | None
+    source: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """Of everything that the dive's result depends on."""
+        return digest({"source": self.source_key, "result": self.result_key})
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the dive is not cut."""
+        return [span.kind for span in self.spans] == [SpanKind.WHOLE]
+
+    def only(self, number: int) -> "Survey":
+        """Return the survey with one of its pieces alone, as its process needs it."""
+        return replace(self, spans=(self.spans[number],))
+
+    def in_one_piece(self, why: str) -> "Survey":
+        """Return the survey of the same dive, not to be cut."""
+        whole = (Span(kind=SpanKind.WHOLE, n_bytes=self.n_bytes),)
+        return replace(self, spans=whole, why_whole=why)
+
+
+def survey(work: DiveWork) -> Survey:
+    """Look at a dive.
+
+    Reads the whole file once, unless an earlier look is still valid, but decodes nothing.
+
+    Raises
+    ------
+    AqualvsError
+        If the dive or its rig cannot be used.
+    """
+    dive = open_dive(work.request)
+    with dive.source:
+        found = Survey(
+            source_key="",
+            result_key=result_key(dive),
+            spans=(),
+            why_whole="",
+            n_bytes=0,
+            n_frames=dive.source.n_frames,
+            source=source_facts(dive.source),
+        )
+        stat = _stat_key(Path(work.request.source)) | {"frames": work.piece_frames}
+        content = _remembered(work, stat) or _remember(
+            work, stat, _content(dive, work.piece_frames)
+        )
+    spans = tuple(Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"])
+    found = replace(
+        found, source_key=content["source_key"], spans=spans, n_bytes=content["n_bytes"]
+    )
+    why = "" if work.request.index_target is None else "the water is followed from frame to frame"
+    why = why or content["why_whole"]
+    return found.in_one_piece(why) if why or not spans else found
+
+
+def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
+    """Return what is found in the source itself, ready for JSON."""
+    path = Path(dive.request.source)
+    if isinstance(dive.source, VideoSource):
+        try:
+            video = video_spans(path, piece_frames)
+        except (av.error.FFmpegError, OSError) as fault:
+            return _uncut(path, f"cannot be looked through ({fault})")
+        return {
+            "source_key": digest({"packets": video.checksum, "n_bytes": video.n_bytes}),
+            "spans": [asdict(span) for span in video.spans],
+            "why_whole": video.why_whole,
+            "n_bytes": video.n_bytes,
+        }
+    if isinstance(dive.source, ImageSource) and path.is_dir():
+        return _images(path, piece_frames)
+    return _uncut(path, "recordings and bags are not cut")
+
+
+def _images(folder: Path, piece_frames: int) -> dict[str, Any]:
+    files = [(path.name, path.stat()) for path in images_in(folder)]
+    sizes = [stat.st_size for _, stat in files]
+    starts = [*range(0, len(files), piece_frames), len(files)]
+    spans = [
+        Span(kind=SpanKind.IMAGES, first=first, stop=stop, n_bytes=sum(sizes[first:stop]))
+        for first, stop in itertools.pairwise(starts)
+    ]
+    return {
+        "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
+        "spans": [asdict(span) for span in spans],
+        "why_whole": "",
+        "n_bytes": sum(sizes),
+    }
+
+
+def _uncut(path: Path, why: str) -> dict[str, Any]:
+    stat = _stat_key(path)
+    return {
+        "source_key": digest(stat),
+        "spans": [],
+        "why_whole": why,
+        "n_bytes": size_of(path),
+    }
+
+
+def size_of(path: Path) -> int:
+    """Return the size of a file, or of the files in a folder; 0 where there is nothing."""
+    try:
+        if path.is_dir():
+            return sum(inner.stat().st_size for inner in path.iterdir() if inner.is_file())
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _stat_key(path: Path) -> dict[str, Any]:
+    """Return what changes when a file, or what is in a folder, is replaced."""
+    found = [path, *(path.iterdir() if path.is_dir() else ())]
+    latest = max(one.stat().st_mtime_ns for one in found)
+    return {"path": str(path), "size": size_of(path), "n_files": len(found), "mtime_ns": latest}
+
+
+def _remembered(work: DiveWork, stat: Mapping[str, Any]) -> dict[str, Any] | None:
+    return sealed(work.home / _MEMORY, digest(stat))
+
+
+def _remember(work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    folder = work.home / _MEMORY
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        seal(folder, digest(stat), content, [])
+    return content

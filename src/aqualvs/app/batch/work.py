@@ -1,0 +1,183 @@
+"""What is to be done for one dive, as it travels to the processes that do it."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from aqualvs.app.run import RunRequest
+from aqualvs.app.run_agreement import agreement_of
+from aqualvs.app.run_inputs import check_fits, prepared_rig, scanner_facts
+from aqualvs.app.run_mcap import ScansFrames
+from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
+from aqualvs.app.run_water import WaterFollowingScanner
+from aqualvs.app.runfile import versions
+from aqualvs.app.target_file import target_facts
+from aqualvs.errors import OptionError
+from aqualvs.live.sources import FrameSource, open_source
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.scanning.agreement import LaserAgreement
+from aqualvs.scanning.pipeline import Scanner
+
+PIECE_FRAMES = 1500
+"""Frames that a piece has at least: a minute of video, seconds of work."""
+
+_FORMAT = 1
+"""Of what pieces hold; another one makes old pieces worthless."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiveWork:
+    """One dive of a batch.
+
+    Attributes
+    ----------
+    name : str
+        Of the dive in the batch.
+    request : RunRequest
+        The run that the result equals; its `out` is the dive's folder.
+    home : Path
+        Folder for what is finished of the dive, until it is whole.
+    dataset : Path
+        Folder of the batch's Parquet data set.
+    piece_frames : int
+        Frames that a piece has at least.
+    """
+
+    name: str
+    request: RunRequest
+    home: Path
+    dataset: Path
+    piece_frames: int = PIECE_FRAMES
+
+
+@dataclass(slots=True)
+class OpenDive:
+    """A dive that is ready to be measured.
+
+    Attributes
+    ----------
+    source : FrameSource or Replay
+        A context manager.
+    rig : Rig
+    request : RunRequest
+        With the options that count, which a recording may bring itself.
+    replay : Replay or None
+        The source, where it is a recording.
+    """
+
+    source: FrameSource
+    rig: Rig
+    request: RunRequest
+    replay: Replay | None
+
+    def scanner(self) -> ScansFrames:
+        """Return what measures the frames.
+
+        Raises
+        ------
+        AqualvsError
+            If the target that tells the water's index cannot be used.
+        """
+        if self.request.index_target is None:
+            return self.replay or Scanner(self.rig, self.request.scanner)
+        if self.rig.dome is None:
+            raise OptionError("--index-target: without a dome the water's index cannot be seen")
+        return WaterFollowingScanner(
+            self.rig, self.request.scanner, self.request.index_target, self.request.water
+        )
+
+
+def open_dive(request: RunRequest) -> OpenDive:
+    """Open a dive's source and load its rig, as `run` does it.
+
+    Raises
+    ------
+    AqualvsError
+        If one of them cannot be used, or they do not belong together.
+    """
+    replay = replay_of(
+        request.source,
+        ReplayRequest(
+            rig=request.rig,
+            water=request.water,
+            no_dome=request.no_dome,
+            scanner=request.scanner,
+            chosen=request.chosen,
+            index_target=request.index_target,
+            pictures=False,
+        ),
+    )
+    if replay is not None:
+        return OpenDive(replay, replay.rig, replace(request, scanner=replay.options), replay)
+    rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)
+    source = open_source(request.source, fps=request.fps)
+    try:
+        check_fits(source, rig)
+    except BaseException:
+        source.__exit__(None, None, None)
+        raise
+    return OpenDive(source, rig, request, None)
+
+
+def agreement_for(dive: OpenDive) -> LaserAgreement | None:
+    """Return what watches over the lasers of a dive, None where a run watches nothing.
+
+    Raises
+    ------
+    RigError
+        If what the rig says about its uncertainty cannot be understood.
+    """
+    request = dive.request
+    return None if request.no_dome else agreement_of(dive.rig, request.rig or Path(request.source))
+
+
+def option_facts(request: RunRequest) -> dict[str, Any]:
+    """Return the options as `run.yaml` holds them."""
+    found: dict[str, Any] = {
+        "rig_file": None if request.rig is None else str(request.rig),
+        "no_dome": request.no_dome,
+    }
+    found |= asdict(request.water)
+    found |= {"first_frame": request.frames.first, "stop_frame": request.frames.stop}
+    found["index_target"] = None if request.index_target is None else str(request.index_target)
+    return found | {"scanner": scanner_facts(request.scanner)}
+
+
+def result_key(dive: OpenDive) -> str:
+    """Return what a dive's numbers depend on besides its pictures, as a short text.
+
+    Content counts, not the place: a rig file that says the same under another name changes nothing.
+    """
+    request = dive.request
+    facts = option_facts(request) | {"rig_file": None, "index_target": _content(request)}
+    target = asdict(target_facts(request.target))
+    found = {
+        "format": _FORMAT,
+        "rig": rig_to_mapping(dive.rig),
+        "options": facts,
+        "fps": request.fps,
+        "target": target,
+        "versions": versions(),
+    }
+    return digest(found)
+
+
+def digest(facts: Mapping[str, Any]) -> str:
+    """Return a short text that differs for different facts."""
+    text = json.dumps(facts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _content(request: RunRequest) -> str | None:
+    if request.index_target is None:
+        return None
+    try:
+        return hashlib.sha256(request.index_target.read_bytes()).hexdigest()
+    except OSError as fault:
+        raise OptionError(
+            f"{request.index_target}: cannot be read ({fault.strerror}); check the path"
+        ) from fault

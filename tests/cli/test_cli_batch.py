@@ -1,0 +1,151 @@
+"""`aqualvs batch` as a user types it, with processes of its own that are killed on the way."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import yaml
+
+from aqualvs.app.cli import main
+from batch_cases import DEMO, RESULTS, demo_dive, without_times
+
+pytest.importorskip("distributed")
+
+PROGRAM = [sys.executable, "-m", "aqualvs", "batch"]
+# The first run on a machine compiles its kernels.
+PATIENCE_S = 240
+
+
+@pytest.fixture(scope="module")
+def season(tmp_path_factory):
+    """Three dives of the same name in three folders, and one that is no video."""
+    folder = tmp_path_factory.mktemp("season")
+    for name in ("a", "b", "c"):
+        (folder / name).mkdir()
+        demo_dive(folder / name / "dive.mp4", 12)
+    (folder / "c" / "torn.mp4").write_bytes(b"no video")
+    (folder / "rig.yaml").write_bytes((DEMO / "rig.yaml").read_bytes())
+    return folder
+
+
+@pytest.fixture
+def refused(capfd):
+    """Run the command line; it must refuse in one line with exit code 2."""
+
+    def check(*arguments):
+        assert main(["batch", *(str(a) for a in arguments)]) == 2
+        said = capfd.readouterr()
+        assert said.err.count("\n") == 1
+        assert "Traceback" not in said.err
+        return said.err
+
+    return check
+
+
+def command(season, out):
+    rig = ["--rig", str(season / "rig.yaml")]
+    return [*PROGRAM, str(season), "-o", str(out), *rig, "--workers", "2", "--no-report"]
+
+
+def begun(season, out):
+    return subprocess.Popen(
+        command(season, out),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def workers_of(process):
+    """Processes that a batch has started, by what the system says of its children."""
+    found = []
+    for entry in os.listdir("/proc"):
+        try:
+            with open(f"/proc/{entry}/stat", encoding="ascii", errors="replace") as file:
+                parent = int(file.read().rpartition(")")[2].split()[1])
+            with open(f"/proc/{entry}/cmdline", "rb") as file:
+                is_worker = b"spawn_main" in file.read()
+        except (OSError, ValueError, IndexError):
+            continue
+        if parent == process.pid and is_worker:
+            found.append(int(entry))
+    return found
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc"), reason="looks for processes in /proc")
+def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_path, season):
+    out = tmp_path / "out"
+    with begun(season, out) as first:
+        said = first.stdout.readline()
+        # As a terminal does it: to the workers too.
+        os.killpg(first.pid, signal.SIGINT)
+        rest, errors = first.communicate(timeout=PATIENCE_S)
+    assert first.returncode == 130, errors
+    assert "the same command goes on from here" in rest
+    assert "Traceback" not in errors
+    assert (out / "summary.html").exists()
+
+    killed = []
+    with begun(season, out) as second:
+        over = threading.Event()
+
+        def kill_one():
+            until = time.monotonic() + PATIENCE_S
+            homes = out / ".batch" / "dives"
+            while not over.is_set() and time.monotonic() < until:
+                if len(list(homes.glob("*/survey"))) >= 2 and (pids := workers_of(second)):
+                    os.kill(pids[0], signal.SIGKILL)
+                    killed.append(pids[0])
+                    return
+                time.sleep(0.05)
+
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        told, errors = second.communicate(timeout=PATIENCE_S)
+        over.set()
+        killer.join()
+    assert killed
+    # One of them is no video; the others are not held up by it.
+    assert second.returncode == 1, errors
+    assert "Traceback" not in errors
+    assert "torn: failed" in said + told
+    assert "3 finished" in told
+    names = {f"{name}_dive" for name in "abc"}
+    assert {path.name for path in (out / "dives").iterdir()} == names
+    assert not list(out.rglob("*.part"))
+
+    serial = tmp_path / "serial"
+    source = season / "b" / "dive.mp4"
+    rig = str(season / "rig.yaml")
+    assert main(["run", str(source), "--rig", rig, "-o", str(serial), "--no-report"]) == 0
+    result = out / "dives" / "b_dive"
+    same = [
+        name for name in RESULTS if without_times(serial / name) == without_times(result / name)
+    ]
+    assert same == list(RESULTS)
+    assert yaml.safe_load((result / "run.yaml").read_text())["status"] == "finished"
+
+
+def test_bad_input_is_refused_in_one_line(tmp_path, season, refused):
+    out = tmp_path / "out"
+    assert "no such file" in refused(tmp_path / "none.mp4", "-o", out)
+    lonely = tmp_path / "lonely.mp4"
+    lonely.touch()
+    assert "has no rig" in refused(lonely, "-o", out)
+    both = ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
+    assert "--workers" in refused(season, "-o", out, *both)
+    assert "give at least 1" in refused(season, "-o", out, "--workers", "0")
+    (tmp_path / "file").touch()
+    rig = ("--rig", season / "rig.yaml")
+    assert "choose another folder" in refused(season, "-o", tmp_path / "file", *rig)
+
+
+def test_help_shows_an_example(capsys):
+    assert main(["batch", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026" in " ".join(said.split())

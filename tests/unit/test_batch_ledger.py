@@ -1,0 +1,79 @@
+"""Finished work is there whole, or not at all, and counts for what it was made for only."""
+
+import threading
+
+import pytest
+
+from aqualvs.app.batch.ledger import SEAL, drafted, read_seal, seal, sealed
+
+
+@pytest.fixture
+def finished(tmp_path):
+    folder = tmp_path / "piece"
+    with drafted(folder) as draft:
+        (draft / "rows.csv").write_bytes(b"0123456789")
+        seal(draft, "key", {"n": 3}, ["rows.csv"])
+    return folder
+
+
+def test_finished_work_is_had_back(finished):
+    assert sealed(finished, "key") == {"n": 3}
+
+
+def test_another_key_makes_it_worthless(finished):
+    assert sealed(finished, "other") is None
+
+
+@pytest.mark.parametrize("content", [b"012345678", b"0123456780", b"01234567890"])
+def test_a_changed_file_makes_it_worthless(finished, content):
+    (finished / "rows.csv").write_bytes(content)
+    assert sealed(finished, "key") is None
+
+
+def test_a_lost_file_or_a_torn_seal_makes_it_worthless(finished):
+    text = (finished / SEAL).read_text()
+    (finished / SEAL).write_text(text[: len(text) // 2])
+    assert sealed(finished, "key") is None
+    (finished / SEAL).write_text(text)
+    (finished / "rows.csv").unlink()
+    assert sealed(finished, "key") is None
+
+
+def test_work_that_is_broken_off_leaves_nothing(tmp_path):
+    def break_off():
+        with drafted(tmp_path / "piece") as draft:
+            (draft / "rows.csv").touch()
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        break_off()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_two_that_do_the_same_the_first_to_finish_wins(tmp_path):
+    folder, ready = tmp_path / "piece", threading.Barrier(2)
+
+    def work(word):
+        with drafted(folder) as draft:
+            (draft / "rows.csv").write_text(word)
+            seal(draft, "key", {"word": word}, ["rows.csv"])
+            ready.wait(10)
+
+    threads = [threading.Thread(target=work, args=(word,)) for word in ("one", "two")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    facts = sealed(folder, "key")
+    assert facts is not None
+    assert facts["word"] == (folder / "rows.csv").read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["piece"]
+
+
+def test_new_work_takes_the_place_of_damaged_work(finished):
+    (finished / "rows.csv").write_bytes(b"x")
+    with drafted(finished) as draft:
+        (draft / "rows.csv").write_bytes(b"0123456789")
+        seal(draft, "key", {"n": 4}, ["rows.csv"])
+    assert sealed(finished, "key") == {"n": 4}
+    assert read_seal(finished)["files"]["rows.csv"][0] == 10
