@@ -1,0 +1,257 @@
+"""The command line of dives, measured and simulated: signatures only.
+
+Bodies are imported when they run.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+RigFile = Annotated[Path, typer.Option("--rig", help="Rig file (YAML).", show_default=False)]
+OutFolder = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+]
+
+
+def run(
+    context: typer.Context,
+    source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
+    out: OutFolder,
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", help="Rig file; a recording has its own.", show_default=False),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a run that is there.")
+    ] = False,
+    target: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."
+        ),
+    ] = "auto",
+    detector: Annotated[
+        Literal["ridge", "threshold"],
+        typer.Option(help="Stripe detector; threshold is the paper's, for comparison."),
+    ] = "ridge",
+    mesh_filter: Annotated[
+        Literal["none", "paper"],
+        typer.Option(help="Filter for nets; paper is the paper's Algorithm 1."),
+    ] = "none",
+    fit: Annotated[
+        Literal["robust", "pseudo_inverse"],
+        typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
+    ] = "robust",
+    water_n: Annotated[
+        float | None, typer.Option(help="Refractive index of the water.", show_default=False)
+    ] = None,
+    temperature_c: Annotated[
+        float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
+    ] = None,
+    salinity: Annotated[
+        float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
+    ] = None,
+    dome: Annotated[
+        bool, typer.Option("--dome/--no-dome", help="Refract at the dome, or ignore it.")
+    ] = True,
+    frames: Annotated[
+        str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
+    ] = ":",
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of a folder of images.", show_default=False)
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Write overlay.mp4 too.")] = False,
+    report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the truth to compare with.", show_default=False)
+    ] = None,
+    index_target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
+            show_default=False,
+        ),
+    ] = None,
+    net: Annotated[
+        bool, typer.Option("--net", help="Tell the state of the net too, see aqualvs net.")
+    ] = False,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
+    ] = False,
+) -> None:
+    """Measure a dive."""
+    from aqualvs.app import run as body
+    from aqualvs.app.net_pass import NetRequest
+    from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
+
+    request = body.RunRequest(
+        source=source,
+        rig=rig,
+        out=out,
+        overwrite=overwrite,
+        water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
+        no_dome=not dome,
+        frames=FrameWindow.parse(frames),
+        fps=fps,
+        scanner=scanner_options(target, detector, mesh_filter, fit),
+        target=target,
+        chosen=_given(context, ("target", "detector", "mesh_filter", "fit")),
+        mcap=mcap,
+        overlay=overlay,
+        report=report,
+        truth=truth,
+        index_target=index_target,
+        net=NetRequest() if net else None,
+    )
+    raise typer.Exit(body.run_and_tell(request, typer.echo))
+
+
+def net(
+    source: Annotated[str, typer.Argument(help="Folder of a run, or video, folder of images.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write; of a run its own if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="Rig file, for a dive; a run has its own.", show_default=False),
+    ] = None,
+    target: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE", help="As for aqualvs run, which a dive needs first."
+        ),
+    ] = "auto",
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN.",
+            show_default=False,
+        ),
+    ] = None,
+    log_offset_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Log's clock minus the dive's; found from the motion if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    twine_mm: Annotated[
+        float | None,
+        typer.Option(help="Diameter of the bare twine, where it is known.", show_default=False),
+    ] = None,
+    stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+) -> None:
+    """Tell the state of a net."""
+    from aqualvs.app import net as body
+    from aqualvs.app.net_pass import NetRequest
+
+    request = NetRequest(twine_mm=twine_mm, stretch_m=stretch_m, log=log, log_offset_s=log_offset_s)
+    place = body.NetSource(source=source, rig=rig, out=out, target=target, overwrite=overwrite)
+    raise typer.Exit(body.net(place, request, typer.echo))
+
+
+def figures(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    out: OutFolder,
+    frame: Annotated[
+        int | None,
+        typer.Option(help="Frame; the one that shows most if left out.", show_default=False),
+    ] = None,
+    laser: Annotated[
+        str | None,
+        typer.Option(help="Laser's name; the one that shows most if left out.", show_default=False),
+    ] = None,
+    target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target file (net.yaml) with the parameters of the paper's filter.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Draw a run's reflections."""
+    from aqualvs.app import figures as body
+
+    body.figures(folder, out, typer.echo, frame=frame, laser=laser, target=target)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the truth to show.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a report again."""
+    from aqualvs.app.outputs import recover
+    from aqualvs.app.report import write_report
+
+    if recover(folder):
+        typer.echo(f"{folder}: points completed from the journal of a run that was killed")
+    typer.echo(f"report: {write_report(folder, truth=truth)}")
+
+
+def _given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
+    """Return which of some options the user gave."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    return frozenset(
+        name for name, source in sources.items() if source and source.name != "DEFAULT"
+    )
+
+
+def simulate(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Scenario name or YAML file.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig file; the example rig if left out.", show_default=False)
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a dive that is there.")
+    ] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
+) -> None:
+    """Render a dive."""
+    from aqualvs.app import simulate as body
+
+    if list_:
+        body.tell_scenarios(typer.echo)
+    else:
+        body.simulate(scenario, rig, out, typer.echo, overwrite=overwrite)
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out/demo"),
+) -> None:
+    """Run the bundled dive."""
+    from aqualvs.app import demo as body
+
+    raise typer.Exit(body.demo(out, typer.echo))
+
+
+def check(
+    rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")],
+    against: Annotated[
+        Path | None,
+        typer.Option(help="Older rig file: say what has moved since.", show_default=False),
+    ] = None,
+) -> None:
+    """Check a rig."""
+    if against is not None:
+        from aqualvs.app.check_compare import run_compare
+
+        raise typer.Exit(run_compare(rig, against))
+    from aqualvs.app.check import run_check
+
+    raise typer.Exit(run_check(rig))

@@ -1,0 +1,1 @@
+"""The same net on several dates: how fouling grew, which holes are new."""

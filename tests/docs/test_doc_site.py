@@ -1,0 +1,44 @@
+"""The site builds without a network, and no link inside it is dead."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from doc_blocks import ROOT
+
+pytest.importorskip("material", reason="the site needs the dev extra")
+
+
+def build(folder, docs=None):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    if docs is not None:
+        command += ["--config-file", str(docs)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
+    )
+
+
+def test_the_site_builds_and_links_hold(tmp_path):
+    done = build(tmp_path / "site")
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert "aqualvs" in page
+    # What a page loads comes with it.
+    loads = [part.split('"')[0] for part in page.split('src="')[1:]]
+    loads += [part.split('href="')[1].split('"')[0] for part in page.split("<link ")[1:]]
+    assert loads
+    assert not [one for one in loads if one.startswith(("http:", "https:", "//"))]
+
+
+def test_a_dead_link_is_found(tmp_path):
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    (docs / "index.md").write_text("[gone](gone.md)\n", encoding="utf-8")
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("nav:\n")[0]
+    (tmp_path / "mkdocs.yml").write_text(config, encoding="utf-8")
+    done = build(tmp_path / "site", tmp_path / "mkdocs.yml")
+    assert done.returncode != 0
+    assert "gone.md" in done.stderr + done.stdout
