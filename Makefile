@@ -17,8 +17,9 @@ setup: $(STAMP) ## Make .venv with the package and the tools of developers
 demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
 	$(BIN)/aqualvs demo -o out/demo
 
-test: $(STAMP) ## Run all tests
-	$(BIN)/python -m pytest
+test: $(STAMP) ## Run all tests: those that watch a clock one by one, the others two at a time
+	$(BIN)/python -m pytest --ignore=tests/live --numprocesses=2 --dist=loadfile
+	$(BIN)/python -m pytest tests/live
 
 lint: $(STAMP) ## Check style, types and the direction of imports
 	$(BIN)/ruff check $(CODE)
