@@ -31,7 +31,7 @@ format: $(STAMP) ## Format the code and mend what can be mended
 	$(BIN)/ruff format $(CODE)
 	$(BIN)/ruff check --fix $(CODE)
 
-bench: $(STAMP) ## Measure speed and accuracy; one table
+bench: $(STAMP) ## Measure speed and accuracy beside plain references; keeps out/bench/history.json
 	$(BIN)/python -m benchmarks
 
 docs: $(STAMP) ## Build the documentation site; writes out/site/index.html

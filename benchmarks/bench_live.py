@@ -7,7 +7,6 @@ the system's monotonic clock. The reference is what a live system should need at
 """
 
 import json
-import os
 import statistics
 import subprocess
 import sys
@@ -180,8 +179,6 @@ def rows(rig: Rig) -> list[dict[str, Any]]:
                     "ratio": None if bar is None else bar / value,
                 }
             )
-    busy = os.getloadavg()[0]
-    found[-1]["name"] += f" of {len(total)} frames (load {busy:.1f})"
     return found
 
 
