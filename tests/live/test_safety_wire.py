@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from aqualvs.control.safety import SafetyLimits
@@ -25,7 +26,16 @@ from aqualvs.scanning.posture import Reason, Refusal
 
 pytest.importorskip("pymavlink")
 
-from fake_ardusub_cases import FRAME_S, Dive, Fake, is_neutral, posture, quiet_since, until
+from fake_ardusub_cases import (
+    FRAME_S,
+    PATIENCE_S,
+    Dive,
+    Fake,
+    is_neutral,
+    posture,
+    quiet_since,
+    until,
+)
 
 MARGIN_S = 0.05
 WITHIN_S = 0.2
@@ -115,9 +125,10 @@ def assert_released(one: Dive, at: float, limit_s: float = WITHIN_S) -> None:
     # Three neutrals go out frame by frame.
     time.sleep(4 * FRAME_S + one.lateness(at))
     assert_quiet(one, at, limit_s)
-    later = time.monotonic()
+    until(lambda: not one.fake.steered(time.monotonic() - 0.2), "silence", 1.0 + one.lateness(at))
+    silent = time.monotonic()
     time.sleep(0.2)
-    assert not one.fake.steered(later)
+    assert not one.fake.steered(silent)
 
 
 def assert_quiet(one: Dive, at: float, limit_s: float) -> None:
@@ -203,15 +214,25 @@ def test_never_closer_than_the_least_range(fake: Fake, dive: MakeDive) -> None:
 
 def test_brakes_where_it_closes_in_too_fast(fake: Fake, dive: MakeDive) -> None:
     one = dive(setpoint=Setpoint(0.6))
-    began = time.monotonic()
-    one.frames.seen = lambda: posture(1.5 - 0.5 * (time.monotonic() - began))
+    one.frames.seen = lambda: posture(1.4)
     one.engage()
-    until(lambda: "too fast" in one.pilot.health().detail, "a warning")
+    # 0.5 m/s by the frames' own clock, which a busy machine does not change; to where hardly any
+    # closing speed is allowed, and the brake is firm.
+    ranges = iter(np.arange(1.4, 0.45, -0.5 * FRAME_S).tolist())
     at = time.monotonic()
-    time.sleep(0.2)
-    told = fake.steered(at)
-    assert told
-    assert all(m["fields"]["x"] <= -250 for m in told)
+    one.frames.seen = lambda: posture(next(ranges, 0.45))
+    until(lambda: "too fast" in one.pilot.health().detail, "a warning")
+    until(lambda: min(told_forward(fake, at)) <= -490, "a firm brake")
+    told = told_forward(fake, at)
+    first = next(i for i, x in enumerate(told) if x < 0)
+    firm = next(i for i, x in enumerate(told) if x <= -490)
+    # It begins gently; where a frame was held up, neutral comes between.
+    assert all(x <= 0 for x in told[first:firm])
+
+
+def told_forward(fake: Fake, since: float) -> list[int]:
+    """The forward sticks on the wire, in thousandths; 0 before any."""
+    return [m["fields"]["x"] for m in fake.steered(since)] or [0]
 
 
 @pytest.mark.parametrize("forwards", [True, False])
@@ -299,10 +320,14 @@ def test_disengaging_and_closing_leave_neutral(fake: Fake, dive: MakeDive) -> No
     pushed(one)
     at = time.monotonic()
     one.close()
-    time.sleep(0.1)
-    told = fake.steered(at)
-    assert len(told) >= 3
-    assert all(is_neutral(m) for m in told[-3:])
+    until(lambda: ends_neutral(fake.steered(at)), "three neutrals")
+    closed = time.monotonic()
+    time.sleep(0.2)
+    assert all(is_neutral(m) for m in fake.steered(closed))
+
+
+def ends_neutral(told: list[dict[str, Any]]) -> bool:
+    return len(told) >= 3 and all(is_neutral(m) for m in told[-3:])
 
 
 KILLED = """
@@ -356,7 +381,11 @@ def test_signs(fake: Fake, command: Command) -> None:
         ):
             fake.play(at=[0.9, 0.0])
             before = dict(fake.truth)
-            steer_for(vehicle, Effort(**{name: 0.8}), 0.3)
+
+            def moves(measured: str = measured, before: dict[str, float] = before) -> float:
+                return fake.truth[measured] - before[measured]
+
+            steer_until(vehicle, Effort(**{name: 0.8}), lambda: abs(moves()) > 0.02)
             moved = {key: fake.truth[key] - before[key] for key in before}
             assert sign * moved.pop(measured) > 0.02
             others = {"aside", "yaw"} if name == "yaw" else set()
@@ -365,9 +394,10 @@ def test_signs(fake: Fake, command: Command) -> None:
         vehicle.close()
 
 
-def steer_for(vehicle: ArduSubLink, effort: Effort, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+def steer_until(vehicle: ArduSubLink, effort: Effort, done: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < end, f"{effort} moves nothing"
         vehicle.send(effort)
         time.sleep(0.04)
     vehicle.send(Effort())

@@ -49,12 +49,17 @@ def test_simulation_ends_where_the_plan_ends(tmp_path: Path) -> None:
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(plan=plan), seconds=20.0, cage_radius=10.0)
     simulate_and_tell(request, lambda line: told.append(line))
-    assert any("the plan is done" in line and "a pilot takes over" in line for line in told)
+    assert any("the plan is done; holding" in line for line in told)
     with (request.out / TRUTH_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    # The leg of 2 s counts from the first posture.
-    assert 2.0 < float(rows[-1]["time_s"]) < 2.6
+    # The leg of 2 s counts from the first posture; then it holds, and is shown to hold.
+    over_s = next(float(row["time_s"]) for row in rows if row["stage"] == "over")
+    assert 2.0 < over_s < 2.6
+    assert float(rows[-1]["time_s"]) == pytest.approx(over_s + 5.0, abs=0.1)
     assert float(rows[-1]["along_m"]) > float(rows[0]["along_m"])
+    assert abs(float(rows[-1]["range_m"]) - 0.6) < 0.1
+    assert rows[-1]["engaged"] == "1"
+    assert float(rows[-1]["effort_forward"]) != 0.0
 
 
 def test_a_vehicle_that_cannot_sway_refuses_to_follow(tmp_path: Path) -> None:

@@ -41,7 +41,8 @@ def follow(
         typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.", show_default=False),
     ] = None,
     dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Vehicle: serve the pilot's page.")
+        bool,
+        typer.Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time."),
     ] = False,
     dashboard_address: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="Where to serve it.")
@@ -106,6 +107,8 @@ def follow(
             fps=fps,
             rendered=rendered,
             seed=seed,
+            dashboard=dashboard_address if dashboard else None,
+            token=token,
         )
         raise typer.Exit(body.simulate_and_tell(request, typer.echo))
     if source is None or rig is None or mavlink is None or gains is None:

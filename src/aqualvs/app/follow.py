@@ -2,18 +2,24 @@
 
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from aqualvs.app.disk import writing
 from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_page import serve_page
 from aqualvs.app.follow_rendered import RenderedEye
 from aqualvs.app.follow_report import RunFacts, summary_lines, write_report
 from aqualvs.app.follow_sim import Eye, SimulatedLoop, Timing
 from aqualvs.app.follow_sim_case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.app.follow_sim_log import write_log
+from aqualvs.app.follow_sim_page import LoopPage
+from aqualvs.app.follow_sim_watch import RunWatch
+from aqualvs.app.stopping import StopSignals
 from aqualvs.control.follow_log import FollowLog
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.mission import HoldMission, Mission
@@ -25,7 +31,6 @@ from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.net_motion import NetWall
 
 FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"
-_TELL_EVERY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,6 +102,10 @@ class SimRequest:
     rendered : bool
         Render every frame and measure in it, instead of sampling the scanner's noise.
     seed : int
+    dashboard : str or None
+        Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
+    token : str or None
+        Its password.
     """
 
     out: Path
@@ -113,6 +122,8 @@ class SimRequest:
     fps: float = 25.0
     rendered: bool = False
     seed: int = 0
+    dashboard: str | None = None
+    token: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be simulated.
@@ -157,9 +168,15 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     if request.rendered:
         eye = RenderedEye(case.net, rig, rng)
     loop = case.loop(eye, mission)
-    with FollowLog(request.out / FOLLOW_CSV) as follow_log:
-        loop.on_step = follow_log.write
-        _run(loop, request, tell)
+    with ExitStack() as undo:
+        page = None
+        if request.dashboard is not None:
+            holder = SetpointHolder(rig.working_range)
+            holder.put(setpoint)
+            served = serve_page(request.dashboard, request.token, rig, holder, tell)
+            page = LoopPage(served, rig, loop, holder)
+            undo.callback(page.close)
+        _run(loop, request, page, tell)
     write_log(loop.log, request.out / TRUTH_CSV)
     facts = RunFacts(
         vehicle=case.model.name,
@@ -168,10 +185,10 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
         rendered=request.rendered,
         fps=request.fps,
     )
-    page = write_report(loop.log, facts, request.out)
+    report = write_report(loop.log, facts, request.out)
     for line in summary_lines(loop.log, facts):
         tell(line)
-    tell(f"written: {page}")
+    tell(f"written: {report}")
     return 0
 
 
@@ -199,22 +216,25 @@ def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimC
     )
 
 
-def _run(loop: SimulatedLoop, request: SimRequest, tell: Callable[[str], object]) -> None:
-    """Run, and tell the way where a second takes seconds."""
-    told_s = 0.0
+def _run(
+    loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, tell: Callable[[str], object]
+) -> None:
+    """Run with the log beside it; Ctrl-C ends it early."""
+    with StopSignals() as stop, FollowLog(request.out / FOLLOW_CSV) as follow_log:
+        watch = RunWatch(loop, request.seconds, tell, stop, slow=request.rendered)
+        if page is None:
+            loop.on_step = follow_log.write
+            loop.run(request.seconds, watch)
+            return
 
-    def progress(now_s: float) -> bool:
-        nonlocal told_s
-        if request.rendered and now_s - told_s >= _TELL_EVERY_S:
-            told_s = now_s
-            tell(f"simulated {now_s:.0f} of {request.seconds:g} s")
-        if not loop.steering.engaged:
-            tell(f"at {now_s:.1f} s: {_last_words(loop)}; here a pilot takes over")
-        return loop.steering.engaged
+        def show(*step: Any) -> None:
+            follow_log.write(*step)
+            page.take(*step)
 
-    loop.run(request.seconds, progress)
+        def every_frame(now_s: float) -> bool:
+            page.keep_pace(now_s)
+            return watch(now_s)
 
-
-def _last_words(loop: SimulatedLoop) -> str:
-    reason = loop.steering.gate.latched
-    return "disengaged" if reason is None else reason.words
+        loop.on_step = show
+        tell("in real time; Ctrl-C ends it")
+        loop.run(request.seconds, every_frame)

@@ -1,5 +1,7 @@
 """A scanner that is run on rendered pictures: every frame goes through the real pipeline."""
 
+from collections import deque
+
 import numpy as np
 
 from aqualvs.geometry.transforms import SE3
@@ -7,10 +9,13 @@ from aqualvs.live.sources.planes import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Refusal
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene
+
+# More than are under way from the exposure to the pilot.
+_N_KEPT = 8
 
 
 def net_scene(seed: int = 0) -> Scene:
@@ -38,8 +43,8 @@ class RenderedEye:
 
     Attributes
     ----------
-    frame : Frame or None
-        The last picture.
+    shots : deque of (Frame, Scan)
+        The last pictures, and what was measured in them.
     """
 
     def __init__(
@@ -56,7 +61,7 @@ class RenderedEye:
         self._renderer = Renderer(rig, samples=samples)
         self._scanner = Scanner(rig, options)
         self._n_frames = 0
-        self.frame: Frame | None = None
+        self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
         """Return what the frame exposed now gives."""
@@ -64,6 +69,8 @@ class RenderedEye:
         image = self._renderer.render(scene, time_s, self._rng).image
         # OpenCV's order of colours.
         planes = planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
-        self.frame = Frame(self._n_frames, time_s, *planes)
+        frame = Frame(self._n_frames, time_s, *planes)
         self._n_frames += 1
-        return self._scanner.process(self.frame).posture
+        scan = self._scanner.process(frame)
+        self.shots.append((frame, scan))
+        return scan.posture

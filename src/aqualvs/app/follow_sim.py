@@ -140,6 +140,11 @@ class SimulatedLoop:
         """When a valid posture came last; -inf before the first."""
         return self._sight.seen_s
 
+    @property
+    def filtered(self) -> FilteredPosture | None:
+        """What the time filter made of the last step; None where it does not run."""
+        return self._filtered
+
     def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:
         """Let simulated time pass and return the log; may be called again to go on.
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TextIO
 
 from aqualvs.app.follow import FOLLOW_CSV, Aim
+from aqualvs.app.follow_page import serve_page
 from aqualvs.app.follow_vehicle_log import FollowLogOutput
 from aqualvs.app.live import SWITCH_S, FeedRequest
 from aqualvs.app.live_console import Console
-from aqualvs.app.live_outputs import DASHBOARD_PORT, host_and_port
 from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.autopilot import NetPilot
@@ -20,14 +20,13 @@ from aqualvs.control.controller import RangeYawController
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.safety import SafetyGate
 from aqualvs.control.setpoint import SetpointHolder
-from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.errors import AqualvsError
 from aqualvs.live.ardusub_link import ArduSubLink
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import Pilot
 from aqualvs.live.runner import FixedScanner, LiveRunner
 from aqualvs.live.time_filter import PostureFilter
 from aqualvs.live.warm_up import warm_up
-from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 
 
@@ -98,7 +97,7 @@ def follow_and_tell(
         undo.callback(outputs[1].close)
         outputs.append(Console())
         if request.dashboard is not None:
-            outputs.append(_dashboard(request.dashboard, request.token, rig, holder, tell))
+            outputs.append(serve_page(request.dashboard, request.token, rig, holder, tell))
         runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
         undo.pop_all()
     tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
@@ -128,31 +127,3 @@ def listen(pilot: Pilot, keys: TextIO, tell: Callable[[str], object]) -> threadi
     thread = threading.Thread(target=toggle, name="follow keys", daemon=True)
     thread.start()
     return thread
-
-
-def _dashboard(
-    address: str,
-    token: str | None,
-    rig: Rig,
-    holder: SetpointHolder,
-    tell: Callable[[str], object],
-) -> Output:
-    """Serve the page; its setpoint is the pilot's."""
-    try:
-        from aqualvs.app.dashboard.access import make_access, token_fault
-        from aqualvs.app.dashboard.commands import Controls, NoRecorder
-        from aqualvs.app.dashboard.output import Dashboard
-        from aqualvs.app.dashboard.server import DashboardServer
-    except ImportError as fault:
-        raise OptionError(
-            f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
-        ) from fault
-    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    wrong = token_fault(token)
-    if wrong:
-        raise OptionError(wrong)
-    access, controls = make_access(host, token), Controls(holder, NoRecorder())
-    server = DashboardServer(host, port, access, rig, controls)
-    shown = f"[{host}]" if ":" in host else host
-    tell(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
-    return Dashboard(server, controls)
