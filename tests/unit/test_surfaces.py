@@ -228,9 +228,11 @@ def test_which_of_several_is_the_target() -> None:
 
 def test_specks_on_a_plane_are_no_net_before_a_wall_of_light() -> None:
     """Caustics: a few dozen lines share a plane by chance, beside a wall's thousand."""
-    wall = surface(0.6, 1200.0, False)
-    specks = surface(0.45, 84.0, True)
-    few_strands = surface(0.45, 190.0, True)
-    assert choose([wall, replace(specks, voice=400.0)], TargetKind.AUTO) is wall
-    near = replace(few_strands, voice=400.0)
+    wall = surface(0.6, 1200.0, False, extent=1400.0)
+    specks = replace(surface(0.45, 84.0, True, extent=350.0), voice=400.0)
+    assert choose([wall, specks], TargetKind.AUTO) is wall
+    # A sparse net reaches far, and a near one has more light.
+    sparse = replace(specks, extent=950.0)
+    near = replace(surface(0.45, 190.0, True, extent=350.0), voice=400.0)
+    assert choose([wall, sparse], TargetKind.AUTO) is sparse
     assert choose([wall, near], TargetKind.AUTO) is near

@@ -5,9 +5,9 @@ from enum import StrEnum
 
 from aqualvs.scanning.surfaces import WORTH_SHARE, Surface
 
-# Specks that share a plane by chance have less than this share of the search lines of the surface
-# that has most; a net before a wall has more.
-_LINES_SHARE = 0.1
+# Specks that share a plane by chance have less than these shares of the search lines of the surface
+# that has most, and of the extent of the one that reaches farthest; a sparse net reaches far.
+_LINES_SHARE, _REACH_SHARE = 0.1, 0.5
 # Among meshes, one reaches far with this share of the widest one's extent.
 _EXTENT_SHARE = 0.75
 # And it is well supported with this share of the best one's support.
@@ -42,10 +42,13 @@ def choose_target(
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.voice for surface in surfaces), default=0.0)
     lines = max((surface.n_lines for surface in surfaces), default=0)
+    reach = max((surface.extent for surface in surfaces), default=0.0)
     meshes = [
         one
         for one in surfaces
-        if one.is_mesh and one.voice >= WORTH_SHARE * most and one.n_lines >= _LINES_SHARE * lines
+        if one.is_mesh
+        and one.voice >= WORTH_SHARE * most
+        and (one.n_lines >= _LINES_SHARE * lines or one.extent >= _REACH_SHARE * reach)
     ]
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.support, default=None)
