@@ -1,9 +1,21 @@
 """The command line of batches: a signature only; the body is imported in it."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
+
+from aqualvs.app.cli_options import (
+    Celsius,
+    Detector,
+    Fit,
+    MeshFilter,
+    Refraction,
+    Salinity,
+    Target,
+    WaterIndex,
+    given,
+)
 
 
 def batch(
@@ -42,36 +54,14 @@ def batch(
             show_default=False,
         ),
     ] = None,
-    target: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."
-        ),
-    ] = "auto",
-    detector: Annotated[
-        Literal["ridge", "threshold"],
-        typer.Option(help="Stripe detector; threshold is the paper's, for comparison."),
-    ] = "ridge",
-    mesh_filter: Annotated[
-        Literal["none", "paper"],
-        typer.Option(help="Filter for nets; paper is the paper's Algorithm 1."),
-    ] = "none",
-    fit: Annotated[
-        Literal["robust", "pseudo_inverse"],
-        typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
-    ] = "robust",
-    water_n: Annotated[
-        float | None, typer.Option(help="Refractive index of the water.", show_default=False)
-    ] = None,
-    temperature_c: Annotated[
-        float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
-    ] = None,
-    salinity: Annotated[
-        float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
-    ] = None,
-    dome: Annotated[
-        bool, typer.Option("--dome/--no-dome", help="Refract at the dome, or ignore it.")
-    ] = True,
+    target: Target = "auto",
+    detector: Detector = "ridge",
+    mesh_filter: MeshFilter = "none",
+    fit: Fit = "robust",
+    water_n: WaterIndex = None,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    dome: Refraction = True,
     fps: Annotated[
         float | None, typer.Option(help="Frame rate of folders of images.", show_default=False)
     ] = None,
@@ -89,8 +79,6 @@ def batch(
     from aqualvs.app.batch import command as body
     from aqualvs.app.run_inputs import Water, scanner_options
 
-    given = ("target", "detector", "mesh_filter", "fit")
-    sources = {name: context.get_parameter_source(name) for name in given}
     request = body.BatchRequest(
         dives=tuple(dives),
         out=out,
@@ -101,7 +89,7 @@ def batch(
         no_dome=not dome,
         fps=fps,
         scanner=scanner_options(target, detector, mesh_filter, fit),
-        chosen=frozenset(n for n, s in sources.items() if s and s.name != "DEFAULT"),
+        chosen=given(context, ("target", "detector", "mesh_filter", "fit")),
         target=target,
         index_target=index_target,
         report=report,

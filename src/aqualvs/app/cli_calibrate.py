@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from aqualvs.app.cli_options import Celsius, Salinity
+
 calibrate = typer.Typer(
     name="calibrate",
     help="Make a rig file from pictures: camera, dome, lasers, water, in this order.",
@@ -37,12 +39,6 @@ Medium = Annotated[
         help="What was outside the dome: air, the rig's water, or an index.",
         show_default=False,
     ),
-]
-Celsius = Annotated[
-    float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
-]
-Salinity = Annotated[
-    float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
 ]
 
 

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from aqualvs.app.cli_options import Celsius, IndexTarget, Salinity, Target, WaterIndex
+
 
 def live(
     source: Annotated[
@@ -69,31 +71,14 @@ def live(
         Literal["tcp", "udp"] | None,
         typer.Option(help="How RTSP shall send; tcp if left out.", show_default=False),
     ] = None,
-    target: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."
-        ),
-    ] = "auto",
+    target: Target = "auto",
     detector: Annotated[Literal["ridge", "threshold"], typer.Option(help="Stripe detector.")] = (
         "ridge"
     ),
-    water_n: Annotated[
-        float | None, typer.Option(help="Refractive index of the water.", show_default=False)
-    ] = None,
-    temperature_c: Annotated[
-        float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
-    ] = None,
-    salinity: Annotated[
-        float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
-    ] = None,
-    index_target: Annotated[
-        Path | None,
-        typer.Option(
-            help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
-            show_default=False,
-        ),
-    ] = None,
+    water_n: WaterIndex = None,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    index_target: IndexTarget = None,
 ) -> None:
     """Measure live."""
     from aqualvs.app import live as body

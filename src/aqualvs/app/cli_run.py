@@ -3,16 +3,24 @@
 Bodies are imported when they run.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-RigFile = Annotated[Path, typer.Option("--rig", help="Rig file (YAML).", show_default=False)]
-OutFolder = Annotated[
-    Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
-]
+from aqualvs.app.cli_options import (
+    Celsius,
+    Detector,
+    Fit,
+    IndexTarget,
+    MeshFilter,
+    OutFolder,
+    Refraction,
+    Salinity,
+    Target,
+    WaterIndex,
+    given,
+)
 
 
 def run(
@@ -26,36 +34,14 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a run that is there.")
     ] = False,
-    target: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."
-        ),
-    ] = "auto",
-    detector: Annotated[
-        Literal["ridge", "threshold"],
-        typer.Option(help="Stripe detector; threshold is the paper's, for comparison."),
-    ] = "ridge",
-    mesh_filter: Annotated[
-        Literal["none", "paper"],
-        typer.Option(help="Filter for nets; paper is the paper's Algorithm 1."),
-    ] = "none",
-    fit: Annotated[
-        Literal["robust", "pseudo_inverse"],
-        typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
-    ] = "robust",
-    water_n: Annotated[
-        float | None, typer.Option(help="Refractive index of the water.", show_default=False)
-    ] = None,
-    temperature_c: Annotated[
-        float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
-    ] = None,
-    salinity: Annotated[
-        float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
-    ] = None,
-    dome: Annotated[
-        bool, typer.Option("--dome/--no-dome", help="Refract at the dome, or ignore it.")
-    ] = True,
+    target: Target = "auto",
+    detector: Detector = "ridge",
+    mesh_filter: MeshFilter = "none",
+    fit: Fit = "robust",
+    water_n: WaterIndex = None,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    dome: Refraction = True,
     frames: Annotated[
         str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
     ] = ":",
@@ -67,13 +53,7 @@ def run(
     truth: Annotated[
         Path | None, typer.Option(help="CSV with the truth to compare with.", show_default=False)
     ] = None,
-    index_target: Annotated[
-        Path | None,
-        typer.Option(
-            help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
-            show_default=False,
-        ),
-    ] = None,
+    index_target: IndexTarget = None,
     net: Annotated[
         bool, typer.Option("--net", help="Tell the state of the net too, see aqualvs net.")
     ] = False,
@@ -97,7 +77,7 @@ def run(
         fps=fps,
         scanner=scanner_options(target, detector, mesh_filter, fit),
         target=target,
-        chosen=_given(context, ("target", "detector", "mesh_filter", "fit")),
+        chosen=given(context, ("target", "detector", "mesh_filter", "fit")),
         mcap=mcap,
         overlay=overlay,
         report=report,
@@ -197,14 +177,6 @@ def report(
     if recover(folder):
         typer.echo(f"{folder}: points completed from the journal of a run that was killed")
     typer.echo(f"report: {write_report(folder, truth=truth)}")
-
-
-def _given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
-    """Return which of some options the user gave."""
-    sources = {name: context.get_parameter_source(name) for name in names}
-    return frozenset(
-        name for name, source in sources.items() if source and source.name != "DEFAULT"
-    )
 
 
 def simulate(

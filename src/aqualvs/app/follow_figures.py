@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from aqualvs.app.canvas import new_canvas
 from aqualvs.app.follow_sim_log import LoopLog
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 
@@ -123,11 +124,7 @@ def _command(axes: "Axes", time_s: FloatArray, effort: FloatArray, name: str) ->
 
 
 def _panels(n: int, height_in: float) -> "tuple[Figure, list[Axes]]":
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.2, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_canvas(7.2, height_in)
     axes = figure.subplots(n, 1, sharex=True)
     figure.align_ylabels(axes)
     return figure, list(axes)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from aqualvs.app.canvas import new_canvas
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanning.mesh import MeshFilterOptions, laser_plane_image, structuring_elements
 
@@ -104,15 +105,6 @@ def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> "dict
         }
 
 
-def _figure(width_in: float, height_in: float) -> "Figure":
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _dots(axes: "Axes", xy: FloatArray, size: float, colour: str, label: str = "") -> None:
     axes.scatter(xy[:, 0], xy[:, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
 
@@ -128,7 +120,7 @@ def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
     spare = max(0.5 * height - width, 0.0)
     low[0], high[0] = low[0] - 0.5 * spare, high[0] + 0.5 * spare
     tall = min(max(4.6 * height / (width + spare), 2.0), 5.6)
-    figure = _figure(min(tall * (width + spare) / height + 1.0, 5.6), tall + 0.8)
+    figure = new_canvas(min(tall * (width + spare) / height + 1.0, 5.6), tall + 0.8)
     axes = figure.add_subplot()
     _zone(axes, r)
     _dots(axes, xy[r.usable], 2.5, _BLUE, f"reflections in it ({int(r.usable.sum())})")
@@ -149,7 +141,7 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
     spare = max(0.55 * width - 1.14 * height, 0.0)
     low[1], high[1] = low[1] - 0.5 * spare, high[1] + 0.14 * height + 0.5 * spare
     shape = min((high[1] - low[1]) / width, 1.3)
-    figure = _figure(7.2, 3.3 * (shape + _DETAIL[1] / _DETAIL[0]) + 1.5)
+    figure = new_canvas(7.2, 3.3 * (shape + _DETAIL[1] / _DETAIL[0]) + 1.5)
     grid = figure.subplots(2, 2, height_ratios=[shape, _DETAIL[1] / _DETAIL[0]])
     view = _detail(1e3 * r.in_laser[r.adaptive | r.paper], xy)
     for column, (name, net) in enumerate(zip(_NAMES, (r.adaptive, r.paper), strict=True)):
@@ -177,7 +169,7 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
 
 def _binary_image(r: Reflections, options: MeshFilterOptions) -> "Figure":
     """Draw the laser-plane image (Eq. 41-42) with the structuring elements (figure 9) to scale."""
-    figure = _figure(7.2, 4.0)
+    figure = new_canvas(7.2, 4.0)
     left, right = figure.subplots(1, 2)
     xy = r.in_laser[r.usable]
     if not len(xy):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from aqualvs.app.canvas import new_canvas
 from aqualvs.app.design.calibrated import camera_errors
 from aqualvs.app.design.predict import predict, together
 from aqualvs.app.design.settings import Design
@@ -68,7 +69,7 @@ def _errors(design: Design) -> "Figure":
     camera = together(camera_errors(design, few.tolist()))
     camera = np.stack([np.interp(ranges, few, column) for column in camera.T], axis=-1)
     systematic = np.hypot(told.systematic_total, camera)
-    figure = _canvas((7.2, 2.9))
+    figure = new_canvas(7.2, 2.9)
     panels = figure.subplots(1, 3, sharex=True)
     kinds = (
         ("net, one frame", told.net, _ORANGE, "-"),
@@ -108,7 +109,7 @@ def _picture(design: Design) -> "Figure":
     from matplotlib.colors import LogNorm
 
     width, height = design.rig.size_px
-    figure = _canvas((7.2, 5.6 * height / width + 0.6))
+    figure = new_canvas(7.2, 5.6 * height / width + 0.6)
     axes = figure.subplots()
     near, far = design.rig.working_range
     norm, colours = LogNorm(near * 1e3, far * 1e3), colormaps["viridis_r"].resampled(256)
@@ -160,12 +161,3 @@ def _label_lasers(axes: "Axes", design: Design, ranges: FloatArray) -> None:
             color=_DARK,
             bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": _GREY, "lw": 0.5},
         )
-
-
-def _canvas(size: tuple[float, float]) -> "Figure":
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure

@@ -47,17 +47,6 @@ def ordered(names: Sequence[str]) -> list[str]:
     return [name for name in MODULES if not names or name in names]
 
 
-def chosen(names: Sequence[str]) -> list[Experiment]:
-    """Return the experiments of these names in the catalogue's order; all of them for none.
-
-    Raises
-    ------
-    OptionError
-        If a name is not in the catalogue.
-    """
-    return [experiment(name) for name in ordered(names)]
-
-
 def experiment(name: str) -> Experiment:
     """Return an experiment of the catalogue."""
     module = import_module(f"{_PACKAGE}.{MODULES[name]}")

@@ -80,7 +80,7 @@ class Seen:
     @property
     def errors(self) -> FloatArray:
         """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return np.column_stack([self.ours.range_percent, np.degrees(self.ours.errors[:, 1:])])
+        return self.ours.errors_told
 
     @property
     def rms(self) -> FloatArray:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,11 @@ class Measured:
     def range_percent(self) -> FloatArray:
         """Error of the range in percent of the true range, shape (N,)."""
         return np.asarray(100.0 * self.errors[:, 0] / self.truth[:, 0])
+
+    @property
+    def errors_told(self) -> FloatArray:
+        """Errors for people, shape (N, 3): range in percent, pitch and yaw in degrees."""
+        return np.column_stack([self.range_percent, np.degrees(self.errors[:, 1:])])
 
 
 class Laboratory:
@@ -220,11 +225,6 @@ class Laboratory:
             scanner = Scanner(believed, options, camera)
             self._measured[key] = _measured(dive, scanner, self.frame_s if own else [])
         return self._measured[key]
-
-
-def with_seed(scenario: Scenario, seed: int) -> Scenario:
-    """Return the same dive with other noise."""
-    return replace(scenario, seed=seed)
 
 
 def frames_of(dive: Dive) -> list[Frame]:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
+from aqualvs.app.canvas import new_canvas
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -41,9 +43,4 @@ def new_figure(height_in: float, width: Literal["column", "page"] = "page") -> "
     width : {"column", "page"}
         As wide as a journal's column or page.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH_IN[width], height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return new_canvas(WIDTH_IN[width], height_in)

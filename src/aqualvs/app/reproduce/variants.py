@@ -43,9 +43,7 @@ class Variant:
     @property
     def errors(self) -> FloatArray:
         """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return np.concatenate(
-            [np.column_stack([m.range_percent, np.degrees(m.errors[:, 1:])]) for m in self.measured]
-        )
+        return np.concatenate([m.errors_told for m in self.measured])
 
     @property
     def rms(self) -> FloatArray:
