@@ -24,7 +24,7 @@ import av
 from aqualvs.app.batch.cluster import DaskWorkers, Outcome
 from aqualvs.app.batch.pieces import PieceResult
 from aqualvs.app.batch.season import Season, Steps
-from aqualvs.app.batch.spans import Span, SpanKind
+from aqualvs.live.sources.spans import Span, SpanKind
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
 from aqualvs.app.demo import bundled_dive

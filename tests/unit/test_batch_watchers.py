@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.app.batch.piece_frames import UnlikeSurveyError
 from aqualvs.app.batch.watchers import NoteTaker, stand_ins, stored_bars, stored_ranges, write_notes
 from aqualvs.app.net_check import NetCheck
 from aqualvs.app.tally import Tally
 from aqualvs.app.target_file import NetFacts
+from aqualvs.live.sources.span_frames import UnlikeSurveyError
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints

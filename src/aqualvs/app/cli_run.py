@@ -60,8 +60,19 @@ def run(
     mcap: Annotated[
         bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
     ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Processes that measure; one per core by default.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Measure a dive."""
+    from aqualvs.app import crew_start
+
+    n_processes = workers or crew_start.n_cores()
+    if n_processes > 1:
+        crew_start.prepare()
     from aqualvs.app import run as body
     from aqualvs.app.net_pass import NetRequest
     from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
@@ -84,6 +95,7 @@ def run(
         truth=truth,
         index_target=index_target,
         net=NetRequest() if net else None,
+        n_processes=n_processes,
     )
     raise typer.Exit(body.run_and_tell(request, typer.echo))
 

@@ -1,20 +1,22 @@
 """`aqualvs run`: from a dive to posture, points and report."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.crew_plan import crew_work
+from aqualvs.app.crew_work import CrewWork
+from aqualvs.app.measuring import Measured
 from aqualvs.app.net_check import net_check
 from aqualvs.app.net_pass import NetRequest
 from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
-from aqualvs.app.progress import progress
+from aqualvs.app.progress import Tick, progress
 from aqualvs.app.report import write_report
 from aqualvs.app.run_agreement import agreement_of
 from aqualvs.app.run_bare_lens import RunBareLens
-from aqualvs.app.run_frames import ready, window_of, with_losses
 from aqualvs.app.run_inputs import (
     FrameWindow,
     Water,
@@ -24,6 +26,7 @@ from aqualvs.app.run_inputs import (
     source_facts,
 )
 from aqualvs.app.run_mcap import RunMcap, ScansFrames, prepare_mcap
+from aqualvs.app.run_measuring import RunMeasuring
 from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay
 from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
@@ -76,6 +79,9 @@ class RunRequest:
         What to find out about the net on the way, if anything.
     target : str
         As the command line has it: a file may say what the net is, which is then checked.
+    n_processes : int
+        Processes that measure, where the dive can be shared; what is found is the same. A program
+        that asks for several must be safe to import, as `multiprocessing` wants it.
     """
 
     source: str
@@ -95,6 +101,7 @@ class RunRequest:
     index_target: Path | None = None
     net: NetRequest | None = None
     target: str = "auto"
+    n_processes: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,30 +169,25 @@ def run(
         following = _following(request, rig)
         scanner = following or replay or scanner_for(rig, request.scanner)
         net, agreement = RunNet(rig, request.net), _agreement(request, rig)
-        frames = ready(window_of(source, request.frames), source, request.frames)
-        prepare_mcap(request.out, request.source, overwrite=request.overwrite)
-        prepare_folder(request.out, overwrite=request.overwrite)
-        started = time.perf_counter()
-        try:
-            with (
-                _writers(request, rig, source, net) as writers,
-                StopSignals() as stop,
-                progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
-            ):
-                writers.tally.agreement = agreement
-                writers.tally.net_check = net_check(request.target, rig)
-                # A recording tells of lost frames itself; what it lacks was skipped on purpose.
-                first = None if replay else request.frames.first
-                for lost, frame in with_losses(frames, first, rig.n_water):
-                    for scan in lost:
-                        writers.lost(scan)
-                    writers.measure(scanner, frame)
-                    tick(1 + len(lost))
-                    if stop.caught:
-                        writers.interrupt()
-                        break
-        except SourceError as broken_off:
-            fault = broken_off
+        work = _crew_work(request, source, rig, scanner)
+        measuring = RunMeasuring(source, rig, request.frames, work, request.n_processes)
+        with measuring:
+            prepare_mcap(request.out, request.source, overwrite=request.overwrite)
+            prepare_folder(request.out, overwrite=request.overwrite)
+            started = time.perf_counter()
+            try:
+                with (
+                    _writers(request, rig, source, net) as writers,
+                    StopSignals() as stop,
+                    progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
+                ):
+                    writers.tally.agreement = agreement
+                    writers.tally.net_check = net_check(request.target, rig)
+                    scanner = writers.recorded(scanner)
+                    with closing(measuring.measured(scanner, one_by_one=request.mcap)) as found:
+                        _write_all(found, writers, stop, tick)
+            except SourceError as broken_off:
+                fault = broken_off
     return RunResult(
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
@@ -198,6 +200,18 @@ def run(
         comparison=_comparison(request),
         fault=fault,
     )
+
+
+def _write_all(
+    found: Iterable[Measured], writers: RunWriters, stop: StopSignals, tick: Tick
+) -> None:
+    """Write what is found until it ends, or a signal stops it."""
+    for measured in found:
+        writers.write(measured)
+        tick(1)
+        if stop.caught:
+            writers.interrupt()
+            return
 
 
 def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
@@ -258,6 +272,16 @@ def _following(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
     if rig.dome is None:
         raise OptionError("--index-target: without a dome the water's index cannot be seen")
     return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
+
+
+def _crew_work(
+    request: RunRequest, source: FrameSource, rig: Rig, scanner: ScansFrames
+) -> CrewWork | None:
+    """Return how processes can share the dive; None where one alone can do what is asked."""
+    alone = request.overlay or request.mcap or type(scanner) is not Scanner
+    if alone or request.n_processes < 2:
+        return None
+    return crew_work(source, request.frames, rig, request.scanner)
 
 
 def _agreement(request: RunRequest, rig: Rig) -> LaserAgreement | None:

@@ -8,12 +8,11 @@ from types import TracebackType
 from typing import Self
 
 from aqualvs.app.disk import writing
+from aqualvs.app.measuring import Measured
 from aqualvs.app.outputs import POSTURE_BARE_CSV
 from aqualvs.app.posture_csv import PostureCsv
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.comparison import BareLensComparison
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Scan
 
 
 class RunBareLens:
@@ -32,18 +31,17 @@ class RunBareLens:
 
     def __init__(self, folder: Path, rig: Rig) -> None:
         self._path = folder / POSTURE_BARE_CSV
-        self._comparison = BareLensComparison(rig) if rig.dome is not None else None
         self._ratios = array("d")
         self._file: PostureCsv | None = None
-        if self._comparison is not None:
+        if rig.dome is not None:
             with writing(self._path):
                 self._file = PostureCsv(self._path)
 
-    def write(self, scan: Scan) -> None:
+    def write(self, measured: Measured) -> None:
         """Append the row of one frame."""
-        if self._comparison is None or self._file is None:
+        scan, posture = measured.scan, measured.bare
+        if posture is None or self._file is None:
             return
-        posture = self._comparison.measure(scan)
         if isinstance(posture, Posture) and isinstance(scan.posture, Posture):
             self._ratios.append(posture.range / scan.posture.range)
         with writing(self._path):

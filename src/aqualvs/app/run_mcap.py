@@ -3,21 +3,22 @@
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from aqualvs.app.disk import writing
 from aqualvs.app.outputs import RUN_FILES
 from aqualvs.app.run_replay import Replay
 from aqualvs.app.run_water import WaterFollowingScanner
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.live.health import Health
-from aqualvs.live.recorder import RecorderOptions, Recording
-from aqualvs.live.sample import Instants, LiveSample
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
+
+if TYPE_CHECKING:
+    from aqualvs.live.recorder import Recording
+    from aqualvs.live.sample import LiveSample
 
 DIVE_MCAP = "dive.mcap"
 
@@ -56,24 +57,28 @@ class RunMcap:
         self._recording: Recording | None = None
         if wanted:
             with writing(self._path):
-                self._recording = Recording(self._path, RecorderOptions(scanner=options))
+                self._recording = _recording(self._path, options)
 
-    def process(self, scanner: ScansFrames, frame: Frame) -> Scan:
-        """Return the scan of a frame; it is recorded with its stripes."""
-        if self._recording is None:
-            return scanner.process(frame)
-        rig, scan, returns = _measured(scanner, frame)
-        self._write(rig, scan, returns)
-        return scan
+    def recorded(self, scanner: ScansFrames) -> ScansFrames:
+        """Return a scanner that measures as this one does, and has what it finds recorded."""
+        return scanner if self._recording is None else _RecordedScanner(self, scanner)
+
+    def write(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> None:
+        """Record a scan with the rig and the stripes that it was made from."""
+        if self._recording is not None:
+            with writing(self._path):
+                self._recording.write(self._sample(rig, scan, returns))
 
     def lost(self, scan: Scan) -> None:
         """Record the scan of a frame that was lost."""
-        if self._recording is not None:
-            self._write(self._rig, scan, {})
+        self.write(self._rig, scan, {})
 
-    def _write(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> None:
+    def _sample(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> "LiveSample":
+        from aqualvs.live.health import Health
+        from aqualvs.live.sample import Instants, LiveSample
+
         at_ns = round(1e9 * scan.time_s)
-        sample = LiveSample(
+        return LiveSample(
             rig=rig,
             scan=scan,
             returns=returns,
@@ -84,9 +89,6 @@ class RunMcap:
             filtered=None,
             health=Health(),
         )
-        if self._recording is not None:
-            with writing(self._path):
-                self._recording.write(sample)
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -102,6 +104,25 @@ class RunMcap:
         if self._recording is not None:
             with writing(self._path):
                 self._recording.close()
+
+
+class _RecordedScanner:
+    """Measures as another scanner does, and records what it finds."""
+
+    def __init__(self, mcap: RunMcap, scanner: ScansFrames) -> None:
+        self._mcap, self._scanner = mcap, scanner
+
+    def process(self, frame: Frame) -> Scan:
+        rig, scan, returns = _measured(self._scanner, frame)
+        self._mcap.write(rig, scan, returns)
+        return scan
+
+
+def _recording(path: Path, options: ScannerOptions) -> "Recording":
+    """Open a recording; what records is imported here and above, as few runs write one."""
+    from aqualvs.live.recorder import RecorderOptions, Recording
+
+    return Recording(path, RecorderOptions(scanner=options))
 
 
 def prepare_mcap(folder: Path, source: str, *, overwrite: bool) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from aqualvs.app.measuring import Measured
 from aqualvs.app.outputs import RunOutputs
 from aqualvs.app.run_bare_lens import RunBareLens
 from aqualvs.app.run_mcap import RunMcap, ScansFrames
@@ -9,7 +10,6 @@ from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay
 from aqualvs.app.runfile import Status
 from aqualvs.app.tally import Tally
-from aqualvs.scanning.scan import Frame, Scan
 
 
 class RunWriters:
@@ -40,16 +40,20 @@ class RunWriters:
         """Summary so far."""
         return self._outputs.tally
 
-    def measure(self, scanner: ScansFrames, frame: Frame) -> None:
-        """Measure a frame and write what was found."""
-        scan = self._mcap.process(scanner, frame)
-        self._write(frame, scan)
-        self._net.add(scan)
+    def recorded(self, scanner: ScansFrames) -> ScansFrames:
+        """Return the scanner to measure with: it has what it finds recorded, if that is wanted."""
+        return self._mcap.recorded(scanner)
 
-    def lost(self, scan: Scan) -> None:
-        """Write the scan that stands for a lost frame."""
-        self._mcap.lost(scan)
-        self._write(None, scan)
+    def write(self, measured: Measured) -> None:
+        """Write what was found in a frame, or what stands for a lost one."""
+        scan = measured.scan
+        if measured.is_lost:
+            self._mcap.lost(scan)
+        else:
+            self._net.add(scan)
+        self._outputs.write(scan)
+        self._bare_lens.write(measured)
+        self._overlay.write(measured.frame, scan)
 
     def interrupt(self) -> None:
         """Note that the run ends before its source does."""
@@ -62,8 +66,3 @@ class RunWriters:
     def net_lines(self, folder: Path, source: str) -> list[str]:
         """Write the state of the net, if it was wanted, and say it in words."""
         return self._net.write(folder, source)
-
-    def _write(self, frame: Frame | None, scan: Scan) -> None:
-        self._outputs.write(scan)
-        self._bare_lens.write(scan)
-        self._overlay.write(frame, scan)

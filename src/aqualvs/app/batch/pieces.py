@@ -11,13 +11,13 @@ from typing import Any
 import cv2
 
 from aqualvs.app.batch.ledger import drafted, seal, sealed
-from aqualvs.app.batch.piece_frames import image_frames, video_frames
-from aqualvs.app.batch.spans import Span, SpanKind
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.watchers import NoteTaker, write_notes
 from aqualvs.app.batch.work import DiveWork, OpenDive, agreement_for, digest, open_dive
+from aqualvs.app.blocks import block_length, in_blocks
 from aqualvs.app.disk import writing
 from aqualvs.app.journal import PointsJournal
+from aqualvs.app.measuring import Measured, Meter, measured_frames
 from aqualvs.app.net_check import net_check
 from aqualvs.app.outputs import JOURNAL, POSTURE_BARE_CSV, POSTURE_CSV
 from aqualvs.app.posture_csv import PostureCsv
@@ -26,7 +26,9 @@ from aqualvs.app.run_frames import ready, with_losses
 from aqualvs.app.run_inputs import FrameWindow
 from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.errors import SourceError
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.live.sources.span_frames import image_frames, video_frames
+from aqualvs.live.sources.spans import Span, SpanKind
+from aqualvs.scanning.scan import Frame
 
 NOTES = "notes.npz"
 
@@ -97,7 +99,7 @@ def measure_piece(work: DiveWork, survey: Survey, number: int) -> PieceResult:
     with writing(folder), drafted(folder) as draft:
         dive = open_dive(work.request)
         with dive.source:
-            facts, names = _measure(dive, span, draft, _scanner(dive, survey))
+            facts, names = _write_piece(dive, span, draft, _scanner(dive, survey))
         seal(draft, key, facts, names)
     return PieceResult(
         number=number, cpu_s=time.process_time() - began_s, peak_bytes=peak_bytes(), **facts
@@ -113,22 +115,24 @@ def peak_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def _measure(
+def _write_piece(
     dive: OpenDive, span: Span, folder: Path, scanner: ScansFrames
 ) -> tuple[dict[str, Any], list[str]]:
     """Write a piece into a folder; returns facts and the names of the files."""
     fault, n_valid, last_s = "", 0, 0.0
     frames = _frames(dive, span)
+    meter = Meter(dive.rig, scanner)
     taker = NoteTaker(span.first, agreement_for(dive), net_check(dive.request.target, dive.rig))
     with ExitStack() as files:
         posture = files.enter_context(PostureCsv(folder / POSTURE_CSV))
         points = files.enter_context(PointsJournal(folder / JOURNAL))
         bare = files.enter_context(RunBareLens(folder, dive.rig))
         try:
-            for scan in _scans(dive, span, frames, scanner):
+            for measured in _measured(dive, span, frames, meter):
+                scan = measured.scan
                 points.write(scan)
                 posture.write(scan)
-                bare.write(scan)
+                bare.write(measured)
                 taker.add(scan)
                 n_valid += bool(scan.posture)
                 last_s = scan.time_s
@@ -157,15 +161,14 @@ def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
     return ready(iter(dive.source), dive.source, FrameWindow())
 
 
-def _scans(
-    dive: OpenDive, span: Span, frames: Iterator[Frame], scanner: ScansFrames
-) -> Iterator[Scan]:
-    """Yield the scans of a piece's frames, and those that stand for lost ones."""
+def _measured(
+    dive: OpenDive, span: Span, frames: Iterator[Frame], meter: Meter
+) -> Iterator[Measured]:
+    """Yield what is found in a piece's frames, and what stands for lost ones."""
     # A recording tells of lost frames itself.
     first = None if dive.replay is not None else span.first
-    for lost, frame in with_losses(frames, first, dive.rig.n_water):
-        yield from lost
-        yield scanner.process(frame)
+    pairs = with_losses(frames, first, dive.rig.n_water)
+    return measured_frames(in_blocks(pairs, block_length(dive.rig.size_px)), meter)
 
 
 class _Kept(threading.local):

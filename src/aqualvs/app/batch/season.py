@@ -8,12 +8,12 @@ from typing import Any, Protocol
 from aqualvs.app.batch.cluster import Outcome, Workers, WorkersLostError
 from aqualvs.app.batch.dataset import drop_dive
 from aqualvs.app.batch.joining import PieceLostError, finished_dive, join_dive
-from aqualvs.app.batch.piece_frames import UnlikeSurveyError
 from aqualvs.app.batch.pieces import PieceResult, measure_piece
 from aqualvs.app.batch.records import DiveRecord, DiveState
 from aqualvs.app.batch.survey import Survey, survey
 from aqualvs.app.batch.work import DiveWork
 from aqualvs.errors import AqualvsError
+from aqualvs.live.sources.span_frames import UnlikeSurveyError
 
 # Tasks handed over for each that can be under way, so that no process waits for the next.
 _AHEAD = 3

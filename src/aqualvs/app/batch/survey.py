@@ -1,6 +1,5 @@
 """The first look at a dive: whether it can be measured, what it holds, and where it is cut."""
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -9,11 +8,11 @@ from typing import Any
 import av
 
 from aqualvs.app.batch.ledger import seal, sealed
-from aqualvs.app.batch.spans import Span, SpanKind, video_spans
 from aqualvs.app.batch.work import DiveWork, OpenDive, digest, open_dive, result_key
 from aqualvs.app.disk import writing
 from aqualvs.app.run_inputs import source_facts
 from aqualvs.live.sources.images import ImageSource, images_in
+from aqualvs.live.sources.spans import Span, SpanKind, image_spans, video_spans
 from aqualvs.live.sources.video import VideoSource
 
 _MEMORY = "survey"
@@ -125,14 +124,9 @@ def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
 def _images(folder: Path, piece_frames: int) -> dict[str, Any]:
     files = [(path.name, path.stat()) for path in images_in(folder)]
     sizes = [stat.st_size for _, stat in files]
-    starts = [*range(0, len(files), piece_frames), len(files)]
-    spans = [
-        Span(kind=SpanKind.IMAGES, first=first, stop=stop, n_bytes=sum(sizes[first:stop]))
-        for first, stop in itertools.pairwise(starts)
-    ]
     return {
         "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
-        "spans": [asdict(span) for span in spans],
+        "spans": [asdict(span) for span in image_spans(sizes, piece_frames)],
         "why_whole": "",
         "n_bytes": sum(sizes),
     }

@@ -15,9 +15,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.app.batch.piece_frames import UnlikeSurveyError
 from aqualvs.app.net_check import NetCheck
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.live.sources.span_frames import UnlikeSurveyError
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints

@@ -10,10 +10,10 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from aqualvs.app.batch.spans import Span, joint_checksum, packet_checksum
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.images import ImageSource, images_in
 from aqualvs.live.sources.planes import planes_of
+from aqualvs.live.sources.spans import Span, joint_checksum, packet_checksum
 from aqualvs.scanning.scan import Frame
 
 _PATIENCE_S = 10.0

@@ -4,10 +4,10 @@ import av
 import numpy as np
 import pytest
 
-from aqualvs.app.batch.nal_units import unit_reader
-from aqualvs.app.batch.piece_frames import UnlikeSurveyError, image_frames, video_frames
-from aqualvs.app.batch.spans import Span, SpanKind, video_spans
 from aqualvs.live.sources import open_source
+from aqualvs.live.sources.nal_units import unit_reader
+from aqualvs.live.sources.span_frames import UnlikeSurveyError, image_frames, video_frames
+from aqualvs.live.sources.spans import Span, SpanKind, video_spans
 from shell_cases import cut_after, damage_frame, destroy_frame, grain, packets, write_video
 
 SIZE = (96, 64)

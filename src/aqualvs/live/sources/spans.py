@@ -1,4 +1,4 @@
-"""Parts of a dive that can be measured by themselves, and how they are found.
+"""Parts of a dive that can be decoded by themselves, and how they are found.
 
 A part of a video must begin at a picture from which decoding can start as if nothing had been
 before. In H.264 and HEVC that is an instantaneous decoding refresh (IDR): by the standards (ITU-T
@@ -19,7 +19,7 @@ import numpy as np
 from av.packet import Packet
 from av.video.stream import VideoStream
 
-from aqualvs.app.batch.nal_units import UnitReader, unit_reader
+from aqualvs.live.sources.nal_units import UnitReader, unit_reader
 
 # Codecs that predict no picture from another.
 _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
@@ -111,6 +111,23 @@ def video_spans(path: Path, n_least: int) -> VideoSpans:
         why = packets.why_whole() or _broken_promise(stream, packets)
         spans = () if why else packets.spans(n_least)
         return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
+
+
+def image_spans(sizes: Sequence[int], n_least: int) -> tuple[Span, ...]:
+    """Cut a folder of images into parts.
+
+    Parameters
+    ----------
+    sizes : sequence of int
+        Of the files, in bytes, in their order.
+    n_least : int
+        Images that a part has, but for the last.
+    """
+    edges = [*range(0, len(sizes), n_least), len(sizes)]
+    return tuple(
+        Span(kind=SpanKind.IMAGES, first=first, stop=stop, n_bytes=sum(sizes[first:stop]))
+        for first, stop in itertools.pairwise(edges)
+    )
 
 
 def packet_checksum(packet: "Packet[VideoStream]") -> int:

@@ -1,0 +1,237 @@
+"""A dive that several processes measure is, byte for byte, the one that one process measures."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.app import crew_plan
+from aqualvs.app.blocks import block_length, in_blocks, read_ahead
+from aqualvs.app.crew import Crew
+from aqualvs.app.crew_messages import Ended, packed, unpacked
+from aqualvs.app.crew_plan import crew_work
+from aqualvs.app.measuring import Meter
+from aqualvs.app.run import RunRequest, run
+from aqualvs.app.run_inputs import FrameWindow
+from aqualvs.errors import SourceError
+from aqualvs.live.sources import open_source
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanning.scan import ScanPoints
+from batch_cases import DEMO, RESULTS, demo_dive, without_times
+from shell_cases import destroy_frame
+
+N, GROUP = 24, 6
+RIG = DEMO / "rig.yaml"
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory):
+    return demo_dive(tmp_path_factory.mktemp("dive") / "dive.mp4", N, GROUP)
+
+
+@pytest.fixture(autouse=True)
+def short_dives_are_shared(monkeypatch):
+    monkeypatch.setattr(crew_plan, "_LEAST_FRAMES", 8)
+    monkeypatch.setattr(crew_plan, "_PART_FRAMES", GROUP)
+
+
+@pytest.fixture
+def crews(monkeypatch):
+    """The crews that runs have had."""
+    seen = []
+    entered = Crew.__enter__
+    monkeypatch.setattr(Crew, "__enter__", lambda crew: seen.append(crew) or entered(crew))
+    return seen
+
+
+def work_of(source):
+    with open_source(source, fps=25 if Path(source).is_dir() else None) as opened:
+        return crew_work(opened, FrameWindow(), load_rig(RIG), ScannerOptions())
+
+
+def results(source, out, n_processes, **more):
+    """What a run writes, by name, and how it went."""
+    request = RunRequest(
+        source=str(source), rig=RIG, out=out, report=False, n_processes=n_processes, **more
+    )
+    result = run(request)
+    return {name: without_times(out / name) for name in RESULTS}, result
+
+
+def assert_same(source, folder, crews, **more):
+    alone, _ = results(source, folder / "alone", 1, **more)
+    assert not crews
+    shared, result = results(source, folder / "shared", 2, **more)
+    assert len(crews) == 1
+    assert [name for name in RESULTS if alone[name] == shared[name]] == list(RESULTS)
+    assert not multiprocessing.active_children()
+    return result
+
+
+def test_two_processes_find_what_one_finds(tmp_path, dive, crews):
+    result = assert_same(dive, tmp_path, crews)
+    assert crews[0].is_done
+    assert result.tally.n_frames == N
+    assert result.tally.n_valid > N - 4
+
+
+def test_so_they_do_in_a_window_that_cuts_through_parts(tmp_path, dive, crews):
+    result = assert_same(dive, tmp_path, crews, frames=FrameWindow(4, 15))
+    assert crews[0].is_done
+    assert result.tally.n_frames == 11
+
+
+def test_so_they_do_in_a_folder_of_images(tmp_path, dive, crews):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    with av.open(str(dive)) as container:
+        for i, picture in zip(range(2 * GROUP), container.decode(video=0), strict=False):
+            cv2.imwrite(str(folder / f"{i}.png"), picture.to_ndarray(format="bgr24"))
+    assert_same(folder, tmp_path, crews, fps=12.5)
+    assert crews[0].is_done
+
+
+def test_from_damage_on_one_process_goes_on(tmp_path, dive, crews):
+    damaged = tmp_path / "damaged.mp4"
+    damaged.write_bytes(dive.read_bytes())
+    destroy_frame(damaged, 15)
+    result = assert_same(damaged, tmp_path, crews)
+    assert not crews[0].is_done
+    assert 12 <= crews[0].next_frame <= 15
+    assert result.tally.refused["corrupt_frame"] >= 1
+
+
+def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, crews, monkeypatch):
+    """Nothing is lost, and nothing is there twice."""
+    whole, _ = results(dive, tmp_path / "alone", 1)
+    of_part = Crew._of_part
+
+    def one_dies(crew, number):
+        if number == 1:
+            for hand in crew._hands:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(hand.process.pid, signal.SIGKILL)
+        return of_part(crew, number)
+
+    monkeypatch.setattr(Crew, "_of_part", one_dies)
+    shared, result = results(dive, tmp_path / "shared", 2)
+    assert result.tally.n_frames == N
+    assert whole == shared
+    assert GROUP <= crews[0].next_frame <= N
+
+
+def test_what_is_given_up_leaves_no_process(dive):
+    work = work_of(dive)
+    with Crew(work, 3) as crew:
+        first = next(crew.measured())
+        assert len(multiprocessing.active_children()) == 3
+    assert first.scan.index == 0
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"overlay": True}, {"mcap": True}, {"frames": FrameWindow(0, 7)}],
+    ids=["pictures", "stripes", "few-frames"],
+)
+def test_what_needs_this_process_is_done_by_it(tmp_path, dive, crews, more):
+    if "mcap" in more:
+        pytest.importorskip("foxglove")
+    results(dive, tmp_path / "out", 2, **{"frames": FrameWindow(0, 9), **more})
+    assert not crews
+
+
+def test_a_video_without_key_frames_inside_is_not_shared(tmp_path):
+    assert work_of(demo_dive(tmp_path / "one.mp4", 12, 100)) is None
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are copied on Linux")
+def test_the_command_shares_a_dive_by_default(tmp_path):
+    """In a process of its own, which may copy itself."""
+    dive = demo_dive(tmp_path / "dive.mp4", 108, 36)
+    outs = [tmp_path / "one", tmp_path / "two"]
+    for n, out in enumerate(outs, start=1):
+        command = [
+            sys.executable,
+            "-m",
+            "aqualvs",
+            "run",
+            str(dive),
+            "--rig",
+            str(RIG),
+            "--no-report",
+        ]
+        command += ["-o", str(out), "--workers", str(n)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "108 frames" in done.stdout
+        assert done.stderr == ""
+    assert all(without_times(outs[0] / n) == without_times(outs[1] / n) for n in RESULTS)
+
+
+def test_messages_arrive_as_they_were(dive):
+    rig = load_rig(RIG)
+    with open_source(dive) as source:
+        frames = [frame for _, frame in zip(range(3), source, strict=False)]
+    block = Meter(rig, Scanner(rig)).measure(frames)
+    found = unpacked(packed(block))
+    assert [m.frame for m in found] == [None] * 3
+    for one, other in zip(block, found, strict=True):
+        assert (one.scan.index, one.scan.time_s) == (other.scan.index, other.scan.time_s)
+        assert one.scan.posture.range == other.scan.posture.range
+        assert one.bare.range == other.bare.range
+        assert np.array_equal(one.scan.posture.covariance, other.scan.posture.covariance)
+        for field in fields(ScanPoints):
+            mine, theirs = (getattr(m.scan.points, field.name) for m in (one, other))
+            assert mine.dtype == theirs.dtype
+            assert np.array_equal(mine, theirs)
+    assert [unpacked(packed(end)) for end in Ended] == list(Ended)
+
+
+def breaking_off(n):
+    yield from range(n)
+    raise SourceError("the end is missing")
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_what_came_before_a_break_is_in_blocks(ahead):
+    blocks = in_blocks(breaking_off(7), 3)
+    found = []
+    with pytest.raises(SourceError, match="the end is missing"):  # noqa: PT012
+        for block in read_ahead(blocks) if ahead else blocks:
+            found.append(block)
+    assert found == [[0, 1, 2], [3, 4, 5], [6]]
+
+
+def test_reading_ahead_ends_with_its_reader():
+    fetched, n_before = [], threading.active_count()
+
+    def items():
+        for i in range(1000):
+            fetched.append(i)
+            yield i
+
+    reader = read_ahead(items())
+    assert [next(reader) for _ in range(3)] == [0, 1, 2]
+    time.sleep(0.05)
+    assert len(fetched) <= 6
+    reader.close()
+    assert threading.active_count() == n_before
+
+
+def test_blocks_of_large_pictures_are_short():
+    assert block_length((720, 576)) == 8
+    assert 1 <= block_length((3840, 2160)) < 4
+    assert block_length((16000, 12000)) == 1
