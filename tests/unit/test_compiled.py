@@ -27,10 +27,36 @@ def later(x):
 print(int(twice(1)), sum(twice.stats.cache_hits.values()))
 """
 
+ALLOCATING = """
+import sys
+import numpy as np
+from aqualvs.geometry.compiled import kernel
 
-def run_caller(folder: Path) -> list[str]:
+@kernel
+def middle(x):
+    return np.median(np.abs(x))
+
+@kernel
+def doubled(x):
+    if len(x) < 2:
+        raise ValueError("too short")
+    return 2.0 * middle(np.sort(x)) + np.empty(3).size
+
+x = np.array([3.0, -1.0, 2.0])
+middle(x)
+said = ""
+try:
+    doubled(x[:1])
+except ValueError as fault:
+    said = str(fault).replace(" ", "_")
+hits = [sum(one.stats.cache_hits.values()) for one in (middle, doubled)]
+print(middle(x), doubled(x), said, *hits, "numba.np.arraymath" in sys.modules)
+"""
+
+
+def run_caller(folder: Path, name: str = "caller.py") -> list[str]:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
-    command = [sys.executable, "caller.py"]
+    command = [sys.executable, name]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, check=True
     )
@@ -44,3 +70,15 @@ def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:
     assert run_caller(tmp_path) == ["3", "1"]
     (tmp_path / "callee.py").write_text(CALLEE.format(increment=1000))
     assert run_caller(tmp_path) == ["2001", "0"]
+
+
+def test_cached_kernels_load_without_what_only_compiling_needs(tmp_path: Path) -> None:
+    (tmp_path / "allocating.py").write_text(ALLOCATING)
+    found = ["2.0", "7.0", "too_short"]
+    assert run_caller(tmp_path, "allocating.py") == [*found, "0", "0", "True"]
+    assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]
+    for path in (tmp_path / "cache").rglob("*doubled*"):
+        path.unlink()
+    # The first is loaded; the second, which inlines it, is compiled, and loaded the next time.
+    assert run_caller(tmp_path, "allocating.py") == [*found, "1", "0", "True"]
+    assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]

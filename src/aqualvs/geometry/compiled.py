@@ -5,6 +5,11 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+# What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
+_LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
+if _LOADS_LIGHTLY:
+    from aqualvs.geometry.kernel_loading import load_lightly
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Contraction to fused multiply-add and reassociation let LLVM vectorise the sums; NaN and
@@ -36,15 +41,26 @@ def inline_borrowing_kernel(function: F) -> F:
     return _compiled(function, forceinline=True, _nrt=False)
 
 
-def _compiled(function: F, **options: bool) -> F:
+def exact_borrowing_kernel(function: F) -> F:
+    """Compile a borrowing kernel whose sums are taken in the order in which they are written."""
+    return _compiled(function, fastmath=False, _nrt=False)
+
+
+def inline_exact_borrowing_kernel(function: F) -> F:
+    """Compile a scalar function that exact kernels call; always inlined by LLVM."""
+    return _compiled(function, forceinline=True, fastmath=False, _nrt=False)
+
+
+def _compiled(function: F, **options: object) -> F:
     compiled = numba.njit(
         cache=True,
         error_model="numpy",
-        fastmath=_FAST_BUT_NAN_SAFE,
         nogil=True,
-        **options,
+        **{"fastmath": _FAST_BUT_NAN_SAFE, **options},
     )(function)
     _depend_on_callees(compiled, function)
+    if _LOADS_LIGHTLY:
+        load_lightly(compiled)
     return cast(F, compiled)
 
 

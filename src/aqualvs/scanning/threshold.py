@@ -7,8 +7,9 @@ import numpy as np
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.contrast import U8Array
-from aqualvs.scanning.runs import ColumnRuns, RowRuns
+from aqualvs.scanning.contrast import BLOCK
+from aqualvs.scanning.lanes import U8Array, whole_lanes
+from aqualvs.scanning.runs import Runs
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.view import SearchView
@@ -62,20 +63,15 @@ class ThresholdDetector:
         options: ThresholdOptions,
     ) -> None:
         along_x = axis is SearchAxis.ALONG_X
-        finder = RowRuns if along_x else ColumnRuns
         length = size_px[0] if along_x else size_px[1]
-        self._finder = finder(length, lowest, highest, options.max_returns)
-        n_words, n_blocks = self._finder.in_band.shape[:: 1 if along_x else -1]
+        self._finder = Runs(length, lowest, highest, options.max_returns)
         # One grey level below the threshold everywhere: what stands above it by one is bright.
-        # Nothing stands above the white of lines beyond the picture.
-        below: U8Array = np.full((8 * n_words, n_blocks), 255, np.uint8)
-        below[: len(lowest)] = options.level - 1
-        background = below[: len(lowest)] if along_x else below.T
-        self._background: U8Array = np.ascontiguousarray(background)
+        n_blocks = whole_lanes(length) // BLOCK
+        self._below: U8Array = np.full((len(lowest), n_blocks), options.level - 1, np.uint8)
 
     def detect(self, view: SearchView) -> Returns:
         """Find the returns of one frame; colour is not looked at."""
-        runs = self._finder.find(view.image, self._background, 1, self._finder.in_band)
+        runs = self._finder.find(view.lines, self._below, 1, self._finder.in_band)
         n = len(runs)
         return Returns(
             line=runs[:, 0].copy(),

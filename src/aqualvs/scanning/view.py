@@ -1,8 +1,8 @@
-"""Views: a frame as each search direction sees it.
+"""Views: a frame as each search direction sees it, with search lines as rows.
 
-The decoder's planes are read once. Search lines are the columns of the picture, or its rows; where
-they are two pixels wide, the means of columns and those of rows are two small pictures, else both
-directions look at the same one. Green is U turned over, so that laser light is high.
+The decoder's planes are read once. Search lines are the columns of the picture, turned into rows,
+or its rows; where they are two pixels wide, they are the means of two columns, or of two rows.
+Green is U turned over, so that laser light is high.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,10 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
-from aqualvs.scanning.contrast import BLOCK, U8Array
+from aqualvs.scanning.lanes import U8Array, margined
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis
+from aqualvs.scanning.turning import SQUARE, turn_slab
 
 _AS_IT_IS, _TURNED_OVER = np.uint8(0), np.uint8(255)
 
@@ -24,19 +25,14 @@ class SearchView:
 
     Attributes
     ----------
-    image : uint8 array, shape (height, width)
-        Without gaps in memory, in whole blocks of `BLOCK` columns: 255 beyond the picture. Search
-        lines are its columns for searches along y, its rows for searches along x.
-    lines : uint8 array, shape (n_lines, length)
-        The same memory with search lines as rows.
-    green, green_lines : uint8 array or None
+    lines : uint8 array, shape (n_lines, whole lanes)
+        Search lines, allocated with `margined`: 255 beyond the picture.
+    green : uint8 array or None
         255 less U, of half the size, likewise; None for a grey source.
     """
 
-    image: U8Array
     lines: U8Array
     green: U8Array | None
-    green_lines: U8Array | None
 
 
 class FrameViews:
@@ -53,60 +49,51 @@ class FrameViews:
     def __init__(self, size_px: tuple[int, int], line_px: int) -> None:
         width, height = size_px
         across, down = width // line_px, height // line_px
-        plane = _Plane if line_px == 1 else _HalvedPlane
-        self._luma = plane((height, width), (across, down), _AS_IT_IS)
+        self._luma = _Plane((height, width), (across, down), line_px, _AS_IT_IS)
         chroma = (-(-height // 2), -(-width // 2))
-        self._green = plane(chroma, (-(-across // 2), -(-down // 2)), _TURNED_OVER)
+        halves = (-(-across // 2), -(-down // 2))
+        self._green = _Plane(chroma, halves, line_px, _TURNED_OVER)
 
     def of(self, frame: Frame) -> dict[SearchAxis, SearchView]:
         """Return the views of a frame; the next call overwrites them."""
         luma = self._luma.take(frame.luma)
         if frame.chroma is None:
-            return {axis: SearchView(*luma[axis], None, None) for axis in SearchAxis}
+            return {axis: SearchView(luma[axis], None) for axis in SearchAxis}
         green = self._green.take(frame.chroma[0])
-        return {axis: SearchView(*luma[axis], *green[axis]) for axis in SearchAxis}
-
-
-BothWays = dict[SearchAxis, tuple[U8Array, U8Array]]
+        return {axis: SearchView(luma[axis], green[axis]) for axis in SearchAxis}
 
 
 class _Plane:
-    """One image plane, the same for both directions."""
+    """One image plane: its columns and its rows, or the means of two of them, as search lines."""
 
-    def __init__(self, shape: tuple[int, int], _: tuple[int, int], flip: np.uint8) -> None:
-        self._flip, self._width = flip, shape[1]
-        self._image = _blocks(*shape)
-        picture = self._image[:, : shape[1]]
-        self._views: BothWays = {
-            SearchAxis.ALONG_Y: (self._image, picture.T),
-            SearchAxis.ALONG_X: (self._image, picture),
-        }
-
-    def take(self, plane: U8Array) -> BothWays:
-        _copy(*_memory(plane), self._width, self._flip, self._image)
-        return self._views
-
-
-class _HalvedPlane:
-    """One image plane: the means of neighbouring columns, and those of neighbouring rows."""
-
-    def __init__(self, shape: tuple[int, int], n_lines: tuple[int, int], flip: np.uint8) -> None:
+    def __init__(
+        self, shape: tuple[int, int], n_lines: tuple[int, int], line_px: int, flip: np.uint8
+    ) -> None:
         height, width = shape
-        self._flip, self._shape = flip, shape
-        self._n_lines = n_lines
-        self._columns, self._rows = _blocks(height, n_lines[0]), _blocks(n_lines[1], width)
-        self._views: BothWays = {
-            SearchAxis.ALONG_Y: (self._columns, self._columns[:, : n_lines[0]].T),
-            SearchAxis.ALONG_X: (self._rows, self._rows[:, :width]),
+        self._shape, self._flip = shape, flip
+        self._take = _copy if line_px == 1 else _halve
+        self._columns = margined(-(-n_lines[0] // SQUARE) * SQUARE, height)
+        self._rows = margined(n_lines[1], width)
+        self._slab: U8Array = np.zeros((SQUARE, len(self._columns)), np.uint8)
+        self._pieces: U8Array = np.empty((SQUARE, SQUARE), np.uint8)
+        self._views = {
+            SearchAxis.ALONG_Y: self._columns[: n_lines[0]],
+            SearchAxis.ALONG_X: self._rows,
         }
+        self._n_columns = n_lines[0]
 
-    def take(self, plane: U8Array) -> BothWays:
-        _halve(*_memory(plane), self._shape, self._flip, *self._n_lines, self._columns, self._rows)
+    def take(self, plane: U8Array) -> dict[SearchAxis, U8Array]:
+        self._take(
+            *_memory(plane),
+            self._shape,
+            self._flip,
+            self._n_columns,
+            self._slab,
+            self._pieces,
+            self._columns,
+            self._rows,
+        )
         return self._views
-
-
-def _blocks(height: int, width: int) -> U8Array:
-    return np.full((height, -(-width // BLOCK) * BLOCK), 255, np.uint8)
 
 
 def _memory(plane: U8Array) -> tuple[U8Array, int]:
@@ -130,11 +117,26 @@ def _mean(one: np.uint8, other: np.uint8) -> np.uint8:
 
 
 @borrowing_kernel
-def _copy(memory: U8Array, step: int, width: int, flip: np.uint8, image: U8Array) -> None:
-    for y in range(image.shape[0]):
-        line, out = memory[y * step : y * step + width], image[y]
+def _copy(
+    memory: U8Array,
+    step: int,
+    shape: tuple[int, int],
+    flip: np.uint8,
+    _: int,
+    slab: U8Array,
+    pieces: U8Array,
+    columns: U8Array,
+    rows: U8Array,
+) -> None:
+    """Copy rows, and turn columns into rows."""
+    height, width = shape
+    for y in range(height):
+        line, own, out = memory[y * step : y * step + width], slab[y % SQUARE], rows[y]
         for x in range(width):
-            out[x] = line[x] ^ flip
+            value = line[x] ^ flip
+            own[x] = value
+            out[x] = value
+        _turn_when_full(slab, pieces, y, height, columns)
 
 
 @borrowing_kernel
@@ -143,24 +145,36 @@ def _halve(
     step: int,
     shape: tuple[int, int],
     flip: np.uint8,
-    across: int,
-    down: int,
+    n_columns: int,
+    slab: U8Array,
+    pieces: U8Array,
     columns: U8Array,
     rows: U8Array,
 ) -> None:
     """Average columns two by two, and rows likewise, rounding up; an odd one stands for itself."""
     height, width = shape
-    pairs = min(across, width // 2)
-    for i in range((height + 1) // 2):
-        a, b = 2 * i, min(2 * i + 1, height - 1)
-        first, second = memory[a * step : a * step + width], memory[b * step : b * step + width]
-        if i < down:
-            out = rows[i]
+    pairs = min(n_columns, width // 2)
+    for y in range(height):
+        line, own = memory[y * step : y * step + width], slab[y % SQUARE]
+        for x in range(pairs):
+            own[x] = _mean(line[2 * x], line[2 * x + 1]) ^ flip
+        for x in range(pairs, n_columns):
+            own[x] = line[width - 1] ^ flip
+        if y % 2 == 0 and y // 2 < rows.shape[0]:
+            other = min(y + 1, height - 1)
+            below, out = memory[other * step : other * step + width], rows[y // 2]
             for x in range(width):
-                out[x] = _mean(first[x], second[x]) ^ flip
-        for y in range(a, b + 1):
-            line, out = memory[y * step : y * step + width], columns[y]
-            for x in range(pairs):
-                out[x] = _mean(line[2 * x], line[2 * x + 1]) ^ flip
-            for x in range(pairs, across):
-                out[x] = line[width - 1] ^ flip
+                out[x] = _mean(line[x], below[x]) ^ flip
+        _turn_when_full(slab, pieces, y, height, columns)
+
+
+@inline_borrowing_kernel
+def _turn_when_full(slab: U8Array, pieces: U8Array, y: int, height: int, columns: U8Array) -> None:
+    """Write the columns of a slab when row `y` of the picture was its last; 255 beyond the end."""
+    row = y % SQUARE
+    if y + 1 == height:
+        for i in range(row + 1, SQUARE):
+            slab[i, :] = np.uint8(255)
+    elif row + 1 < SQUARE:
+        return
+    turn_slab(slab, pieces, columns, y - row)
