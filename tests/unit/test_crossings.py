@@ -7,7 +7,8 @@ import pytest
 
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.measure import FitMethod, PostureMeter, _in_crossing
+from aqualvs.scanning.measure import FitMethod, PostureMeter
+from aqualvs.scanning.measure_kernels import in_crossing
 from aqualvs.scanning.search import plan_searches
 from aqualvs.simulation.example_rigs import example_rig
 from windowed_cases import windowed
@@ -29,7 +30,7 @@ def test_a_crossing_zone_follows_the_other_sheet(make_rig: Callable[[], Rig]) ->
     expected = np.abs(off_px) < 1.2 * 6.0 + 2.0
     found = np.array(
         [
-            _in_crossing(points, i, 0, meter._planes, meter._bent, width, rig.focal_px)
+            in_crossing(points, i, 0, meter._planes, meter._bent, width, rig.focal_px)
             for i in range(len(points))
         ]
     )

@@ -1,5 +1,7 @@
 """Readings: every return as a point of each laser that could have made it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from aqualvs.geometry.planes import Plane
@@ -119,12 +121,7 @@ def test_observations_are_weighed_by_light() -> None:
     readings = read(rig, returns_of(rig, [(WALL, everywhere)]))
     mine = readings.where(readings.stretch == readings.stretch[0])
     light = np.linspace(10.0, 100.0, len(mine))
-    shaded = Readings(
-        **{
-            name: light if name == "height" else getattr(mine, name)
-            for name in Readings.__dataclass_fields__
-        }
-    )
+    shaded = replace(mine, height=light)
     index = np.zeros(len(mine), np.int64)
     seen = shaded.observations(index, 1, WALL.normal)
     weight = light * mine.width

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.scanning.stretch_shape import StretchShapes, describe_stretches, is_curved, run_end
 
 # Position noise of a chunk's centroid beyond that: a floor that neighbouring returns share, and a
 # share of the spread, because a strand's light may be cut off on one side by a knot or the border.
@@ -20,58 +21,108 @@ _SPECK_LINES = 3.0
 
 
 @borrowing_kernel
-def number_chunks(chunk: IntArray, index: IntArray) -> int:
-    """Renumber ascending chunks without gaps, and count them."""
+def count_chunks(chunk: IntArray) -> int:
+    """Count chunks whose numbers ascend."""
     n = 0
     for i in range(chunk.shape[0]):
-        if i > 0 and chunk[i] != chunk[i - 1]:
-            n += 1
-        index[i] = n
-    return n + 1 if chunk.shape[0] else 0
+        n += i == 0 or chunk[i] != chunk[i - 1]
+    return n
 
 
 @kernel
-def chunk_facts(
-    index: IntArray,
+def chunk_readings(
+    chunk: IntArray,
     line: IntArray,
     laser: IntArray,
     stretch: IntArray,
     trust: FloatArray,
-    facts: IntArray,
-    voice: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    index: IntArray,
+    table: FloatArray,
     light: FloatArray,
+    facts: IntArray,
+) -> FloatArray:
+    """Summarise N readings in C chunks, whose numbers ascend.
+
+    Parameters
+    ----------
+    chunk, line, laser, stretch, trust, height, width, points, sensitivity
+        As in `Readings`.
+    index : int array, shape (N,)
+        Written: row of each reading's chunk.
+    table : array, shape (7, C), light : array, shape (C,)
+        Written, as in `Chunks`.
+    facts : int array, shape (4, C)
+        Written: (n_lines, first_line, last_line, laser).
+
+    Returns
+    -------
+    array, shape (6, S)
+        The stretches as `describe_stretches` tells them.
+    """
+    begin = 0
+    for c in range(light.shape[0]):
+        end = run_end(chunk, begin)
+        for i in range(begin, end):
+            index[i] = c
+        facts[0, c], facts[1, c], facts[2, c] = end - begin, line[begin], line[end - 1]
+        facts[3, c] = laser[begin]
+        light[c] = 0.0
+        for i in range(begin, end):
+            light[c] += trust[i]
+        _write_centroid(height, width, points, sensitivity, begin, end, table, c)
+        begin = end
+    shapes = describe_stretches(stretch, line, points, sensitivity, width, height)
+    _write_voices(facts[0], stretch, light, shapes, table[6])
+    return shapes
+
+
+@inline_borrowing_kernel
+def _write_centroid(
+    height: FloatArray,
+    width: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    begin: int,
+    end: int,
+    table: FloatArray,
+    c: int,
 ) -> None:
-    """Write (n_lines, first_line, last_line, laser), voice and light of each chunk."""
-    n_stretches = 0
-    for i in range(stretch.shape[0]):
-        n_stretches = max(n_stretches, stretch[i] + 1)
-    lines_of_stretch = np.zeros(n_stretches)
-    facts[0] = 0
-    for i in range(index.shape[0]):
-        c = index[i]
-        if facts[0, c] == 0:
-            facts[1, c] = line[i]
-            facts[3, c] = laser[i]
-        facts[0, c] += 1
-        light[c] += trust[i]
-        facts[2, c] = line[i]
-        lines_of_stretch[stretch[i]] += 1.0
-    stretches = lines_of_stretch[lines_of_stretch >= _SPECK_LINES]
-    typical = np.median(stretches) if stretches.shape[0] else 0.0
-    loudest = max(_LOUDEST_SHARE * typical, _LOUD_ENOUGH)
-    for i in range(index.shape[0]):
-        voice[index[i]] = light[index[i]] * min(1.0, loudest / lines_of_stretch[stretch[i]])
+    """Write the mean point and sensitivity of a chunk, weighted by the light in each return."""
+    total, x, y, z, jx, jy, jz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(begin, end):
+        light = height[i] * width[i]
+        total += light
+        x += light * points[i, 0]
+        y += light * points[i, 1]
+        z += light * points[i, 2]
+        jx += light * sensitivity[i, 0]
+        jy += light * sensitivity[i, 1]
+        jz += light * sensitivity[i, 2]
+    share = 1.0 / total
+    table[0, c], table[1, c], table[2, c] = share * x, share * y, share * z
+    table[3, c], table[4, c], table[5, c] = share * jx, share * jy, share * jz
 
 
 @kernel
-def hush(index: IntArray, stretch: IntArray, curved: BoolArray, voice: FloatArray) -> None:
-    """Lower the voice of chunks of curved stretches, in place."""
-    hushed = np.zeros(voice.shape[0], np.bool_)
-    for i in range(index.shape[0]):
-        c = index[i]
-        if curved[stretch[i]] and not hushed[c]:
+def _write_voices(
+    n_lines: IntArray, stretch: IntArray, light: FloatArray, table: FloatArray, voice: FloatArray
+) -> None:
+    """Write the voice of each chunk: its light, less where its stretch is long or curved."""
+    shapes = StretchShapes(table[0], table[1], table[2], table[3], table[4], table[5])
+    strands = shapes.n_lines[shapes.n_lines >= _SPECK_LINES]
+    typical = np.median(strands) if strands.shape[0] else 0.0
+    loudest = max(_LOUDEST_SHARE * typical, _LOUD_ENOUGH)
+    begin = 0
+    for c in range(n_lines.shape[0]):
+        s = stretch[begin]
+        voice[c] = light[c] * min(1.0, loudest / shapes.n_lines[s])
+        if is_curved(shapes, s):
             voice[c] *= _CURVED_VOICE
-            hushed[c] = True
+        begin += n_lines[c]
 
 
 @kernel
@@ -107,22 +158,27 @@ def summarise(
         group_sigma_px[c] += (light * sigma_px[i]) ** 2
         group_line[c] += light * line[i]
         group_laser[c] = laser[i]
+    middle = np.empty(n)
     for c in range(n):
+        share = 1.0 / total[c]
+        middle[c] = 0.0
         for k in range(3):
-            centroid[c, k] /= total[c]
-            mean_sensitivity[c, k] /= total[c]
-        group_sigma_px[c] /= total[c] * total[c]
-        group_line[c] /= total[c]
+            centroid[c, k] *= share
+            mean_sensitivity[c, k] *= share
+            middle[c] += normal[k] * centroid[c, k]
+        group_sigma_px[c] *= share * share
+        group_line[c] *= share
     for i in range(index.shape[0]):
         c = index[i]
-        if c < 0:
-            continue
-        offset = 0.0
+        if c >= 0:
+            off = -middle[c]
+            for k in range(3):
+                off += normal[k] * points[i, k]
+            spread[c] += height[i] * width[i] * off * off
+    for c in range(n):
         per_px = 0.0
         for k in range(3):
-            offset += normal[k] * (points[i, k] - centroid[c, k])
             per_px += normal[k] * mean_sensitivity[c, k]
-        spread[c] += height[i] * width[i] * (offset / per_px) ** 2
-    for c in range(n):
-        variance = group_sigma_px[c] + _SPREAD_SHARE**2 * spread[c] / total[c]
+        scatter = spread[c] / (total[c] * per_px * per_px)
+        variance = group_sigma_px[c] + _SPREAD_SHARE**2 * scatter
         group_sigma_px[c] = np.sqrt(variance + _CHUNK_FLOOR_PX**2)

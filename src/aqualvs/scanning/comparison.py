@@ -1,10 +1,13 @@
 """What ignoring the dome costs: the same stripe points, triangulated as if by a bare lens."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.plane_fit import SOLID_ERROR, fit_robust
-from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
+from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust, plane_of_all
+from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of, rested_on
 from aqualvs.scanning.scan import Scan
 from aqualvs.scanning.search import plan_searches
 from aqualvs.scanning.triangulate import Triangulator
@@ -42,27 +45,51 @@ class BareLensComparison:
         """
         if not scan.posture:
             return scan.posture
-        rows = np.flatnonzero(scan.points.used)[::_EVERY]
-        laser = scan.points.laser[rows].astype(np.int64)
-        pixels = scan.points.pixels[rows]
-        found = self._triangulator.triangulate(pixels, self._along_x[laser], laser)
-        if np.count_nonzero(found.valid) < _MIN_POINTS:
-            return Refusal(Reason.TOO_FEW_POINTS, "a bare lens would see too few of the points")
-        points, laser = found.points_in_dome[found.valid], laser[found.valid]
-        sigma_px = np.ones(len(points))
-        try:
-            start = np.linalg.solve(points.T @ points, points.sum(axis=0))
-        except np.linalg.LinAlgError:
-            return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
-        fit = fit_robust(
-            points,
-            found.sensitivity[found.valid],
-            sigma_px,
-            laser,
-            np.zeros(len(points)),
-            start,
-            SOLID_ERROR,
+        points = scan.points
+        most = -(-len(points) // _EVERY)
+        numbers, pixels = np.empty((3, most), np.int64), np.empty((most, 2))
+        n = _pick(points.used, points.laser, points.pixels, self._along_x, numbers, pixels)
+        found, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
+        rows, laser, along_x = numbers[:, :n]
+        # Every point is a group of its own: they are not neighbours.
+        all_valid = self._triangulator.triangulate_into(
+            pixels[:n], along_x, laser, rows, found, sensitivity, valid
         )
+        if not all_valid:
+            found, sensitivity, laser = found[valid], sensitivity[valid], laser[valid]
+        if len(found) < _MIN_POINTS:
+            return Refusal(Reason.TOO_FEW_POINTS, "a bare lens would see too few of the points")
+        fit = self._fit(found, sensitivity, laser)
         if fit is None:
             return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
-        return posture_from_fit(fit, points[fit.weights > 0.0], self._axis_in_dome)
+        n_points, nearest = rested_on(found, fit.weights)
+        return posture_of(fit, nearest, n_points, self._axis_in_dome)
+
+    @staticmethod
+    def _fit(points: FloatArray, sensitivity: FloatArray, laser: IntArray) -> PlaneFit | None:
+        n, start = len(points), np.empty(3)
+        if not plane_of_all(points, start):
+            return None
+        return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, SOLID_ERROR)
+
+
+@borrowing_kernel
+def _pick(
+    used: BoolArray,
+    laser: NDArray[np.int8],
+    pixels: FloatArray,
+    along_x_of: IntArray,
+    numbers: IntArray,
+    out_pixels: FloatArray,
+) -> int:
+    """Write row, laser and direction of search of some of the points used; how many there are."""
+    n, n_used = 0, 0
+    for i in range(used.shape[0]):
+        if not used[i]:
+            continue
+        if n_used % _EVERY == 0:
+            numbers[0, n], numbers[1, n], numbers[2, n] = i, laser[i], along_x_of[laser[i]]
+            out_pixels[n, 0], out_pixels[n, 1] = pixels[i, 0], pixels[i, 1]
+            n += 1
+        n_used += 1
+    return n

@@ -72,23 +72,45 @@ def describe_pattern(
     -------
     Pattern
     """
+    on_strands = np.zeros(n_lasers)
+    is_mesh, is_gappy, extent = _describe(
+        chunks.table,
+        chunks.light,
+        chunks.n_lines,
+        chunks.first_line,
+        chunks.last_line,
+        chunks.laser,
+        members,
+        min_lines,
+        focal_px,
+        on_strands,
+    )
+    return Pattern(is_mesh, is_gappy, extent, on_strands)
+
+
+@kernel
+def _describe(
+    table: FloatArray,
+    light: FloatArray,
+    n_lines: IntArray,
+    first_line: IntArray,
+    last_line: IntArray,
+    laser: IntArray,
+    members: BoolArray,
+    min_lines: int,
+    focal_px: float,
+    on_strands: FloatArray,
+) -> tuple[bool, bool, float]:
+    """Write the light on strands; returns the rest of a `Pattern`."""
     asked, broken, gappy, long, n_stretches = 0, 0, 0, 0, 0
     total = 0.0
-    on_strands = np.zeros(n_lasers)
-    for index in range(n_lasers):
-        mine = np.flatnonzero(members & (chunks.laser == index))
-        if chunks.n_lines[mine].sum() < min_lines:
+    for index in range(on_strands.shape[0]):
+        order, n_mine = _in_order(first_line, n_lines, laser, members, index)
+        if n_mine < min_lines:
             continue
         asked += 1
-        order = mine[np.argsort(chunks.first_line[mine])]
         n, duty, length, extent, on_strands[index] = _describe_stripe(
-            chunks.table,
-            chunks.light,
-            chunks.n_lines,
-            chunks.first_line,
-            chunks.last_line,
-            order,
-            focal_px,
+            table, light, n_lines, first_line, last_line, order, focal_px
         )
         n_stretches += n
         is_short = length < LONGEST_STRETCH
@@ -98,8 +120,28 @@ def describe_pattern(
         broken += is_gappy and duty < _MESH_DUTY
         total += extent if is_gappy else 0.0
     few = not long and gappy == broken and n_stretches >= _FEW_STRETCHES
-    is_mesh, is_gappy = (n >= min(2, asked) or few for n in (broken, gappy))
-    return Pattern(is_mesh, is_gappy, total, on_strands)
+    enough = min(2, asked)
+    return broken >= enough or few, gappy >= enough or few, total
+
+
+@kernel
+def _in_order(
+    first_line: IntArray, n_lines: IntArray, laser: IntArray, members: BoolArray, index: int
+) -> tuple[IntArray, int]:
+    """Return a laser's chunks on a surface in their order along the stripe, and their lines."""
+    order, n, total = np.empty(members.shape[0], np.int64), 0, 0
+    for c in range(members.shape[0]):
+        if not members[c] or laser[c] != index:
+            continue
+        # Chunks come almost in order.
+        at = n
+        while at > 0 and first_line[order[at - 1]] > first_line[c]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = c
+        n += 1
+        total += n_lines[c]
+    return order[:n], total
 
 
 @kernel

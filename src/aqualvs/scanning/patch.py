@@ -1,13 +1,21 @@
 """Patches: pieces of paraboloids over a plane, and the point of them nearest to the vehicle."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.quadric_kernels import heights_over
+from aqualvs.scanning.patch_kernels import (
+    COEFFICIENTS,
+    PACKED,
+    RIGHT,
+    UP,
+    carry_to_tangent,
+    heights_over,
+    write_flat,
+    write_tangent,
+)
 
 FLAT = np.zeros(6)
 """Coefficients (a, b, c, p, q, r) of a plane."""
@@ -16,8 +24,6 @@ FLAT = np.zeros(6)
 # its normal no farther off the vehicle's forward axis than 55 degrees.
 _BESIDE_VIEW = 0.6
 _FACING = 0.57
-# The nearest point is looked for in so many Newton steps.
-_FOOT_STEPS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +47,17 @@ class Patch:
 
     def height(self, points: FloatArray) -> FloatArray:
         """Return by how much points (N, 3) lie behind the patch, along the base's normal, in m."""
-        return heights_over(
-            points, self.base.normal, self.base.offset, self.right, self.up, self.coefficients
-        )
+        off = np.empty(len(points))
+        heights_over(points, self.packed(), off)
+        return off
 
     def packed(self) -> FloatArray:
         """Return the patch as 16 numbers for kernels: normal, offset, right, up, coefficients."""
-        return np.concatenate(
-            [self.base.normal, [self.base.offset], self.right, self.up, self.coefficients]
-        )
+        packed = np.empty(PACKED)
+        packed[:3], packed[3] = self.base.normal, self.base.offset
+        packed[RIGHT:UP], packed[UP:COEFFICIENTS] = self.right, self.up
+        packed[COEFFICIENTS:] = self.coefficients
+        return packed
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +84,15 @@ class PatchFit:
 
 def flat_patch(plane: Plane) -> Patch:
     """Return a plane as a patch: u to the right, v upward."""
-    a, b, c = plane.normal.tolist()
-    level = math.hypot(a, b)
-    right, ahead = b / level, -a / level
-    up = np.array([ahead * c, -right * c, right * b - ahead * a])
-    return Patch(plane, np.array([right, ahead, 0.0]), up, FLAT)
+    packed = packed_plane(plane)
+    return Patch(plane, packed[RIGHT:UP], packed[UP:COEFFICIENTS], FLAT)
+
+
+def packed_plane(plane: Plane) -> FloatArray:
+    """Return `flat_patch(plane).packed()`."""
+    packed = np.empty(PACKED)
+    write_flat(plane.normal, plane.offset, packed)
+    return packed
 
 
 def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
@@ -112,43 +124,12 @@ def nearest_tangent(patch: Patch) -> FloatArray | None:
     array, shape (3,), or None
         None where there is no such point: the net curls around the vehicle.
     """
-    a, b, c, p, q, r = patch.coefficients
-    u = v = 0.0
-    normal, right, up = patch.base.normal, patch.right, patch.up
-    for _ in range(_FOOT_STEPS):
-        h = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
-        slope_u, slope_v = b + p * u + q * v, c + q * u + r * v
-        # Half the squared distance is (u² + v² + (d + h)²) / 2.
-        reach = patch.base.offset + h
-        gradient = np.array([u + reach * slope_u, v + reach * slope_v])
-        hessian = np.array(
-            [
-                [1.0 + slope_u**2 + reach * p, slope_u * slope_v + reach * q],
-                [slope_u * slope_v + reach * q, 1.0 + slope_v**2 + reach * r],
-            ]
-        )
-        if np.linalg.det(hessian) <= 0.05 or hessian[0, 0] <= 0.05:
-            return None
-        step = np.linalg.solve(hessian, gradient)
-        u, v = u - step[0], v - step[1]
-    tangent = normal - slope_u * right - slope_v * up
-    tangent /= np.linalg.norm(tangent)
-    point = u * right + v * up + (patch.base.offset + h) * normal
-    m: FloatArray = tangent / float(tangent @ point)
-    return m
+    m = np.empty(3)
+    return m if write_tangent(patch.packed(), m) else None
 
 
 def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
     """Return the covariance (3, 3) of `nearest_tangent`, by differences of the coefficients."""
-    jacobian = np.zeros((3, 6))
-    for k in range(6):
-        step = 1e-4 * max(np.sqrt(fit.covariance[k, k]), 1e-6)
-        moved = fit.patch.coefficients.copy()
-        moved[k] += step
-        patch = Patch(fit.patch.base, fit.patch.right, fit.patch.up, moved)
-        other = nearest_tangent(patch)
-        if other is None:
-            return np.full((3, 3), np.inf)
-        jacobian[:, k] = (other - m) / step
-    covariance: FloatArray = jacobian @ fit.covariance @ jacobian.T
+    covariance = np.empty((3, 3))
+    carry_to_tangent(fit.patch.packed(), fit.covariance, m, covariance)
     return covariance

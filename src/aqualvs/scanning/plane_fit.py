@@ -1,5 +1,6 @@
 """Plane fits to triangulated stripes: the paper's pseudo-inverse and the robust default."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,11 +120,20 @@ def fit_robust(
     m = np.array(start, dtype=np.float64)
     covariance = np.empty((3, 3))
     weights = np.empty(len(points))
-    modes = np.array([shared.shift_px, shared.tilt_px])
+    modes = shared.shift_px, shared.tilt_px
     rms = _fit(points, sensitivity, sigma_px, laser, along, modes, m, covariance, weights)
-    if not (np.isfinite(rms) and np.isfinite(covariance).all()):
+    if not math.isfinite(rms):
         return None
     return PlaneFit(m, covariance, weights, rms)
+
+
+@kernel
+def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
+    """Write the m of m·X = 1 that fits points (N, 3) best, all alike; False if they fix none."""
+    normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    one = np.ones(points.shape[0])
+    _normal_equations(points, one, one, normal, right)
+    return solve_symmetric(normal, right, inverse, m)
 
 
 @kernel
@@ -169,7 +179,7 @@ def _fit(
     sigma_px: FloatArray,
     laser: IntArray,
     along: FloatArray,
-    modes: FloatArray,
+    modes: tuple[float, float],
     m: FloatArray,
     covariance: FloatArray,
     weights: FloatArray,
@@ -201,6 +211,8 @@ def _fit(
     _add_shared_error(
         points, sensitivity, sigma, weights, laser, along, modes, m, inverse, covariance
     )
+    if not np.isfinite(covariance).all():
+        return np.nan
     return _weighted_rms(sigma, z, weights, m)
 
 
@@ -235,7 +247,7 @@ def _add_shared_error(
     weights: FloatArray,
     laser: IntArray,
     along: FloatArray,
-    modes: FloatArray,
+    modes: tuple[float, float],
     m: FloatArray,
     inverse: FloatArray,
     covariance: FloatArray,
@@ -245,6 +257,7 @@ def _add_shared_error(
     for i in range(laser.shape[0]):
         n_lasers = max(n_lasers, laser[i] + 1)
     pull = np.zeros((n_lasers, 2, 3))
+    shift = np.empty(3)
     for i in range(points.shape[0]):
         per_px = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
         w = weights[i] * per_px / (sigma[i] * sigma[i])
@@ -253,7 +266,11 @@ def _add_shared_error(
             pull[laser[i], 1, k] += w * points[i, k] * along[i]
     for index in range(n_lasers):
         for mode in range(2):
-            shift = modes[mode] * (inverse @ pull[index, mode])
+            for j in range(3):
+                shift[j] = 0.0
+                for k in range(3):
+                    shift[j] += inverse[j, k] * pull[index, mode, k]
+                shift[j] *= modes[mode]
             for j in range(3):
                 for k in range(3):
                     covariance[j, k] += shift[j] * shift[k]

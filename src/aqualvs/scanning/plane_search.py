@@ -12,7 +12,12 @@ runs along memory and becomes vector instructions.
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inline_kernel,
+    kernel,
+)
 from aqualvs.geometry.symmetric import solve_symmetric
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
@@ -128,20 +133,62 @@ def _next_random(state: np.uint64) -> tuple[np.uint64, float]:
     return state, float(state >> np.uint64(11)) / 9007199254740992.0
 
 
-@inline_kernel
-def _pick(voice_up_to: FloatArray, draw: float) -> int:
+@inline_borrowing_kernel
+def _pick(voice_up_to: FloatArray, guide: IntArray, draw: float) -> int:
     """Draw a chunk with a probability in proportion to its voice."""
-    n = voice_up_to.shape[0]
-    wanted = draw * voice_up_to[n - 1]
-    low = 0
-    high = n - 1
-    while low < high:
-        middle = (low + high) // 2
-        if voice_up_to[middle] > wanted:
-            high = middle
+    wanted = draw * voice_up_to[voice_up_to.shape[0] - 1]
+    at = guide[int(draw * guide.shape[0])]
+    while at > 0 and voice_up_to[at - 1] > wanted:
+        at -= 1
+    while voice_up_to[at] <= wanted and at < voice_up_to.shape[0] - 1:
+        at += 1
+    return int(at)
+
+
+@borrowing_kernel
+def _guide(voice_up_to: FloatArray, guide: IntArray) -> None:
+    """Write where `_pick` begins to look, for draws in as many steps as there are chunks."""
+    n = guide.shape[0]
+    step = voice_up_to[n - 1] / n
+    at = 0
+    for k in range(n):
+        while at < n - 1 and voice_up_to[at] <= k * step:
+            at += 1
+        guide[k] = at
+
+
+@kernel
+def _middle_voice(voice: FloatArray) -> float:
+    """Return the voice that one half of all voice is in chunks with at most that of."""
+    values = voice.copy()
+    wanted, below = 0.5 * np.sum(voice), 0.0
+    low, high = 0, values.shape[0]
+    while high - low > 1:
+        pivot = values[(low + high) // 2]
+        # Softer ones to the front, louder ones to the end.
+        first, last, k = low, high, low
+        softer, same = 0.0, 0.0
+        while k < last:
+            one = values[k]
+            if one < pivot:
+                softer += one
+                values[k], values[first] = values[first], one
+                first += 1
+                k += 1
+            elif one > pivot:
+                last -= 1
+                values[k], values[last] = values[last], one
+            else:
+                same += one
+                k += 1
+        if below + softer >= wanted:
+            high = first
+        elif below + softer + same >= wanted:
+            return float(pivot)
         else:
-            low = middle + 1
-    return low
+            below += softer + same
+            low = last
+    return float(values[min(low, values.shape[0] - 1)])
 
 
 @kernel
@@ -150,16 +197,7 @@ def _loud(voice: FloatArray) -> IntArray:
 
     Where glare makes specks by the thousand, most neighbours on a stripe would be specks.
     """
-    order = np.argsort(voice)
-    wanted = 0.5 * np.sum(voice)
-    seen = 0.0
-    middle = 0.0
-    for k in range(order.shape[0]):
-        seen += voice[order[k]]
-        middle = voice[order[k]]
-        if seen >= wanted:
-            break
-    return np.flatnonzero(voice >= _SOFTEST_SHARE * middle)
+    return np.flatnonzero(voice >= _SOFTEST_SHARE * _middle_voice(voice))
 
 
 @kernel
@@ -197,6 +235,8 @@ def search_plane(
     loud = _loud(table[WEIGHT])
     n_loud = loud.shape[0]
     voice_up_to = np.cumsum(table[WEIGHT][loud])
+    guide = np.empty(n_loud, np.int64)
+    _guide(voice_up_to, guide)
     total = np.sum(table[WEIGHT])
     most = min(_MAX_HYPOTHESES, _MAX_WORK // n)
     needed = most
@@ -204,14 +244,15 @@ def search_plane(
     while trial < needed:
         trial += 1
         state, draw = _next_random(state)
-        at = _pick(voice_up_to, draw)
+        at = _pick(voice_up_to, guide, draw)
         state, draw = _next_random(state)
         beside = at + 1 + int(draw * _NEIGHBOURHOOD)
         state, draw = _next_random(state)
-        i, k = loud[at], loud[_pick(voice_up_to, draw)]
-        if beside >= n_loud or laser[i] != laser[loud[beside]] or laser[k] == laser[i]:
+        if beside >= n_loud or laser[loud[at]] != laser[loud[beside]]:
             continue
-        j = loud[beside]
+        i, j, k = loud[at], loud[beside], loud[_pick(voice_up_to, guide, draw)]
+        if laser[k] == laser[i]:
+            continue
         if not _plane_through(table, i, j, k, plane):
             continue
         if plane[3] < nearest or plane[3] > farthest or plane[1] < _MIN_FACING:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import borrowing_kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.plane_fit import PlaneFit
 
 # Beyond these a posture tells nothing that a pilot could use.
@@ -113,18 +113,26 @@ def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: Flo
     camera_axis_in_dome : array, shape (3,)
         Unit vector along which the camera looks.
     """
+    n_points, nearest = rested_on(points, np.ones(len(points)))
+    return posture_of(fit, nearest, n_points, camera_axis_in_dome)
+
+
+def posture_of(
+    fit: PlaneFit, nearest: float, n_points: int, camera_axis_in_dome: FloatArray
+) -> Posture:
+    """Do as `posture_from_fit` where the points are counted and the nearest of them is known."""
+    covariance, normal = np.empty((3, 3)), np.empty(3)
+    approach = _carry_over(fit.m, fit.covariance, camera_axis_in_dome, covariance, normal)
     distance, pitch, yaw = range_pitch_yaw(fit.m)
-    jacobian = _range_pitch_yaw_jacobian(fit.m)
-    approach = float(fit.m @ camera_axis_in_dome)
     return Posture(
         range=distance,
         pitch=pitch,
         yaw=yaw,
-        covariance=jacobian @ fit.covariance @ jacobian.T,
-        normal_in_dome=fit.m * distance,
+        covariance=covariance,
+        normal_in_dome=normal,
         slant_range=1.0 / approach if approach > 0.0 else float("inf"),
-        nearest=_nearest(points),
-        n_points=len(points),
+        nearest=nearest,
+        n_points=n_points,
         rms=fit.rms,
     )
 
@@ -141,8 +149,7 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
     """
     near, far = working_range
     distance = posture.range
-    variance = posture.covariance
-    sigma_range, sigma_pitch, sigma_yaw = (math.sqrt(variance[i, i]) for i in range(3))
+    sigma_range, sigma_pitch, sigma_yaw = map(math.sqrt, posture.covariance.diagonal().tolist())
     worst = max(sigma_pitch, sigma_yaw)
     if not (sigma_range <= _MAX_SIGMA_RANGE_SHARE * distance and worst <= _MAX_SIGMA_ANGLE):
         return Refusal(
@@ -168,25 +175,41 @@ def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
     return 1.0 / math.hypot(x, y, z), math.atan2(z, y), math.atan2(x, y)
 
 
-def _range_pitch_yaw_jacobian(m: FloatArray) -> FloatArray:
-    """Return the derivative (3, 3) of (range, pitch, yaw) by m."""
-    x, y, z = m.tolist()
-    yz, xy = y * y + z * z, x * x + y * y
-    cube = -(math.hypot(x, y, z) ** 3)
-    return np.array(
-        [
-            [x / cube, y / cube, z / cube],
-            [0.0, -z / yz, y / yz],
-            [y / xy, -x / xy, 0.0],
-        ]
-    )
+@kernel
+def _carry_over(
+    m: FloatArray,
+    covariance: FloatArray,
+    axis: FloatArray,
+    out_covariance: FloatArray,
+    out_normal: FloatArray,
+) -> float:
+    """Write the covariance of (range, pitch, yaw) and the unit normal; returns m along the axis."""
+    x, y, z = m[0], m[1], m[2]
+    yz, xy, square = y * y + z * z, x * x + y * y, x * x + y * y + z * z
+    length = np.sqrt(square)
+    # Derivative of (range, pitch, yaw) by m.
+    jacobian = np.zeros((3, 3))
+    for k in range(3):
+        jacobian[0, k] = -m[k] / (length * square)
+        out_normal[k] = m[k] / length
+    jacobian[1, 1], jacobian[1, 2] = -z / yz, y / yz
+    jacobian[2, 0], jacobian[2, 1] = y / xy, -x / xy
+    for i in range(3):
+        for j in range(3):
+            out_covariance[i, j] = 0.0
+            for k in range(3):
+                for n in range(3):
+                    out_covariance[i, j] += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
+    return float(m[0] * axis[0] + m[1] * axis[1] + m[2] * axis[2])
 
 
 @borrowing_kernel
-def _nearest(points: FloatArray) -> float:
-    """Return the smallest distance of points (N, 3) from the origin."""
-    square = np.inf
+def rested_on(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
+    """Count the points (N, 3) that have a weight; the distance of the nearest from the origin."""
+    n, square = 0, np.inf
     for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        square = min(square, x * x + y * y + z * z)
-    return float(np.sqrt(square))
+        if weights[i] > 0.0:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            square = min(square, x * x + y * y + z * z)
+            n += 1
+    return n, np.sqrt(square)

@@ -21,19 +21,12 @@ from aqualvs.scanning.patch import (
     PatchFit,
     flat_patch,
     nearest_tangent,
+    packed_plane,
     tangent_covariance,
 )
+from aqualvs.scanning.patch_kernels import COEFFICIENTS, RIGHT, UP
 from aqualvs.scanning.plane_fit import SharedError
-from aqualvs.scanning.quadric_kernels import (
-    GATE_PX,
-    GATE_SHARE,
-    N,
-    add_shared,
-    curvature_in_sigmas,
-    grow,
-    over_plane,
-    reweight,
-)
+from aqualvs.scanning.quadric_kernels import N, fit_over, hinted_curvature
 from aqualvs.scanning.readings import Observations
 
 __all__ = (
@@ -53,11 +46,6 @@ LEAST_BEND = 0.003
 """By so much of the range a net must bend where it is seen, or it is flat."""
 
 _WIDE_GATE = 3.0
-# The residual asks for curvature when it gains so much of the light or of the scatter ...
-_MORE_LIGHT = 1.10
-_LESS_SCATTER = 0.6
-# ... and the curvature is no chance.
-_SIGNIFICANT = 6.0
 _HINT = 2.0
 # Strands on a bend err together more than on a plane: found on simulated nets.
 _LOOSENED = 1.5
@@ -75,8 +63,9 @@ def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) ->
     plane : Plane
         The fit.
     """
-    terms, height, per_px = _over(seen, plane, flat_patch(plane))
-    return bool(curvature_in_sigmas(terms, height, per_px * seen.sigma_px, weights) > _HINT)
+    flat = packed_plane(plane)
+    hint = hinted_curvature(seen.points, seen.sensitivity, seen.sigma_px, weights, flat)
+    return bool(hint > _HINT)
 
 
 def fit_patch(
@@ -148,68 +137,25 @@ def _fit_over(
     least_bend: float = LEAST_BEND,
 ) -> _Attempt | None:
     """Fit a patch over a plane, grown from some observations or from those in so many gates."""
-    flat = flat_patch(plane)
-    terms, height, per_px = _over(seen, plane, flat)
-    gate = np.hypot(GATE_SHARE * plane.offset, GATE_PX * per_px)
-    sigma = per_px * seen.sigma_px
-    on_plane = np.abs(height) < gate
-    inside = np.abs(height) < start * gate if isinstance(start, float) else start.copy()
-    coefficients, weights, inverse = np.zeros(N), np.empty(len(height)), np.empty((N, N))
-    if not grow(terms, height, gate, inside, coefficients):
-        return None
-    scale, rms = reweight(terms, height, sigma, inside, coefficients, weights, inverse)
-    covariance = inverse * max(scale, 1.0) ** 2
-    pull = weights * per_px / sigma**2
-    add_shared(
-        terms,
-        pull,
-        seen.line,
-        seen.laser,
-        shared.shift_px,
-        shared.tilt_px,
-        inverse,
-        covariance,
-    )
-    fit = PatchFit(Patch(plane, flat.right, flat.up, coefficients), covariance, weights, rms)
-    asked = _asked_for(fit, terms, height, inside, on_plane, plane.offset, least_bend)
-    return _Attempt(fit, asked)
-
-
-def _over(
-    seen: Observations, plane: Plane, flat: Patch
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the terms of the observations' places, their heights, and these by the pixel."""
     n = len(seen.line)
-    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
-    over_plane(
+    inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
+    patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)
+    found, asked_for, rms = fit_over(
         seen.points,
         seen.sensitivity,
-        plane.normal,
-        plane.offset,
-        flat.right,
-        flat.up,
-        terms,
-        height,
-        per_px,
+        seen.sigma_px,
+        seen.line,
+        seen.laser,
+        start if isinstance(start, float) else 0.0,
+        shared.shift_px,
+        shared.tilt_px,
+        least_bend,
+        inside,
+        patch,
+        covariance,
+        weights,
     )
-    return terms, height, per_px
-
-
-def _asked_for(
-    fit: PatchFit,
-    terms: FloatArray,
-    height: FloatArray,
-    inside: BoolArray,
-    on_plane: BoolArray,
-    distance: float,
-    least_bend: float,
-) -> bool:
-    """Whether the residual of the plane asks for curvature."""
-    bend = terms[inside, 3:] @ fit.patch.coefficients[3:]
-    if np.ptp(bend) < least_bend * distance:
-        return False
-    sigmas = np.sqrt(np.diag(fit.covariance)[3:])
-    if np.abs(fit.patch.coefficients[3:] / sigmas).max() < _SIGNIFICANT:
-        return False
-    more = np.count_nonzero(inside) >= _MORE_LIGHT * np.count_nonzero(on_plane)
-    return bool(more or fit.rms < _LESS_SCATTER * np.sqrt(np.mean(height[inside] ** 2)))
+    if not found:
+        return None
+    bent = Patch(plane, patch[RIGHT:UP], patch[UP:COEFFICIENTS], patch[COEFFICIENTS:])
+    return _Attempt(PatchFit(bent, covariance, weights, rms), asked_for)

@@ -6,7 +6,8 @@ Systems of six unknowns are solved in less time than it takes to hand them to a 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.scanning.patch_kernels import COEFFICIENTS, NORMAL, OFFSET, RIGHT, UP
 
 N = 6
 """Coefficients a, b, c, p, q, r."""
@@ -23,73 +24,167 @@ _SIGMA_CURVATURE = 2.0
 _SIGMA_TWIST = 0.5
 # Steeper bends than a radius of half a metre are something else.
 _STRONGEST = 2.0
+# The residual asks for curvature when it gains so much of the light or of the scatter ...
+_MORE_LIGHT = 1.10
+_LESS_SCATTER = 0.6
+# ... and the curvature is no chance.
+_SIGNIFICANT = 6.0
 # A pivot below this share of its diagonal is rounding, not information.
 _SINGULAR = 1e-13
 
 
-@inline_borrowing_kernel
-def write_terms(u: float, v: float, terms: FloatArray) -> None:
-    """Write the terms of the height at (u, v), shape (6,)."""
-    terms[0], terms[1], terms[2] = 1.0, u, v
-    terms[3], terms[4], terms[5] = 0.5 * u * u, u * v, 0.5 * v * v
-
-
 @kernel
-def heights_over(
+def fit_over(
     points: FloatArray,
-    normal: FloatArray,
-    offset: float,
-    right: FloatArray,
-    up: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    line: FloatArray,
+    laser: IntArray,
+    gates: float,
+    shift_px: float,
+    tilt_px: float,
+    least_bend: float,
+    inside: BoolArray,
+    patch: FloatArray,
+    covariance: FloatArray,
+    weights: FloatArray,
+) -> tuple[bool, bool, float]:
+    """Fit a patch over its base plane, grown from what lies near the plane, or from `inside`.
+
+    Parameters
+    ----------
+    points, sensitivity, sigma_px, line, laser
+        Of M observations.
+    gates : float
+        The fit begins with what is so many gates from the base; 0 for what is marked.
+    shift_px, tilt_px : float
+        What each laser's stripe shares, as standard deviations.
+    least_bend : float
+        Share of the range by which the net must bend where it is seen.
+    inside : bool array, shape (M,)
+        Where the fit begins, unless `gates` says so; then what it has taken in.
+    patch : array, shape (16,)
+        The base, as `write_flat` writes it; completed by the coefficients.
+    covariance : array, shape (6, 6), weights : array, shape (M,)
+        Written.
+
+    Returns
+    -------
+    found, asked_for : bool
+        Whether there is a fit, and whether the base leaves too much over for a plane.
+    rms : float
+        Weighted root mean square distance from the patch, in metres.
+    """
+    n, coefficients = line.shape[0], patch[COEFFICIENTS:]
+    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
+    over_plane(points, sensitivity, patch, terms, height, per_px)
+    gate, sigma, pull, inverse = np.empty(n), np.empty(n), np.empty(n), np.empty((N, N))
+    by_range = GATE_SHARE * patch[OFFSET]
+    n_on_plane = 0
+    for i in range(n):
+        by_pixel = GATE_PX * per_px[i]
+        gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
+        sigma[i] = per_px[i] * sigma_px[i]
+        n_on_plane += abs(height[i]) < gate[i]
+        inside[i] = abs(height[i]) < gates * gate[i] if gates > 0.0 else inside[i]
+    if not grow(terms, height, gate, inside, coefficients):
+        return False, False, np.nan
+    scale, rms = reweight(terms, height, sigma, inside, coefficients, weights, inverse)
+    for j in range(N):
+        for k in range(N):
+            covariance[j, k] = inverse[j, k] * max(scale, 1.0) ** 2
+    for i in range(n):
+        pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
+    add_shared(terms, pull, line, laser, shift_px, tilt_px, inverse, covariance)
+    enough = least_bend * patch[OFFSET]
+    asked = _asked_for(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
+    return True, asked, rms
+
+
+@borrowing_kernel
+def _asked_for(
+    terms: FloatArray,
+    height: FloatArray,
+    inside: BoolArray,
     coefficients: FloatArray,
-) -> FloatArray:
-    """Return by how much points (N, 3) lie behind a patch, along its base's normal, in metres."""
-    a, b, c, p, q, r = coefficients
-    off = np.empty(points.shape[0])
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        u = right[0] * x + right[1] * y + right[2] * z
-        v = up[0] * x + up[1] * y + up[2] * z
-        height = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
-        off[i] = normal[0] * x + normal[1] * y + normal[2] * z - offset - height
-    return off
+    covariance: FloatArray,
+    n_on_plane: int,
+    least_bend: float,
+    rms: float,
+) -> bool:
+    """Tell whether the residual of the base plane asks for curvature."""
+    n_inside, square = 0, 0.0
+    least, most = np.inf, -np.inf
+    for i in range(height.shape[0]):
+        if inside[i]:
+            bend = 0.0
+            for k in range(3, N):
+                bend += terms[i, k] * coefficients[k]
+            least, most = min(least, bend), max(most, bend)
+            square += height[i] * height[i]
+            n_inside += 1
+    if most - least < least_bend:
+        return False
+    sigmas = 0.0
+    for k in range(3, N):
+        sigmas = max(sigmas, abs(coefficients[k]) / np.sqrt(covariance[k, k]))
+    if sigmas < _SIGNIFICANT:
+        return False
+    less = rms < _LESS_SCATTER * np.sqrt(square / n_inside)
+    return bool(n_inside >= _MORE_LIGHT * n_on_plane or less)
 
 
 @kernel
+def hinted_curvature(
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    weights: FloatArray,
+    patch: FloatArray,
+) -> float:
+    """Return the strongest curvature that M observations show over a patch's base, over its sigma.
+
+    0 for too few.
+    """
+    n = weights.shape[0]
+    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
+    over_plane(points, sensitivity, patch, terms, height, per_px)
+    for i in range(n):
+        per_px[i] *= sigma_px[i]
+    return curvature_in_sigmas(terms, height, per_px, weights)
+
+
+@borrowing_kernel
 def over_plane(
     points: FloatArray,
     sensitivity: FloatArray,
-    normal: FloatArray,
-    offset: float,
-    right: FloatArray,
-    up: FloatArray,
+    patch: FloatArray,
     terms: FloatArray,
     height: FloatArray,
     per_px: FloatArray,
 ) -> None:
-    """Write what a fit over a plane needs of M observations.
+    """Write what a fit over a patch's base needs of M observations.
 
     Parameters
     ----------
     points, sensitivity : array, shape (M, 3)
         In `dome`: metres, and m/px.
-    normal, offset
-        The plane.
-    right, up : array, shape (3,)
-        Unit vectors in it.
+    patch : array, shape (16,)
+        Whose base counts.
     terms : array, shape (M, 6)
         Written.
     height, per_px : array, shape (M,)
         Written: distance behind the plane, and its change by the stripe's position.
     """
     for i in range(points.shape[0]):
-        u, v, h, d = 0.0, 0.0, -offset, 0.0
+        u, v, h, d = 0.0, 0.0, -patch[OFFSET], 0.0
         for k in range(3):
-            u += right[k] * points[i, k]
-            v += up[k] * points[i, k]
-            h += normal[k] * points[i, k]
-            d += normal[k] * sensitivity[i, k]
-        write_terms(u, v, terms[i])
+            u += patch[RIGHT + k] * points[i, k]
+            v += patch[UP + k] * points[i, k]
+            h += patch[NORMAL + k] * points[i, k]
+            d += patch[NORMAL + k] * sensitivity[i, k]
+        terms[i, 0], terms[i, 1], terms[i, 2] = 1.0, u, v
+        terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v
         height[i], per_px[i] = h, abs(d)
 
 

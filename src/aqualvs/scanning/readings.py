@@ -1,27 +1,24 @@
 """Readings: every return, read as a point of each laser that could have made it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel
-from aqualvs.scanning.chunk_kernels import chunk_facts, hush, number_chunks, summarise
+from aqualvs.scanning.chunk_kernels import chunk_readings, count_chunks, summarise
 from aqualvs.scanning.chunks import Chunks
+from aqualvs.scanning.reading_kernels import N_MEASURES, N_NUMBERS, read_laser, value_at
 from aqualvs.scanning.search import SearchAxis, StripeSearch
-from aqualvs.scanning.segments import Segments, link_segments
 from aqualvs.scanning.stretch_shape import StretchShapes, stretch_shapes
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.triangulate import Triangulator
 
-# Position noise of a return: a floor (texture, compression), and what grey-level noise makes of
-# the two flanks of a stripe of given width and height.
-_FLOOR_PX = 0.1
-_FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
 # The best returns of a frame are those from this quantile on.
 _BEST_SHARE = 0.95
+_AXES = (SearchAxis.ALONG_X, SearchAxis.ALONG_Y)
 _NOTHING = np.empty(0)
+_NO_RETURNS = Returns(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 """The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
@@ -68,6 +65,8 @@ class Readings:
     trust: FloatArray
     points: FloatArray
     sensitivity: FloatArray
+    # Asked for by the search for surfaces and by the labels.
+    _shapes: StretchShapes | None = field(default=None, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -75,7 +74,7 @@ class Readings:
 
     def where(self, mask: BoolArray) -> "Readings":
         """Return the readings that a mask of shape (N,) selects."""
-        return Readings(*(getattr(self, item.name)[mask] for item in fields(self)))
+        return Readings(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
 
     def chunks(self) -> tuple[Chunks, IntArray]:
         """Summarise the chunks by their centroids.
@@ -87,23 +86,36 @@ class Readings:
         index : int array, shape (N,)
             Row of each reading's chunk.
         """
-        index = np.empty(len(self), np.int64)
-        n = number_chunks(self.chunk, index)
-        facts = np.empty((4, n), np.int64)
-        voice, light = np.empty(n), np.zeros(n)
-        chunk_facts(index, self.line, self.laser, self.stretch, self.trust, facts, voice, light)
-        curved = self.shapes().curved()
-        if curved.any():
-            hush(index, self.stretch, curved, voice)
-        pieces = self.observations(index, n, FORWARD)
-        table = np.vstack([pieces.points.T, pieces.sensitivity.T, voice])
+        n = count_chunks(self.chunk)
+        index, facts = np.empty(len(self), np.int64), np.empty((4, n), np.int64)
+        table, light = np.empty((7, n)), np.empty(n)
+        shapes = chunk_readings(
+            self.chunk,
+            self.line,
+            self.laser,
+            self.stretch,
+            self.trust,
+            self.height,
+            self.width,
+            self.points,
+            self.sensitivity,
+            index,
+            table,
+            light,
+            facts,
+        )
+        object.__setattr__(self, "_shapes", StretchShapes(*shapes))
         return Chunks(table, light, *facts), index
 
     def shapes(self) -> StretchShapes:
         """Describe the shape of every stretch."""
-        return stretch_shapes(
-            self.stretch, self.line, self.points, self.sensitivity, self.width, self.height
-        )
+        if self._shapes is None:
+            found = stretch_shapes(
+                self.stretch, self.line, self.points, self.sensitivity, self.width, self.height
+            )
+            object.__setattr__(self, "_shapes", found)
+            return found
+        return self._shapes
 
     def observations(self, index: IntArray, n: int, normal: FloatArray) -> "Observations":
         """Average groups of readings, weighted by the light in each return.
@@ -190,128 +202,54 @@ def read_returns(
     Readings
         Only those whose ray meets the laser's sheet in front of the camera.
     """
-    capacity = sum(len(returns[one.axis]) for one in searches if one.axis in returns)
-    numbers, measures = np.empty((6, capacity), np.int64), np.empty((4, capacity))
-    best = _best(returns)
+    along_x, along_y = (returns.get(axis, _NO_RETURNS) for axis in _AXES)
+    by_search = [along_x if one.axis is SearchAxis.ALONG_X else along_y for one in searches]
+    capacity = sum(map(len, by_search))
+    numbers, measures = np.empty((N_NUMBERS, capacity), np.int64), np.empty((N_MEASURES, capacity))
     pixels = np.empty((capacity, 2))
+    best_height = value_at(along_x.height, along_y.height, _BEST_SHARE)
+    best_green = value_at(along_x.green_fall, along_y.green_fall, _BEST_SHARE)
     n = 0
-    for i, search in enumerate(searches):
-        if search.axis in returns:
-            found = returns[search.axis]
-            segments = link_segments(found, search)
-            along_x = search.axis is SearchAxis.ALONG_X
-            n = _append(
-                i, along_x, found, segments, search.line_px, best, n, numbers, measures, pixels
-            )
+    for i, (search, found) in enumerate(zip(searches, by_search, strict=True)):
+        n = read_laser(
+            found.line,
+            found.position,
+            found.height,
+            found.width,
+            found.green_fall,
+            search.lowest,
+            search.highest,
+            search.slope_low,
+            search.slope_high,
+            i,
+            found is along_x,
+            search.line_px,
+            best_height,
+            best_green,
+            n,
+            numbers,
+            measures,
+            pixels,
+        )
+    points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
     source, laser, line, stretch, chunk, along = numbers[:, :n]
-    located = triangulator.triangulate(pixels[:n], along, laser, chunk)
+    height, width, sigma_px, trust = measures[:, :n]
+    pixels = pixels[:n]
+    all_valid = triangulator.triangulate_into(
+        pixels, along, laser, chunk, points, sensitivity, valid
+    )
     readings = Readings(
         source,
         laser,
         line,
         stretch,
         chunk,
-        pixels[:n],
-        measures[0, :n],
-        measures[1, :n],
-        measures[2, :n],
-        measures[3, :n],
-        located.points_in_dome,
-        located.sensitivity,
-    )
-    return readings if located.valid.all() else readings.where(located.valid)
-
-
-def _best(returns: Mapping[SearchAxis, Returns]) -> tuple[float, float]:
-    """Height and green fall of the frame's best returns."""
-    height = [one.height for one in returns.values()]
-    green = [one.green_fall for one in returns.values()]
-    return _high(np.concatenate(height or [_NOTHING])), _high(np.concatenate(green or [_NOTHING]))
-
-
-def _high(values: FloatArray) -> float:
-    if not len(values):
-        return 1.0
-    rank = int(_BEST_SHARE * (len(values) - 1))
-    return float(np.partition(values, rank)[rank])
-
-
-def _append(
-    laser: int,
-    along_x: bool,
-    found: Returns,
-    segments: Segments,
-    line_px: int,
-    best: tuple[float, float],
-    n: int,
-    numbers: IntArray,
-    measures: FloatArray,
-    pixels: FloatArray,
-) -> int:
-    """Append one laser's candidates to the columns from `n` on; returns the new count."""
-    _gather(
-        laser,
-        along_x,
-        line_px,
-        *best,
-        found.line,
-        found.position,
-        found.height,
-        found.width,
-        found.green_fall,
-        segments.order,
-        segments.stretch,
-        segments.chunk,
-        n,
-        numbers,
-        measures,
         pixels,
+        height,
+        width,
+        sigma_px,
+        trust,
+        points,
+        sensitivity,
     )
-    return n + len(segments.order)
-
-
-@borrowing_kernel
-def _gather(
-    laser: int,
-    along_x: bool,
-    line_px: int,
-    best_height: float,
-    best_green: float,
-    line: IntArray,
-    position: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    green_fall: FloatArray,
-    order: IntArray,
-    stretch: IntArray,
-    chunk: IntArray,
-    begin: int,
-    numbers: IntArray,
-    measures: FloatArray,
-    pixels: FloatArray,
-) -> None:
-    # Stretches and chunks of different lasers must differ.
-    first_stretch = 0
-    for i in range(begin):
-        first_stretch = max(first_stretch, numbers[3, i] + 1)
-    first_chunk = numbers[4, begin - 1] + 1 if begin > 0 else 0
-    across, along = (1, 0) if along_x else (0, 1)
-    for k in range(order.shape[0]):
-        i, r = begin + k, order[k]
-        # Returns of the two search directions get odd and even numbers.
-        numbers[0, i] = 2 * r + along_x
-        numbers[1, i] = laser
-        numbers[2, i] = line[r]
-        numbers[3, i] = first_stretch + stretch[k]
-        numbers[4, i] = first_chunk + chunk[k]
-        numbers[5, i] = along_x
-        measures[0, i] = height[r]
-        measures[1, i] = width[r]
-        measures[2, i] = np.hypot(_FLOOR_PX, _FLANK_NOISE * width[r] / height[r])
-        trust = min(height[r] / best_height, 1.0)
-        if green_fall[r] == green_fall[r]:
-            trust *= min(green_fall[r] / best_green, 1.0)
-        measures[3, i] = np.sqrt(trust)
-        # The middle of a search line that is several pixels wide.
-        pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
-        pixels[i, along] = position[r]
+    return readings if all_valid else readings.where(valid)

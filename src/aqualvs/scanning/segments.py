@@ -11,7 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    kernel,
+)
 from aqualvs.scanning.search import SLOPE_CELL, StripeSearch
 from aqualvs.scanning.stripe import Returns
 
@@ -65,7 +69,7 @@ def link_segments(returns: Returns, search: StripeSearch) -> Segments:
     Segments
     """
     numbers = np.empty((3, len(returns)), np.int64)
-    n = _segment(
+    n = segment_returns(
         returns.line,
         returns.position,
         search.lowest,
@@ -79,104 +83,157 @@ def link_segments(returns: Returns, search: StripeSearch) -> Segments:
 
 
 @kernel
+def segment_returns(
+    line: IntArray,
+    position: FloatArray,
+    lowest: IntArray,
+    highest: IntArray,
+    slope_low: FloatArray,
+    slope_high: FloatArray,
+    numbers: IntArray,
+) -> int:
+    """Write (order, stretch, chunk) as in `Segments`, shape (3, N); returns how many are kept."""
+    n = line.shape[0]
+    segment_of = np.empty(n, np.int64)
+    # First and last return of each segment, and how many it has.
+    first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    n_segments = _link(line, position, lowest, highest, segment_of, first, last, count)
+    start = _sort(segment_of, count[:n_segments], numbers)
+    n_kept = _drop_foreign(line, position, slope_low, slope_high, start, first, last, numbers)
+    root = _join(line, position, first[:n_kept], last[:n_kept])
+    order, stretch = numbers[0], numbers[1]
+    n = 0
+    for s in range(n_kept):
+        mine = root[s]
+        while True:
+            stretch[n] = mine
+            n += 1
+            if order[n - 1] == last[s]:
+                break
+    return n
+
+
+@inline_borrowing_kernel
+def _still_due(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: FloatArray) -> int:
+    """Say where segments are due on search line x; drop those that have ended, count the others."""
+    kept = 0
+    for k in range(n_alive):
+        step = x - alive[1, k]
+        if step <= _MAX_LINE_STEP:
+            if kept != k:
+                for j in range(alive.shape[0]):
+                    alive[j, kept] = alive[j, k]
+                for j in range(track.shape[0]):
+                    track[j, kept] = track[j, k]
+            due[kept] = track[0, kept] + track[1, kept] * step
+            kept += 1
+    return kept
+
+
+@kernel
 def _link(
     line: IntArray,
     position: FloatArray,
     lowest: IntArray,
     highest: IntArray,
     segment_of: IntArray,
+    first: IntArray,
+    last: IntArray,
+    count: IntArray,
 ) -> int:
     """Give each return the segment that it continues, or a new one; -1 outside the band."""
     n = line.shape[0]
-    last_line = np.empty(n, np.int64)
-    last_position = np.empty(n)
-    slope = np.zeros(n)
-    count = np.zeros(n, np.int64)
-    alive = np.empty(n, np.int64)
+    # Segments that may go on: number and last line; last position, slope and how far the next
+    # return may change it; and where they are due on this search line.
+    alive, track, due = np.empty((2, n), np.int64), np.empty((3, n)), np.empty(n)
     n_alive = 0
     n_segments = 0
+    here = -1
     for i in range(n):
-        x = line[i]
+        x, place = line[i], position[i]
         segment_of[i] = -1
-        if position[i] < lowest[x] or position[i] > highest[x]:
+        if place < lowest[x] or place > highest[x]:
             continue
-        kept = 0
+        if x != here:
+            n_alive = _still_due(x, n_alive, alive, track, due)
+            here = x
         best = -1
         best_miss = _LINK_GATE_PX
         for k in range(n_alive):
-            s = alive[k]
-            step = x - last_line[s]
-            if step > _MAX_LINE_STEP:
-                continue
-            alive[kept] = s
-            kept += 1
-            if step == 0:
-                continue
-            miss = abs(position[i] - last_position[s] - slope[s] * step)
-            if miss < best_miss:
-                best, best_miss = s, miss
-        n_alive = kept
+            miss = abs(place - due[k])
+            best = k if miss < best_miss else best
+            best_miss = min(miss, best_miss)
         if best < 0:
-            best = n_segments
+            s, best = n_segments, n_alive
+            alive[0, best], first[s], count[s] = s, i, 1
+            track[1, best], track[2, best] = 0.0, 1.0
             n_segments += 1
-            alive[n_alive] = best
             n_alive += 1
         else:
-            step = x - last_line[best]
-            seen = (position[i] - last_position[best]) / step
-            gain = max(1.0 / count[best], 0.15)
-            slope[best] += gain * (seen - slope[best])
-        last_line[best] = x
-        last_position[best] = position[i]
-        count[best] += 1
-        segment_of[i] = best
+            s = alive[0, best]
+            # The way to the last return is one search line or two.
+            seen = (place - track[0, best]) * (1.0 if x - alive[1, best] == 1 else 0.5)
+            track[1, best] += track[2, best] * (seen - track[1, best])
+            count[s] += 1
+            track[2, best] = max(1.0 / count[s], 0.15)
+        # A segment has one return on a search line.
+        alive[1, best], track[0, best], due[best] = x, place, np.inf
+        segment_of[i], last[s] = s, i
     return n_segments
 
 
 @kernel
-def _group(
-    line: IntArray,
-    position: FloatArray,
-    segment_of: IntArray,
-    slope_low: FloatArray,
-    slope_high: FloatArray,
-    start: IntArray,
-    order: IntArray,
-    segment: IntArray,
-    chunk: IntArray,
-) -> int:
-    """Sort by segment, counting, and keep the segments whose direction is possible."""
-    n_segments = start.shape[0] - 1
-    for i in range(segment_of.shape[0]):
-        if segment_of[i] >= 0:
-            start[segment_of[i] + 1] += 1
+def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
+    """Sort the returns by segment into the first row of `numbers`; where each segment begins."""
+    n_segments = count.shape[0]
+    start, fill = np.empty(n_segments + 1, np.int64), np.empty(n_segments, np.int64)
+    start[0] = 0
     for s in range(n_segments):
-        start[s + 1] += start[s]
-    grouped = np.empty(start[n_segments], np.int64)
-    fill = start[:-1].copy()
+        fill[s] = start[s]
+        start[s + 1] = start[s] + count[s]
     for i in range(segment_of.shape[0]):
         s = segment_of[i]
         if s >= 0:
-            grouped[fill[s]] = i
+            numbers[0, fill[s]] = i
             fill[s] += 1
-    n = 0
-    n_chunks = 0
-    n_kept_segments = 0
-    for s in range(n_segments):
-        members = grouped[start[s] : start[s + 1]]
-        if not _direction_possible(line, position, members, slope_low, slope_high):
-            continue
-        n_pieces = 1
-        if members.shape[0] >= _LONG_SEGMENT:
-            n_pieces = (members.shape[0] + CHUNK_LINES - 1) // CHUNK_LINES
-        for k in range(members.shape[0]):
-            order[n] = members[k]
-            segment[n] = n_kept_segments
-            chunk[n] = n_chunks + k * n_pieces // members.shape[0]
-            n += 1
-        n_chunks += n_pieces
-        n_kept_segments += 1
-    return n
+    return start
+
+
+@kernel
+def _drop_foreign(
+    line: IntArray,
+    position: FloatArray,
+    slope_low: FloatArray,
+    slope_high: FloatArray,
+    start: IntArray,
+    first: IntArray,
+    last: IntArray,
+    numbers: IntArray,
+) -> int:
+    """Keep the segments whose direction is possible, and count them; number their chunks."""
+    order, chunk = numbers[0], numbers[2]
+    n, n_chunks, n_kept = 0, 0, 0
+    for s in range(start.shape[0] - 1):
+        begin, size = start[s], start[s + 1] - start[s]
+        if size >= _LONG_SEGMENT:
+            members = order[begin : begin + size]
+            if not _direction_possible(line, position, members, slope_low, slope_high):
+                continue
+            n_pieces = (size + CHUNK_LINES - 1) // CHUNK_LINES
+            for k in range(size):
+                chunk[n + k] = n_chunks + k * n_pieces // size
+            n_chunks += n_pieces
+        else:
+            for k in range(size):
+                chunk[n + k] = n_chunks
+            n_chunks += 1
+        if n < begin:
+            for k in range(size):
+                order[n + k] = order[begin + k]
+        n += size
+        first[n_kept], last[n_kept] = first[s], last[s]
+        n_kept += 1
+    return n_kept
 
 
 @kernel
@@ -187,10 +244,8 @@ def _direction_possible(
     slope_low: FloatArray,
     slope_high: FloatArray,
 ) -> bool:
-    """Whether a segment runs as its laser's stripe can; always so for a short one."""
+    """Whether a long segment runs as its laser's stripe can."""
     n = members.shape[0]
-    if n < _LONG_SEGMENT:
-        return True
     mean_line = 0.0
     mean_position = 0.0
     for k in range(n):
@@ -213,51 +268,42 @@ def _direction_possible(
 
 
 @kernel
-def _join(
-    line: IntArray, position: FloatArray, order: IntArray, segment: IntArray, stretch: IntArray
-) -> None:
-    """Give one number to segments whose ends meet, transitively."""
-    n = order.shape[0]
-    n_segments = segment[n - 1] + 1 if n else 0
-    first = np.empty(n_segments, np.int64)
-    last = np.empty(n_segments, np.int64)
-    for k in range(n):
-        if k == 0 or segment[k] != segment[k - 1]:
-            first[segment[k]] = order[k]
-        last[segment[k]] = order[k]
-    root = np.arange(n_segments)
-    for a in range(n_segments):
-        for b in range(n_segments):
-            step = line[first[b]] - line[last[a]]
-            if (
-                a != b
-                and abs(step) <= _JOIN_LINES
-                and abs(position[first[b]] - position[last[a]]) <= _JOIN_PX
-            ):
-                low, high = min(root[a], root[b]), max(root[a], root[b])
-                for c in range(n_segments):
-                    if root[c] == high:
-                        root[c] = low
-    for k in range(n):
-        stretch[k] = root[segment[k]]
+def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray) -> IntArray:
+    """Give one number to segments whose ends meet, transitively: that of the first of them.
+
+    `first` and `last` are the returns at the segments' ends; segments are ordered by the first.
+    """
+    n = first.shape[0]
+    root = np.arange(n)
+    for a in range(n):
+        end, place = line[last[a]], position[last[a]]
+        b = _first_from(line, first, end - _JOIN_LINES)
+        while b < n and line[first[b]] <= end + _JOIN_LINES:
+            if a != b and abs(position[first[b]] - place) <= _JOIN_PX:
+                one, other = _root_of(root, a), _root_of(root, b)
+                root[max(one, other)] = min(one, other)
+            b += 1
+    for a in range(n):
+        # Roots come before what hangs on them.
+        root[a] = root[root[a]]
+    return root
 
 
-@kernel
-def _segment(
-    line: IntArray,
-    position: FloatArray,
-    lowest: IntArray,
-    highest: IntArray,
-    slope_low: FloatArray,
-    slope_high: FloatArray,
-    numbers: IntArray,
-) -> int:
-    """Write (order, stretch, chunk) of the kept returns; returns how many they are."""
-    n = line.shape[0]
-    segment_of, segment = np.empty(n, np.int64), np.empty(n, np.int64)
-    n_segments = _link(line, position, lowest, highest, segment_of)
-    order, stretch, chunk = numbers[0], numbers[1], numbers[2]
-    start = np.zeros(n_segments + 1, np.int64)
-    n_kept = _group(line, position, segment_of, slope_low, slope_high, start, order, segment, chunk)
-    _join(line, position, order[:n_kept], segment[:n_kept], stretch)
-    return n_kept
+@borrowing_kernel
+def _first_from(line: IntArray, first: IntArray, wanted: int) -> int:
+    """Return the first segment that begins on the wanted search line or after it."""
+    low, high = 0, first.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if line[first[middle]] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inline_borrowing_kernel
+def _root_of(root: IntArray, a: int) -> int:
+    while root[a] != a:
+        a = root[a]
+    return a

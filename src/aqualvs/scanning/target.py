@@ -38,6 +38,10 @@ def choose_target(
     wall behind the net, lit through its openings, may look broken as well. A handful of left-over
     points that look like a mesh is no net beside a wall that fills the picture.
     """
+    if len(surfaces) == 1:
+        only = surfaces[0]
+        fits = kind is TargetKind.AUTO or (kind is TargetKind.NET) == only.is_mesh
+        return only if fits else None
     near, far = working_range
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.voice for surface in surfaces), default=0.0)
@@ -53,11 +57,9 @@ def choose_target(
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.support, default=None)
     net = _nearest_far_reaching(meshes)
-    return {
-        TargetKind.AUTO: net or solid,
-        TargetKind.NET: net,
-        TargetKind.SOLID: solid,
-    }[kind]
+    if kind is TargetKind.NET:
+        return net
+    return solid if kind is TargetKind.SOLID or net is None else net
 
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_kernel, kernel
-from aqualvs.optics.camera import Camera
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.optics.camera import Camera, CameraParams
+from aqualvs.optics.rays_batch import rays_all
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import packed_sheets
 from aqualvs.optics.sheet_kernels import START, WINDOWED, meet_sheet
@@ -50,9 +51,10 @@ class Triangulator:
 
     def __init__(self, rig: Rig, camera: Camera) -> None:
         self._camera = camera
-        self._sheets = packed_sheets(rig, camera)
-        self._planes = np.ascontiguousarray(self._sheets[:, START : START + 4])
-        self._bent = bool(self._sheets[:, WINDOWED].any())
+        sheets = packed_sheets(rig, camera)
+        self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
+        # A kernel that is given None is compiled without the way to bent sheets.
+        self._bent = sheets if sheets[:, WINDOWED].any() else None
 
     def triangulate(
         self,
@@ -76,22 +78,67 @@ class Triangulator:
             of them; over a few pixels of one stripe it hardly changes.
         """
         n = len(pixels)
-        rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
-        n_rays = _place_rays(
-            pixels, along_x, np.arange(n) if group is None else group, rays_px, owner
-        )
-        origins, directions = np.empty((n_rays, 3)), np.empty((n_rays, 3))
-        seen = np.empty(n_rays, np.bool_)
-        self._camera.rays_into(rays_px[:n_rays], origins, directions, seen)
         points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-        _intersect_planes(
-            self._planes, laser, owner, origins, directions, seen, points, sensitivity, valid
-        )
-        if self._bent:
-            _intersect_bent_sheets(
-                self._sheets, laser, owner, origins, directions, seen, points, sensitivity, valid
-            )
+        if group is None:
+            group = np.arange(n)
+        self.triangulate_into(pixels, along_x, laser, group, points, sensitivity, valid)
         return Triangulation(points, sensitivity, valid)
+
+    def triangulate_into(
+        self,
+        pixels: FloatArray,
+        along_x: IntArray,
+        laser: IntArray,
+        group: IntArray,
+        out_points: FloatArray,
+        out_sensitivity: FloatArray,
+        out_valid: BoolArray,
+    ) -> bool:
+        """Do as `triangulate`, into arrays (N, 3), (N, 3) and (N); tell whether all are valid."""
+        all_valid: bool = _triangulate(
+            self._camera.params,
+            self._planes,
+            self._bent,
+            pixels,
+            along_x,
+            laser,
+            group,
+            out_points,
+            out_sensitivity,
+            out_valid,
+        )
+        return all_valid
+
+
+@kernel
+def _triangulate(
+    camera: CameraParams,
+    planes: FloatArray,
+    bent: FloatArray | None,
+    pixels: FloatArray,
+    along_x: IntArray,
+    laser: IntArray,
+    group: IntArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    valid: BoolArray,
+) -> bool:
+    """Trace the pixels and meet the sheets; tell whether all points are valid."""
+    n = pixels.shape[0]
+    rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
+    n_rays = _place_rays(pixels, along_x, group, rays_px, owner)
+    origins, directions = np.empty((n_rays, 3)), np.empty((n_rays, 3))
+    seen = np.empty(n_rays, np.bool_)
+    rays_all(camera, rays_px[:n_rays], origins, directions, seen)
+    _intersect_planes(planes, laser, owner, origins, directions, seen, points, sensitivity, valid)
+    if bent is not None:
+        _intersect_bent_sheets(
+            bent, laser, owner, origins, directions, seen, points, sensitivity, valid
+        )
+    all_valid = True
+    for i in range(n):
+        all_valid &= valid[i]
+    return all_valid
 
 
 @borrowing_kernel
@@ -119,7 +166,7 @@ def _place_rays(
     return int(n_rays)
 
 
-@kernel
+@borrowing_kernel
 def _intersect_planes(
     planes: FloatArray,
     laser: IntArray,
@@ -132,33 +179,38 @@ def _intersect_planes(
     valid: BoolArray,
 ) -> None:
     """Intersect the rays with n·X = d (Eq. 20); the first of a group has a moved ray as well."""
-    slope = np.full(3, np.nan)
+    sx, sy, sz = np.nan, np.nan, np.nan
     for i in range(points.shape[0]):
-        nx, ny, nz, offset = planes[laser[i]]
-        reach = _distance_to_sheet(origins[i], directions[i], nx, ny, nz, offset)
+        plane = laser[i]
+        reach = _distance_to_sheet(origins, directions, i, planes, plane)
         hit = seen[i] and 0.0 < reach < np.inf
-        for k in range(3):
-            points[i, k] = origins[i, k] + reach * directions[i, k] if hit else np.nan
+        x = origins[i, 0] + reach * directions[i, 0] if hit else np.nan
+        y = origins[i, 1] + reach * directions[i, 1] if hit else np.nan
+        z = origins[i, 2] + reach * directions[i, 2] if hit else np.nan
         j = owner[i]
         if i == 0 or j != owner[i - 1]:
-            moved = _distance_to_sheet(origins[j], directions[j], nx, ny, nz, offset)
-            known = hit and seen[j] and 0.0 < moved < np.inf
-            for k in range(3):
-                other = origins[j, k] + moved * directions[j, k]
-                slope[k] = (other - points[i, k]) / _DIFFERENCE_PX if known else np.nan
-        valid[i] = hit and slope[0] == slope[0]
-        for k in range(3):
-            sensitivity[i, k] = slope[k]
-            if not valid[i]:
-                points[i, k] = np.nan
+            moved = _distance_to_sheet(origins, directions, j, planes, plane)
+            moved = moved if seen[j] and 0.0 < moved < np.inf else np.nan
+            sx = (origins[j, 0] + moved * directions[j, 0] - x) / _DIFFERENCE_PX
+            sy = (origins[j, 1] + moved * directions[j, 1] - y) / _DIFFERENCE_PX
+            sz = (origins[j, 2] + moved * directions[j, 2] - z) / _DIFFERENCE_PX
+        known = hit and sx == sx
+        valid[i] = known
+        points[i, 0] = x if known else np.nan
+        points[i, 1] = y if known else np.nan
+        points[i, 2] = z if known else np.nan
+        sensitivity[i, 0], sensitivity[i, 1], sensitivity[i, 2] = sx, sy, sz
 
 
-@inline_kernel
+@inline_borrowing_kernel
 def _distance_to_sheet(
-    origin: FloatArray, direction: FloatArray, nx: float, ny: float, nz: float, offset: float
+    origins: FloatArray, directions: FloatArray, i: int, planes: FloatArray, plane: int
 ) -> float:
-    approach = nx * direction[0] + ny * direction[1] + nz * direction[2]
-    return float((offset - nx * origin[0] - ny * origin[1] - nz * origin[2]) / approach)
+    """Return how far ray i is from the plane, along itself."""
+    nx, ny, nz = planes[plane, 0], planes[plane, 1], planes[plane, 2]
+    approach = nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2]
+    behind = nx * origins[i, 0] + ny * origins[i, 1] + nz * origins[i, 2] - planes[plane, 3]
+    return float(-behind / approach)
 
 
 @borrowing_kernel

@@ -1,0 +1,70 @@
+"""Kernels that find by a shortcut what sorting or dividing finds as well."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.light_cells import lit_cells, number_cells
+from aqualvs.scanning.plane_search import _guide, _middle_voice, _pick
+from aqualvs.scanning.reading_kernels import value_at
+
+# Grey levels, repeated ones among them, and what lies outside of any picture's.
+LEVELS = st.floats(0.0, 300.0) | st.sampled_from([0.0, 12.0, 12.5, 80.0, 255.75, 256.0, np.nan])
+VOICES = arrays(np.float64, st.integers(1, 60), elements=st.integers(1, 40).map(float))
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    arrays(np.float64, st.integers(0, 40), elements=LEVELS),
+    arrays(np.float64, st.integers(0, 40), elements=LEVELS),
+    st.sampled_from([0.0, 0.5, 0.9, 0.95, 1.0]),
+)
+def test_a_quantile_is_the_value_that_sorting_gives(
+    one: FloatArray, other: FloatArray, share: float
+) -> None:
+    both = np.sort(np.concatenate([one, other]))
+    expected = both[int(share * (len(both) - 1))] if len(both) else 1.0
+    np.testing.assert_equal(value_at(one, other, share), expected)
+
+
+@settings(deadline=None, max_examples=200)
+@given(VOICES)
+def test_half_of_all_voice_is_at_most_as_loud_as_the_middle_one(voice: FloatArray) -> None:
+    # Whole numbers add up exactly in any order.
+    ordered = np.sort(voice)
+    expected = ordered[np.searchsorted(np.cumsum(ordered), 0.5 * voice.sum())]
+    assert _middle_voice(voice) == expected
+
+
+@settings(deadline=None, max_examples=100)
+@given(VOICES, st.lists(st.floats(0.0, 1.0, exclude_max=True), min_size=1, max_size=50))
+def test_chunks_are_drawn_in_proportion_to_their_voice(
+    voice: FloatArray, draws: list[float]
+) -> None:
+    up_to = np.cumsum(voice)
+    guide = np.empty(len(voice), np.int64)
+    _guide(up_to, guide)
+    found = [_pick(up_to, guide, draw) for draw in draws]
+    expected = np.searchsorted(up_to, np.array(draws) * up_to[-1], side="right")
+    np.testing.assert_array_equal(found, expected.clip(max=len(voice) - 1))
+
+
+@pytest.mark.parametrize("size_px", [(720, 576), (1920, 1080)])
+def test_cells_are_six_pixels_wide_and_light_their_neighbours(size_px: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    pixels = rng.uniform((-0.5, -0.5), np.array(size_px) - 0.5, (3000, 2))
+    # Search lines are whole numbers, so that many readings lie on borders of cells.
+    pixels[::2, 0], pixels[1::2, 1] = np.rint(pixels[::2, 0]), np.rint(pixels[1::2, 1])
+    cell = np.empty(len(pixels), np.int64)
+    n_cells, n_columns = number_cells(pixels, cell)
+    row, column = np.maximum(pixels.astype(np.int64), 0).T[::-1] // 6
+    np.testing.assert_array_equal(cell, (row + 1) * n_columns + column + 1)
+    explained = rng.random(len(pixels)) < 0.1
+    lit = lit_cells(cell, explained, n_cells, n_columns)[cell] != 0
+    near_row = np.abs(row[:, None] - row[explained]) <= 1
+    near_column = np.abs(column[:, None] - column[explained]) <= 1
+    np.testing.assert_array_equal(lit, (near_row & near_column).any(axis=1))
+    assert 0.05 < lit.mean() < 0.9
