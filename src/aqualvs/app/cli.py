@@ -4,6 +4,7 @@ Bodies live in their own modules and are imported when their command runs, so th
 neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
 """
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -27,6 +28,9 @@ from aqualvs.errors import AqualvsError
 # Matrices here are small: threads of the linear algebra gain nothing, and where another process
 # keeps the cores busy they wait for each other twenty times as long. Before NumPy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# No plugin of Pydantic has anything to do here, and to look for one reads what every package that
+# is installed says of itself.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 app = typer.Typer(
     name="aqualvs",
@@ -157,6 +161,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     exit_code : int
         0, or 2 for bad input, or 128 + signal for a run that was stopped.
     """
+    code = _exit_code(arguments)
+    if arguments is None:
+        # The process ends here. To look once more through all that was imported for what refers to
+        # itself would take a third of a second.
+        gc.freeze()
+    return code
+
+
+def _exit_code(arguments: Sequence[str] | None) -> int:
     try:
         listed = None if arguments is None else list(arguments)
         code = app(args=listed, prog_name="aqualvs", standalone_mode=False)

@@ -1,34 +1,27 @@
-"""The net's condition over a dive: from scans, one by one, to the files that tell of it."""
+"""The net's condition over a dive: from scans, one by one, to the files that tell of it.
+
+What evaluates and draws is imported where it is used: every run reads this module, few want a net.
+"""
 
 from array import array
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from aqualvs import __version__
 from aqualvs.app.disk import writing
-from aqualvs.app.net_log import LaidLog, lay_log, open_log
-from aqualvs.app.net_map import draw_map
-from aqualvs.app.net_places import place_net
-from aqualvs.app.net_seen import DivePostures
-from aqualvs.app.net_tables import (
-    HOLE_COLUMNS,
-    NET_COLUMNS,
-    hole_rows,
-    stretch_rows,
-    write_geojson,
-    write_table,
-)
-from aqualvs.app.net_wall import NetWall, unroll
-from aqualvs.app.net_words import net_facts, net_lines
 from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG, NET_MAP_SVG
 from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.net_condition import NetCondition, NetConditionOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
+
+if TYPE_CHECKING:
+    from aqualvs.app.net_log import LaidLog
+    from aqualvs.app.net_wall import NetWall
+    from aqualvs.scanning.net_condition import NetConditionOptions
 
 # The posture is that of a net if so much of what it rests on is net.
 _NET_SHARE = 0.5
@@ -51,7 +44,7 @@ class NetRequest:
     """
 
     twine_mm: float | None = None
-    stretch_m: float = NetConditionOptions().stretch
+    stretch_m: float = 0.5
     log: Path | None = None
     log_offset_s: float | None = None
 
@@ -63,8 +56,10 @@ class NetRequest:
         if self.log_offset_s is not None and not np.isfinite(self.log_offset_s):
             raise OptionError(f"--log-offset-s {self.log_offset_s:g}: give a number of seconds")
 
-    def options(self) -> NetConditionOptions:
+    def options(self) -> "NetConditionOptions":
         """Return the options of the evaluation."""
+        from aqualvs.scanning.net_condition import NetConditionOptions
+
         twine = None if self.twine_mm is None else 1e-3 * self.twine_mm
         return NetConditionOptions(stretch=self.stretch_m, twine=twine)
 
@@ -87,9 +82,9 @@ class NetResult:
         The vehicle's log.
     """
 
-    wall: NetWall
+    wall: "NetWall"
     lines: list[str]
-    log: LaidLog | None
+    log: "LaidLog | None"
 
 
 class NetPass:
@@ -109,6 +104,9 @@ class NetPass:
     """
 
     def __init__(self, rig: Rig, request: NetRequest) -> None:
+        from aqualvs.app.net_log import open_log
+        from aqualvs.scanning.net_condition import NetCondition
+
         self._rig, self._request = rig, request
         self._log = open_log(request.log, request.log_offset_s)
         self._condition = NetCondition(rig, request.options())
@@ -141,6 +139,12 @@ class NetPass:
         OutputError
             If a file cannot be written.
         """
+        from aqualvs.app.net_log import lay_log
+        from aqualvs.app.net_places import place_net
+        from aqualvs.app.net_seen import DivePostures
+        from aqualvs.app.net_wall import unroll
+        from aqualvs.app.net_words import net_facts, net_lines
+
         self._condition.finish()
         stretches, holes = self._condition.stretches, self._condition.holes
         postures = DivePostures(*(np.array(column) for column in self._postures))
@@ -164,7 +168,7 @@ class NetPass:
         return NetResult(wall, lines, log)
 
 
-def write_net_files(folder: Path, wall: NetWall, facts: dict[str, Any]) -> None:
+def write_net_files(folder: Path, wall: "NetWall", facts: dict[str, Any]) -> None:
     """Write tables first, pictures last.
 
     Raises
@@ -172,6 +176,16 @@ def write_net_files(folder: Path, wall: NetWall, facts: dict[str, Any]) -> None:
     OSError
         As the system says it.
     """
+    from aqualvs.app.net_map import draw_map
+    from aqualvs.app.net_tables import (
+        HOLE_COLUMNS,
+        NET_COLUMNS,
+        hole_rows,
+        stretch_rows,
+        write_geojson,
+        write_table,
+    )
+
     write_table(folder / NET_CSV, NET_COLUMNS, stretch_rows(wall))
     write_table(folder / HOLES_CSV, HOLE_COLUMNS, hole_rows(wall))
     write_geojson(folder / NET_GEOJSON, wall, facts)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from aqualvs.app.net_words import slip_words
 from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
 from aqualvs.app.report_findings import Card
 from aqualvs.app.report_html import Raw, table, text
@@ -72,6 +71,9 @@ def net_warnings(net: NetTables | None) -> list[str]:
     slip = None if net is None else net.summary.get("track_slip_m")
     if not isinstance(slip, int | float) or not slip > 0.0:
         return []
+    # Imported here: it brings the evaluation of nets along, which few reports have.
+    from aqualvs.app.net_words import slip_words
+
     words = slip_words(slip)
     return [f"Net: {words}."]
 

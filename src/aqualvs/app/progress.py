@@ -1,40 +1,17 @@
 """How far a run is, on standard error."""
 
 import contextlib
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TypeAlias
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
-
 Tick: TypeAlias = Callable[[int], None]
 
-# Until the first frame is done; compiled code is kept for the next run.
-_FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
-
-
-class _Rate(ProgressColumn):
-    """Frames, or whatever is counted, per second."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        """Return the rate as text."""
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.0f} {self._unit}/s")
+# What says of something else that it is a terminal (https://force-color.org).
+_CLAIMS = ("TTY_COMPATIBLE", "FORCE_COLOR")
 
 
 @contextlib.contextmanager
@@ -65,19 +42,25 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     tick : callable
         To be called with the number of frames that have been done since the last call.
     """
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit))
-    bar = Progress(
-        *columns,
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=_HIDDEN.get() or not console.is_terminal,
-    )
-    with bar:
-        task = bar.add_task(f"{label} {_FIRST_RUN}", total=n_frames)
+    if _HIDDEN.get() or not _may_be_terminal():
+        yield _tell_nobody
+        return
+    # Rich takes as long to import as a video to open, and is needed for a terminal only.
+    from aqualvs.app.terminal_bar import terminal_bar
 
-        def tick(n_done: int) -> None:
-            bar.update(task, advance=n_done, description=label)
-
+    with terminal_bar(label, n_frames, unit) as tick:
         yield tick
+
+
+def _may_be_terminal() -> bool:
+    """Return whether standard error may be a terminal; False is certain."""
+    if any(os.environ.get(name) for name in _CLAIMS):
+        return True
+    try:
+        return sys.stderr.isatty()
+    except (AttributeError, ValueError):
+        return False
+
+
+def _tell_nobody(n_done: int) -> None:
+    """Do nothing."""

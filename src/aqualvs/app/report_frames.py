@@ -141,9 +141,8 @@ def _evenly(rows: IntArray, count: int) -> list[int]:
     """Return `count` of `rows`, evenly spread, both ends included."""
     if count <= 0 or not len(rows):
         return []
-    return [
-        int(rows[i]) for i in np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))
-    ]
+    places = np.linspace(0, len(rows) - 1, count).round().astype(int).tolist()
+    return [int(rows[i]) for i in dict.fromkeys(places)]
 
 
 def _farthest(rows: IntArray, chosen: list[int]) -> int:

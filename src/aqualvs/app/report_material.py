@@ -1,6 +1,7 @@
 """Everything the page is made of, gathered from the run folder once."""
 
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from aqualvs.app.report_rig import LaserFacts, lasers_of, working_range_m
 from aqualvs.app.report_run import Track, read_bare, read_run_file, read_track, read_truth
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanning.scan import ImagePlane
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,8 +88,12 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     picture_rows = choose_pictures(track)
     sample_rows = choose_samples(track, picture_rows)
     frames = track.frame[sample_rows].tolist()
-    points, no_points = summarize_points(run_dir, track, frames)
-    pictures, no_pictures = _pictures(_source(run_dir, run), track, picture_rows, points)
+    source = _source(run_dir, run)
+    with ThreadPoolExecutor(1) as beside:
+        # FFmpeg works on the pictures while this thread counts points.
+        images = beside.submit(_decoded, source, track, picture_rows)
+        points, no_points = summarize_points(run_dir, track, frames)
+        pictures, no_pictures = _pictures(source, images, track, points)
     rig = mapping(run, "rig")
     lasers = _lasers(rig, points)
     names = [laser.name for laser in lasers]
@@ -152,13 +158,20 @@ def _source(run_dir: Path, run: Mapping[str, Any]) -> Path | str:
     return f"{path} is not there any more: sample frames come without pictures."
 
 
+def _decoded(source: Path | str, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    return {} if isinstance(source, str) else decode_frames(source, track, rows)
+
+
 def _pictures(
-    source: Path | str, track: Track, rows: list[int], points: PointSummary | None
+    source: Path | str,
+    decoded: "Future[dict[int, ImagePlane]]",
+    track: Track,
+    points: PointSummary | None,
 ) -> tuple[dict[int, Picture], str]:
     if isinstance(source, str):
         return {}, source
     try:
-        images = decode_frames(source, track, rows)
+        images = decoded.result()
     except SourceError as fault:
         return {}, f"{fault}: sample frames come without pictures."
     if not images:

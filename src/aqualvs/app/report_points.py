@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from aqualvs.app.journal import read_journal
+from aqualvs.app.report_kernels import add_points
 from aqualvs.app.report_run import Track
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.scanning.scan import Label
@@ -106,9 +107,10 @@ def summarize_points(
     summary = _empty(track)
     rng = np.random.default_rng(20210126)
     keys = np.zeros(0)
+    planes = _planes(track)
     try:
         for batch in _batches(run_dir):
-            keys = _add(summary, batch, track, sample_frames, keys, rng)
+            keys = _add(summary, batch, track, planes, sample_frames, keys, rng)
     except FileNotFoundError:
         return None, "points.parquet is missing: no points are shown."
     except KeyError as absent:
@@ -126,6 +128,14 @@ def plane_of_posture(posture: FloatArray) -> tuple[FloatArray, FloatArray]:
     pitch, yaw = np.deg2rad(posture[:, 1]), np.deg2rad(posture[:, 2])
     normal = np.stack([np.tan(yaw), np.ones_like(yaw), np.tan(pitch)], axis=-1)
     return normal / np.linalg.norm(normal, axis=1, keepdims=True), posture[:, 0]
+
+
+def _planes(track: Track) -> FloatArray:
+    """Return normal and distance of the target in every frame, shape (N, 4), NaN where refused."""
+    normal, distance = plane_of_posture(track.posture)
+    planes = np.column_stack([normal, distance])
+    planes[~track.valid] = np.nan
+    return planes
 
 
 def _counts(bins: int) -> IntArray:
@@ -189,52 +199,69 @@ def _add(
     summary: PointSummary,
     batch: dict[str, NDArray[Any]],
     track: Track,
+    planes: FloatArray,
     sample_frames: list[int],
     keys: FloatArray,
     rng: np.random.Generator,
 ) -> FloatArray:
     """Add one batch; returns the sampling keys of the cloud as it now is."""
-    row = np.searchsorted(track.frame, batch["frame"]).clip(max=len(track) - 1)
-    laser = batch["laser"].astype(np.int64)
-    known = (track.frame[row] == batch["frame"]) & (laser >= 0) & (laser < MAX_LASERS)
-    if not known.all():
-        batch = {name: column[known] for name, column in batch.items()}
-        row, laser = row[known], laser[known]
-    label = batch["label"].astype(np.int64).clip(0, len(Label) - 1)
-    points = np.stack([batch["x_m"], batch["y_m"], batch["z_m"]], axis=-1).astype(np.float64)
-    np.add.at(summary.labels, (laser, label), 1)
-    _keep_samples(summary, batch, laser, label, points, sample_frames)
-    target = np.flatnonzero(batch["used"] & np.isfinite(points).all(axis=1))
-    row, laser, points = row[target], laser[target], points[target]
-    np.add.at(summary.on_target, (row, laser), 1)
+    frame, laser, label = (batch[name].astype(np.int64) for name in ("frame", "laser", "label"))
+    x, y, z = xyz = [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"]
+    target = np.empty(len(frame), np.int64)
+    n_target = add_points(
+        frame,
+        laser,
+        label,
+        batch["used"].astype(np.bool_),
+        x,
+        y,
+        z,
+        track.frame,
+        planes,
+        summary.labels,
+        summary.on_target,
+        summary.squares_mm2,
+        summary.n_squares,
+        summary.residual,
+        float(RESIDUAL_EDGES_MM[0]),
+        float(RESIDUAL_EDGES_MM[1] - RESIDUAL_EDGES_MM[0]),
+        target,
+    )
+    target = target[:n_target]
     if "quality" in batch:
         quality = batch["quality"][target].astype(np.float64)
-        _count(summary.quality, QUALITY_EDGES, laser, quality)
-    _add_residuals(summary, track, row, laser, points)
-    return _grow_cloud(summary, points, laser, keys, rng)
+        _count(summary.quality, QUALITY_EDGES, laser[target], quality)
+    _keep_samples(summary, batch, frame, laser, label, xyz, sample_frames)
+    return _grow_cloud(summary, xyz, laser, target, keys, rng)
 
 
 def _keep_samples(
     summary: PointSummary,
     batch: dict[str, NDArray[Any]],
+    frame: IntArray,
     laser: IntArray,
     label: IntArray,
-    points: FloatArray,
+    xyz: list[FloatArray],
     sample_frames: list[int],
 ) -> None:
     """Keep the points of sample frames; a frame may go on in the next batch."""
-    numbers = batch["frame"]
-    if not len(numbers):
+    if not len(frame):
         return
-    first, last = int(numbers.min()), int(numbers.max())
-    for frame in sample_frames:
-        mine = np.flatnonzero(numbers == frame) if first <= frame <= last else _NONE
+    first, last = int(frame.min()), int(frame.max())
+    for sample in sample_frames:
+        mine = np.flatnonzero(frame == sample) if first <= sample <= last else _NONE
+        mine = mine[(laser[mine] >= 0) & (laser[mine] < MAX_LASERS)]
         if not len(mine):
             continue
-        pixels = np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64)
-        new = FramePoints(laser[mine], label[mine], batch["used"][mine], pixels, points[mine])
-        old = summary.samples.get(frame)
-        summary.samples[frame] = new if old is None else _joined(old, new)
+        new = FramePoints(
+            laser[mine],
+            label[mine].clip(0, len(Label) - 1),
+            batch["used"][mine],
+            np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64),
+            np.stack([axis[mine] for axis in xyz], axis=-1),
+        )
+        old = summary.samples.get(sample)
+        summary.samples[sample] = new if old is None else _joined(old, new)
 
 
 def _joined(first: FramePoints, second: FramePoints) -> FramePoints:
@@ -250,44 +277,33 @@ def _joined(first: FramePoints, second: FramePoints) -> FramePoints:
 def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: FloatArray) -> None:
     """Add values to the histogram of their laser; those beyond the edges go to the last bins."""
     finite = np.isfinite(values)
+    if not finite.all():
+        laser, values = laser[finite], values[finite]
+    n_lasers, n_bins = histogram.shape
     step = edges[1] - edges[0]
-    bins = ((values[finite] - edges[0]) / step).clip(0, len(edges) - 2).astype(np.int64)
-    np.add.at(histogram, (laser[finite], bins), 1)
-
-
-def _add_residuals(
-    summary: PointSummary, track: Track, row: IntArray, laser: IntArray, points: FloatArray
-) -> None:
-    valid = track.valid[row]
-    row, laser, points = row[valid], laser[valid], points[valid]
-    if not len(row):
-        return
-    # Of many points to a frame, all share its plane.
-    first = int(row.min())
-    normal, distance = plane_of_posture(track.posture[first : int(row.max()) + 1])
-    of_frame = normal[row - first]
-    residual_mm = 1e3 * (np.einsum("ij,ij->i", of_frame, points) - distance[row - first])
-    np.add.at(summary.squares_mm2, row, residual_mm**2)
-    np.add.at(summary.n_squares, row, 1)
-    _count(summary.residual, RESIDUAL_EDGES_MM, laser, residual_mm)
+    bins = ((values - edges[0]) / step).clip(0, n_bins - 1).astype(np.int64)
+    counted = np.bincount(laser * n_bins + bins, minlength=histogram.size)
+    histogram += counted.reshape(n_lasers, n_bins)
 
 
 def _grow_cloud(
     summary: PointSummary,
-    points: FloatArray,
+    xyz: list[FloatArray],
     laser: IntArray,
+    target: IntArray,
     keys: FloatArray,
     rng: np.random.Generator,
 ) -> FloatArray:
     """Keep the points with the smallest of all random keys: a uniform sample of any stream."""
-    drawn = rng.random(len(points))
+    drawn = rng.random(len(target))
     if len(keys) == _CLOUD:
         # Of many points only the few whose key is small enough are looked at again.
         small = np.flatnonzero(drawn < keys.max())
-        drawn, points, laser = drawn[small], points[small], laser[small]
+        drawn, target = drawn[small], target[small]
     keys = np.concatenate([keys, drawn])
+    points = np.stack([axis[target] for axis in xyz], axis=-1)
     points = np.concatenate([summary.cloud_in_dome, points])
-    laser = np.concatenate([summary.cloud_laser, laser])
+    laser = np.concatenate([summary.cloud_laser, laser[target]])
     if len(keys) > _CLOUD:
         kept = np.argpartition(keys, _CLOUD)[:_CLOUD]
         keys, points, laser = keys[kept], points[kept], laser[kept]

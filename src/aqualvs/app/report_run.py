@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -26,6 +26,8 @@ _NUMBERS = (
     "n_points",
     "n_water",
 )
+# The one in C is ten times as fast; not every build of PyYAML has it.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TRUE = ("true", "1", "yes")
 POSTURE = ("range_m", "pitch_deg", "yaw_deg")
 """The three columns of a posture, in the order of every (N, 3) array of the report."""
@@ -72,7 +74,7 @@ def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
     """
     path = run_dir / "run.yaml"
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_LOADER)
     except FileNotFoundError:
         return {}, "run.yaml is missing: rig, options and source are unknown."
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -90,19 +92,19 @@ def read_track(path: Path) -> Track:
     SourceError
         If the file is missing, holds no frame, or holds something that is no number.
     """
-    columns = _read_columns(path, _NUMBERS, ("valid", "reason"))
+    columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason"))
     order = np.argsort(columns["frame"], kind="stable")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
     sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
-    claimed = np.isin(np.char.lower(columns["valid"]), _TRUE)[order]
-    valid = claimed & np.isfinite(posture).all(axis=1)
-    reasons, reason = np.unique(columns["reason"][order], return_inverse=True)
+    words, (reasons, reason) = texts["valid"], texts["reason"]
+    says_so = np.array([word.lower() in _TRUE for word in words.names])
+    valid = says_so[words.codes][order] & np.isfinite(posture).all(axis=1)
     return Track(
         frame=columns["frame"][order].astype(np.int64),
         time_s=columns["time_s"][order],
         valid=valid,
-        reason=reason.astype(np.int64),
-        reasons=tuple(str(name) for name in reasons),
+        reason=reason[order],
+        reasons=reasons,
         posture=np.where(valid[:, None], posture, np.nan),
         sigma=np.where(valid[:, None], sigma, np.nan),
         n_points=columns["n_points"][order],
@@ -174,21 +176,32 @@ def _onto(frames: IntArray, from_frames: FloatArray, values: FloatArray) -> Floa
     return found
 
 
+class _Words(NamedTuple):
+    """A column of few different words: all of them in order, and the number of each row's."""
+
+    names: tuple[str, ...]
+    codes: IntArray
+
+
 def _read_columns(
     path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]
-) -> dict[str, np.ndarray[Any, Any]]:
-    """Read the named columns of a CSV; a missing column becomes NaN or empty text."""
+) -> tuple[dict[str, FloatArray], dict[str, _Words]]:
+    """Read the named columns of a CSV; a missing column becomes NaN or "None"."""
     table = _read_table(path, numbers, texts)
-    frame = table["frame"].to_numpy(zero_copy_only=False).astype(np.float64)
-    table = table.filter(pa.array(np.isfinite(frame)))
-    if not table.num_rows:
+    # With NumPy: filtering an Arrow table imports all of its functions first.
+    whole = np.isfinite(_numbers(table["frame"]))
+    if not whole.any():
         raise SourceError(f"{path}: holds no frame; there is nothing to report, run the dive again")
-    columns = {name: _numbers(table[name]) for name in numbers}
-    return columns | {name: np.array(table[name].to_pylist(), dtype=np.str_) for name in texts}
+    words = table.unify_dictionaries()
+    return (
+        {name: _numbers(table[name])[whole] for name in numbers},
+        {name: _words(words[name], whole) for name in texts},
+    )
 
 
 def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) -> Any:
-    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(texts, pa.string())
+    word = pa.dictionary(pa.int32(), pa.string())
+    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(texts, word)
     convert = csv.ConvertOptions(
         column_types=types, include_columns=list(types), include_missing_columns=True
     )
@@ -200,6 +213,24 @@ def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) ->
     except (pa.ArrowInvalid, OSError) as fault:
         first_line = str(fault).splitlines()[0]
         raise SourceError(f"{path}: cannot be read ({first_line}); mend or remove it") from fault
+
+
+def _words(column: Any, rows: BoolArray) -> _Words:
+    """Return the words of some rows of a dictionary column, those alone that occur there."""
+    if column.null_count:
+        return _Words(("None",), np.zeros(int(rows.sum()), np.int64))
+    chunks = column.chunks
+    found = np.concatenate([chunk.indices.to_numpy() for chunk in chunks])[rows]
+    occurs = np.bincount(found)
+    names = {
+        name: code
+        for code, name in enumerate(chunks[0].dictionary.to_pylist()[: len(occurs)])
+        if occurs[code]
+    }
+    ordered = tuple(sorted(names))
+    place = np.zeros(len(occurs), np.int64)
+    place[[names[name] for name in ordered]] = np.arange(len(ordered))
+    return _Words(ordered, place[found])
 
 
 def _numbers(column: Any) -> FloatArray:

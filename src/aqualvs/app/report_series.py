@@ -54,7 +54,9 @@ def thin(values: FloatArray, limit: int) -> IntArray:
     start = np.arange(len(buckets)) * width
     low = start + np.where(known, buckets, np.inf).argmin(axis=1)
     high = start + np.where(known, buckets, -np.inf).argmax(axis=1)
-    return np.unique(np.concatenate([low, high])[np.tile(known.any(axis=1), 2)])
+    rows = np.sort(np.concatenate([low, high])[np.tile(known.any(axis=1), 2)])
+    first_of_each = np.append(True, np.diff(rows) > 0)
+    return np.asarray(rows[first_of_each])
 
 
 def breaks(rows: IntArray, interrupted: BoolArray) -> list[int]:
@@ -120,8 +122,7 @@ def stretch_words(stretch: Stretch, track: Track) -> str:
 def reason_counts(track: Track) -> list[tuple[str, int]]:
     """Return the reasons of all refusals in words with their numbers of frames, commonest first."""
     counted: Counter[str] = Counter()
-    codes, counts = np.unique(track.reason[~track.valid], return_counts=True)
-    for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
+    for code, count in sorted(Counter(track.reason[~track.valid].tolist()).items()):
         counted[reason_words(track.reasons[code])] += count
     return counted.most_common()
 

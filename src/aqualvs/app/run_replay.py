@@ -1,21 +1,26 @@
-"""A recording as the source of a run: its stripes are measured again, bit for bit."""
+"""A recording as the source of a run: its stripes are measured again, bit for bit.
+
+What reads recordings is imported where it is used: every run reads this module, few replay one.
+"""
 
 from collections.abc import Iterator, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from aqualvs.app.run_inputs import Water, in_water, prepared_rig
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.live.recorder import DiveRecording, RecordedFrame, is_recording
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
+
+if TYPE_CHECKING:
+    from aqualvs.live.recorder import DiveRecording, RecordedFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +33,7 @@ class ReplayedFrame(Frame):
         Never None; only a base class with defaults asks for one.
     """
 
-    recorded: RecordedFrame | None = None
+    recorded: "RecordedFrame | None" = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,6 +89,8 @@ class Replay:
     """
 
     def __init__(self, path: Path, request: ReplayRequest) -> None:
+        from aqualvs.live.recorder import DiveRecording
+
         self._recording = recording = DiveRecording(path)
         self.name = str(path)
         self.size_px, self.fps = recording.rig.size_px, recording.fps
@@ -162,23 +169,27 @@ def replay_of(source: str, request: ReplayRequest) -> Replay | None:
         As `Replay`.
     """
     path = Path(source)
+    if path.suffix.lower() != ".mcap":
+        return None
+    from aqualvs.live.recorder import is_recording
+
     return Replay(path, request) if is_recording(path) else None
 
 
-def _options(recording: DiveRecording, request: ReplayRequest) -> ScannerOptions:
+def _options(recording: "DiveRecording", request: ReplayRequest) -> ScannerOptions:
     if request.chosen is None:
         return request.scanner
     own = {name: getattr(request.scanner, name) for name in request.chosen}
     return replace(recording.options, **own)
 
 
-def _rig(recording: DiveRecording, request: ReplayRequest) -> Rig:
+def _rig(recording: "DiveRecording", request: ReplayRequest) -> Rig:
     if request.rig is not None:
         return prepared_rig(request.rig, request.water, no_dome=request.no_dome)
     return in_water(recording.rig, request.water, no_dome=request.no_dome)
 
 
-def _detects(recording: DiveRecording, request: ReplayRequest, options: ScannerOptions) -> bool:
+def _detects(recording: "DiveRecording", request: ReplayRequest, options: ScannerOptions) -> bool:
     """Return whether stripes must be looked for again, in the recorded pictures."""
     if options.detector != recording.options.detector:
         wanted = "--detector: this detector needs the pictures, which"

@@ -1,21 +1,22 @@
-"""Following the water's index during a run, by a target on the vehicle (paper, 2.2)."""
+"""Following the water's index during a run, by a target on the vehicle (paper, 2.2).
+
+What calibrates is imported where it is used: every run reads this module, few follow the water.
+"""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aqualvs.app.calibrate_water import index_options, step_words
 from aqualvs.app.run_inputs import Water
-from aqualvs.calibration.detection import detect_markers
-from aqualvs.calibration.index_estimator import IndexEstimator
-from aqualvs.calibration.index_prior import IndexPrior
-from aqualvs.calibration.index_reading import IndexReading
-from aqualvs.calibration.target_files import load_target
-from aqualvs.calibration.view import View
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame, Scan
+
+if TYPE_CHECKING:
+    from aqualvs.calibration.index_prior import IndexPrior
+    from aqualvs.calibration.index_reading import IndexReading
 
 # Reading the target's markers takes longer than measuring a frame; the index hardly changes.
 _FIRST_FRAMES, _EVERY_S = 5, 0.4
@@ -51,6 +52,10 @@ class WaterFollowingScanner:
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
+        from aqualvs.app.calibrate_water import index_options
+        from aqualvs.calibration.index_estimator import IndexEstimator
+        from aqualvs.calibration.target_files import load_target
+
         self._rig, self._options, self._target = rig, options, target
         self.scanner = Scanner(rig, options)
         self._markers = load_target(target)
@@ -77,6 +82,8 @@ class WaterFollowingScanner:
 
     def lines(self) -> list[str]:
         """Return what the run's summary says of the water."""
+        from aqualvs.app.calibrate_water import step_words
+
         last = self._last
         if last is None:
             return [
@@ -94,6 +101,9 @@ class WaterFollowingScanner:
 
     def look(self, frame: Frame) -> None:
         """Read the target in a frame; makes another scanner if the water has changed."""
+        from aqualvs.calibration.detection import detect_markers
+        from aqualvs.calibration.view import View
+
         self._next_s = frame.time_s + _EVERY_S
         grey = np.ascontiguousarray(frame.luma)
         view = detect_markers(grey, self._markers, f"frame {frame.index}")
@@ -108,7 +118,9 @@ class WaterFollowingScanner:
             self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
 
 
-def _prior(water: Water, rig: Rig) -> IndexPrior | None:
+def _prior(water: Water, rig: Rig) -> "IndexPrior | None":
+    from aqualvs.calibration.index_prior import IndexPrior
+
     if water.temperature_c is None or water.salinity is None:
         return None
     return IndexPrior.seawater(water.temperature_c, water.salinity, n_air=rig.n_air)

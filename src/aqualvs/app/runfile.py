@@ -1,5 +1,6 @@
 """`run.yaml`: what was run, on what, with what, and how it went."""
 
+import functools
 import os
 import platform
 import sys
@@ -91,12 +92,15 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of what computes the numbers."""
     found = {"aqualvs": __version__, "python": platform.python_version(), "system": sys.platform}
-    for name in _LIBRARIES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+    return found | {name: _installed(name) for name in _LIBRARIES}
+
+
+@functools.cache
+def _installed(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def now() -> str:

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
@@ -209,6 +208,9 @@ class _Motion:
         self._noise = np.diag(np.square(accelerations))
         turn = options.initial_turn_rate
         self._initial_rates = np.diag(np.square((options.initial_speed, turn, turn)))
+        # Imported here: a run that filters nothing need not wait for SciPy.
+        from scipy.special import chdtri
+
         # Below this squared Mahalanobis distance lies the share of three normal variables.
         self._gate = float(chdtri(3.0, 1.0 - options.gate_probability))
 

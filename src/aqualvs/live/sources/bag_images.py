@@ -9,16 +9,6 @@ from aqualvs.live.sources.image_schemas import image_of_ros, kind_of_schema
 from aqualvs.live.sources.message_source import Logged, MessageSource, Topic, choose_topic
 
 
-def is_bag(path: Path) -> bool:
-    """Return whether a path is a ROS bag; a lone MCAP file is none.
-
-    Parameters
-    ----------
-    path : Path
-    """
-    return path.suffix.lower() in (".bag", ".db3") or (path / "metadata.yaml").is_file()
-
-
 def open_bag(path: Path, topic: str | None = None) -> MessageSource:
     """Open the images of a ROS bag.
 

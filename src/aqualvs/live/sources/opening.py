@@ -1,28 +1,27 @@
-"""From a path or an address to the source that reads it."""
+"""From a path or an address to the source that reads it.
+
+What reads streams, cameras and recordings is imported where it is used: most dives are videos.
+"""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import av
 from av.container import InputContainer
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.live.sources.bag_images import is_bag, open_bag
 from aqualvs.live.sources.base import FrameSource
-from aqualvs.live.sources.camera import CameraFeed, CameraOptions, is_camera
-from aqualvs.live.sources.datagrams import UdpAddress, parse_udp
 from aqualvs.live.sources.feed import Feed
 from aqualvs.live.sources.images import IMAGE_SUFFIXES, ImageSource
-from aqualvs.live.sources.mcap_images import open_mcap
-from aqualvs.live.sources.paced import PacedFeed
-from aqualvs.live.sources.remote import RemoteFeed, Transport, remote_feed
-from aqualvs.live.sources.sdp import read_sdp
-from aqualvs.live.sources.udp import UdpFeed
 from aqualvs.live.sources.video import VideoSource
+
+if TYPE_CHECKING:
+    from aqualvs.live.sources.remote import Transport
 
 STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "rtsps", "srt", "tcp", "udp")
 """Addresses of streams; everything else is a path."""
 
-BLUEROV = UdpAddress("", 5600)
+BLUEROV_PORT = 5600
 """Where BlueOS and ArduSub send the main camera, and QGroundControl listens."""
 
 
@@ -70,7 +69,7 @@ def open_source(
         raise SourceError(f"{path}: no such file or folder; check the path")
     if path.suffix.lower() == ".mcap" or is_bag(path):
         _no(fps, path, "a recording has its own clock; leave the frame rate out")
-        return open_bag(path, topic) if is_bag(path) else open_mcap(path, topic)
+        return _recording(path, topic)
     _no(topic, path, "only bags and MCAP files have topics; leave the topic out")
     if path.is_dir():
         return ImageSource(path, fps=fps or 1.0)
@@ -88,7 +87,7 @@ def open_feed(
     fps: float | None = None,
     size_px: tuple[int, int] | None = None,
     pixel_format: str | None = None,
-    transport: Transport | None = None,
+    transport: "Transport | None" = None,
     topic: str | None = None,
 ) -> Feed:
     """Open a source for a live run.
@@ -129,6 +128,9 @@ def open_feed(
     OptionError
         If an option does not go with the source.
     """
+    from aqualvs.live.sources.camera import CameraFeed, CameraOptions, is_camera
+    from aqualvs.live.sources.paced import PacedFeed
+
     text = str(where)
     if fps is not None and not fps > 0:
         raise OptionError(f"frame rate {fps:g}: must be positive")
@@ -149,13 +151,29 @@ def is_address(where: str | Path) -> bool:
     return isinstance(where, str) and where.partition("://")[0].lower() in STREAM_SCHEMES
 
 
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a ROS bag; a lone MCAP file is none."""
+    return path.suffix.lower() in (".bag", ".db3") or (path / "metadata.yaml").is_file()
+
+
 def _is_stream(where: str) -> bool:
     return where == "bluerov" or is_address(where) or where.lower().endswith(".sdp")
 
 
-def _stream(where: str, transport: Transport) -> Feed:
+def _recording(path: Path, topic: str | None) -> FrameSource:
+    from aqualvs.live.sources.bag_images import open_bag
+    from aqualvs.live.sources.mcap_images import open_mcap
+
+    return open_bag(path, topic) if is_bag(path) else open_mcap(path, topic)
+
+
+def _stream(where: str, transport: "Transport") -> Feed:
+    from aqualvs.live.sources.datagrams import UdpAddress, parse_udp
+    from aqualvs.live.sources.remote import remote_feed
+    from aqualvs.live.sources.udp import UdpFeed
+
     if where == "bluerov":
-        return UdpFeed(where, BLUEROV)
+        return UdpFeed(where, UdpAddress("", BLUEROV_PORT))
     if where.lower().endswith(".sdp"):
         return _described(Path(where))
     if where.lower().startswith(("udp://", "rtp://")):
@@ -164,6 +182,10 @@ def _stream(where: str, transport: Transport) -> Feed:
 
 
 def _described(path: Path) -> Feed:
+    from aqualvs.live.sources.remote import RemoteFeed
+    from aqualvs.live.sources.sdp import read_sdp
+    from aqualvs.live.sources.udp import UdpFeed
+
     video = read_sdp(path)
     if video.codec == "H264":
         return UdpFeed(
