@@ -135,7 +135,7 @@ def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, crews, monke
 def test_what_is_given_up_leaves_no_process(dive):
     work = work_of(dive)
     with Crew(work, 3) as crew:
-        first = next(crew.measured())
+        first, *_ = next(crew.blocks())
         assert len(multiprocessing.active_children()) == 3
     assert first.scan.index == 0
     assert not multiprocessing.active_children()

@@ -6,7 +6,7 @@ import pytest
 
 from aqualvs.live.sources import open_source
 from aqualvs.live.sources.nal_units import unit_reader
-from aqualvs.live.sources.span_frames import UnlikeSurveyError, image_frames, video_frames
+from aqualvs.live.sources.span_frames import UnlikeSurveyError, VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind, video_spans
 from shell_cases import cut_after, damage_frame, destroy_frame, grain, packets, write_video
 
@@ -24,14 +24,23 @@ def dive(path, n=N, content=grain, **more):
 
 
 def frames_of(path, spans):
-    for span in spans:
-        yield from video_frames(path, span, SIZE)
+    with VideoParts(path, SIZE) as parts:
+        for span in spans:
+            yield from parts.frames(span)
+
+
+def by_index(frames):
+    return sorted(frames, key=lambda frame: frame.index)
 
 
 def assert_same_frames(path, spans):
     with open_source(path) as source:
         whole = list(source)
     parts = list(frames_of(path, spans))
+    # What the reader has read before must not matter.
+    for one, other in zip(parts, by_index(frames_of(path, spans[::-1])), strict=True):
+        assert (one.index, one.time_s) == (other.index, other.time_s)
+        assert np.array_equal(one.luma, other.luma)
     assert [frame.index for frame in parts] == [frame.index for frame in whole]
     # The clock must be the same number, not one close by.
     assert [frame.time_s for frame in parts] == [frame.time_s for frame in whole]
@@ -109,9 +118,9 @@ def test_a_damaged_part_is_noticed_and_the_others_are_not_touched(tmp_path, dama
     spans = video_spans(path, 10).spans
     assert len(spans) == 4
     with pytest.raises(UnlikeSurveyError):
-        list(video_frames(path, spans[1], SIZE))
+        list(VideoParts(path, SIZE).frames(spans[1]))
     for span in (spans[0], spans[2], spans[3]):
-        assert len(list(video_frames(path, span, SIZE))) == 10
+        assert len(list(VideoParts(path, SIZE).frames(span))) == 10
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -126,7 +135,7 @@ def test_no_damage_goes_unnoticed_that_the_whole_video_shows(tmp_path, seed):
     path.write_bytes(data)
     spans = video_spans(path, 10).spans
     try:
-        list(video_frames(path, spans[1], SIZE))
+        list(VideoParts(path, SIZE).frames(spans[1]))
     except UnlikeSurveyError:
         return
     assert_same_frames(path, spans)
@@ -143,7 +152,7 @@ def test_a_file_that_was_changed_since_is_noticed(tmp_path):
 def test_pictures_of_another_size_are_noticed(tmp_path):
     path = dive(tmp_path / "dive.mp4")
     with pytest.raises(UnlikeSurveyError, match="another size"):
-        list(video_frames(path, video_spans(path, 10).spans[1], (64, 96)))
+        list(VideoParts(path, (64, 96)).frames(video_spans(path, 10).spans[1]))
 
 
 def test_the_parts_of_a_folder_of_images_are_the_whole(tmp_path):

@@ -21,6 +21,7 @@ from aqualvs.app.cli_options import (
     WaterIndex,
     given,
 )
+from aqualvs.app.importing import importing
 
 
 def run(
@@ -73,9 +74,10 @@ def run(
     n_processes = workers or crew_start.n_cores()
     if n_processes > 1:
         crew_start.prepare()
-    from aqualvs.app import run as body
-    from aqualvs.app.net_pass import NetRequest
-    from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
+    with importing():
+        from aqualvs.app import run as body
+        from aqualvs.app.net_pass import NetRequest
+        from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
 
     request = body.RunRequest(
         source=source,

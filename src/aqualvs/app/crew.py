@@ -55,7 +55,7 @@ class Crew:
         self._found: defaultdict[int, deque[Message]] = defaultdict(deque)
         self._n_processes = min(n_processes, len(work.parts))
 
-    def measured(self) -> Iterator[Measured]:
+    def blocks(self) -> Iterator[list[Measured]]:
         """Yield what is found, in the order of the dive.
 
         It ends before its time where a part is not what it was taken for, or a process has died:
@@ -64,7 +64,7 @@ class Crew:
         try:
             for number in range(len(self._work.parts)):
                 for block in self._of_part(number):
-                    yield from block
+                    yield block
                     self.next_frame += len(block)
         except (_UnlikeSurveyError, EOFError, OSError):
             return

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import cv2
 
-from aqualvs.app.blocks import block_length, in_blocks
+from aqualvs.app.blocks import in_blocks
 from aqualvs.app.crew_messages import Ended, Message, packed
 from aqualvs.app.measuring import Measured, Meter
-from aqualvs.live.sources.span_frames import UnlikeSurveyError, image_frames, video_frames
+from aqualvs.live.sources.span_frames import UnlikeSurveyError, VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
@@ -70,18 +70,25 @@ def serve(work: CrewWork, pipe: Connection) -> None:
     cv2.setNumThreads(1)
     try:
         meter = Meter(work.rig, Scanner(work.rig, work.options))
-        while (number := pipe.recv()) is not None:
-            for message in _messages(work, work.parts[number], meter):
-                pipe.send_bytes(packed(message))
-    except (EOFError, BrokenPipeError):
+        with VideoParts(work.path, work.rig.size_px) as video:
+            while (number := pipe.recv()) is not None:
+                part = work.parts[number]
+                for message in _messages(part, _frames(work, part, video), meter):
+                    pipe.send_bytes(packed(message))
+    except (EOFError, ConnectionError):
         # The other end has gone; whatever is buffered for it goes too.
         os._exit(1)
 
 
-def _messages(work: CrewWork, part: Part, meter: Meter) -> Iterator[Message]:
-    blocks = in_blocks(_frames(work, part), block_length(work.rig.size_px), UnlikeSurveyError)
+def _messages(part: Part, frames: Iterator[Frame], meter: Meter) -> Iterator[Message]:
+    wanted = itertools.islice(
+        frames,
+        part.first - part.span.first,
+        # To its very end, where the reader compares the span with what was promised.
+        None if part.stop == part.span.stop else part.stop - part.span.first,
+    )
     try:
-        for block in blocks:
+        for block in in_blocks(wanted, meter.block_length, UnlikeSurveyError):
             yield [Measured(found.scan, found.bare) for found in meter.measure(block)]
     except UnlikeSurveyError:
         yield Ended.UNLIKE_SURVEY
@@ -89,13 +96,7 @@ def _messages(work: CrewWork, part: Part, meter: Meter) -> Iterator[Message]:
         yield Ended.WHOLE
 
 
-def _frames(work: CrewWork, part: Part) -> Iterator[Frame]:
-    span = part.span
-    if span.kind is SpanKind.VIDEO:
-        frames = video_frames(work.path, span, work.rig.size_px)
-    else:
-        frames = image_frames(work.path, span, work.fps)
-    if part.stop < span.stop:
-        return itertools.islice(frames, part.first - span.first, part.stop - span.first)
-    # To its very end, where the reader compares the span with what was promised.
-    return itertools.islice(frames, part.first - span.first, None)
+def _frames(work: CrewWork, part: Part, video: VideoParts) -> Iterator[Frame]:
+    if part.span.kind is SpanKind.VIDEO:
+        return video.frames(part.span)
+    return image_frames(work.path, part.span, work.fps)

@@ -40,7 +40,7 @@ _LABEL_NAMES = pa.array(LABELS, pa.string())
 
 
 class PointsJournal:
-    """Writer of `points.arrows`, frame by frame as `AppendFile` does it.
+    """Writer of `points.arrows`, a few frames at a time as `AppendFile` does it.
 
     Parameters
     ----------
@@ -60,10 +60,10 @@ class PointsJournal:
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._waiting, "w"), POINTS_SCHEMA)
         self._closed = False
 
-    def write(self, scan: Scan) -> None:
-        """Append the points of one frame; a frame without points leaves no trace."""
-        if len(scan.points):
-            self._writer.write_batch(points_batch(scan))
+    def write(self, *scans: Scan) -> None:
+        """Append the points of frames, all or none; those without points leave no trace."""
+        if any(len(scan.points) for scan in scans):
+            self._writer.write_batch(points_batch(*scans))
             self._append()
 
     def close(self) -> None:
@@ -105,22 +105,31 @@ class PointsJournal:
             self.close()
 
 
-def points_batch(scan: Scan) -> Any:
-    """Return the points of a frame as a record batch of `POINTS_SCHEMA`."""
-    points = scan.points
-    n = len(points)
-    numbers = np.empty((9, n), np.float32)
-    numbers[0:2] = points.pixels.T
-    numbers[2:5] = points.points_in_dome.T
-    numbers[5] = points.sigma
-    numbers[6] = points.quality
-    numbers[7] = points.intensity
-    numbers[8] = points.width
-    head = (np.full(n, scan.index, np.int32), np.full(n, scan.time_s), points.laser)
-    label = pa.array(np.ascontiguousarray(points.label).view(np.int8))
+def points_batch(*scans: Scan) -> Any:
+    """Return the points of frames as a record batch of `POINTS_SCHEMA`."""
+    points = [scan.points for scan in scans]
+    counts = [len(one) for one in points]
+    numbers = np.empty((9, sum(counts)), np.float32)
+    end = 0
+    for one in points:
+        first, end = end, end + len(one)
+        mine = numbers[:, first:end]
+        mine[0:2] = one.pixels.T
+        mine[2:5] = one.points_in_dome.T
+        mine[5] = one.sigma
+        mine[6] = one.quality
+        mine[7] = one.intensity
+        mine[8] = one.width
+    head = (
+        np.repeat(np.array([scan.index for scan in scans], np.int32), counts),
+        np.repeat(np.array([scan.time_s for scan in scans]), counts),
+        np.concatenate([one.laser for one in points]),
+    )
+    label = pa.array(np.concatenate([one.label for one in points]).view(np.int8))
     names = pa.DictionaryArray.from_arrays(label, _LABEL_NAMES, safe=False)
+    used = pa.array(np.concatenate([one.used for one in points]))
     columns = [pa.array(column) for column in (*head, *numbers)]
-    arrays = [*columns[:10], names, pa.array(points.used), *columns[10:]]
+    arrays = [*columns[:10], names, used, *columns[10:]]
     return pa.RecordBatch.from_arrays(arrays, schema=POINTS_SCHEMA)
 
 

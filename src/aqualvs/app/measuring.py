@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from aqualvs.app.blocks import block_length
 from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.comparison import BareLensComparison
@@ -40,10 +41,16 @@ class Meter:
     rig : Rig
     scanner : ScansFrames
         For the same rig.
+
+    Attributes
+    ----------
+    block_length : int
+        How many frames it is best given at a time.
     """
 
     def __init__(self, rig: Rig, scanner: ScansFrames) -> None:
         self._scanner = scanner
+        self.block_length = block_length(rig.size_px) if isinstance(scanner, Scanner) else 1
         self._bare_lens = BareLensComparison(rig) if rig.dome is not None else None
 
     def measure(self, frames: Sequence[Frame]) -> list[Measured]:
@@ -73,9 +80,9 @@ class Meter:
         ]
 
 
-def measured_frames(
+def measured_blocks(
     blocks: Iterator[list[tuple[list[Scan], Frame]]], meter: Meter
-) -> Iterator[Measured]:
+) -> Iterator[list[Measured]]:
     """Yield what is found in frames, and what stands for lost ones, in the order of the dive.
 
     Parameters
@@ -83,13 +90,20 @@ def measured_frames(
     blocks : iterator of list
         Of frames with the scans that stand for the lost ones right before, see `with_losses`.
     meter : Meter
+
+    Yields
+    ------
+    found : list of Measured
+        Of one block; what stands for lost frames before it comes by itself.
     """
     for block in blocks:
-        (lost, _), *others = block
-        # Before anything is recorded of the block's own frames.
-        yield from map(meter.lost, lost)
+        (before, _), *others = block
+        if before:
+            # Before anything is recorded of the block's own frames.
+            yield [meter.lost(scan) for scan in before]
         first, *more = meter.measure([frame for _, frame in block])
-        yield first
+        found = [first]
         for (lost, _), measured in zip(others, more, strict=True):
-            yield from map(meter.lost, lost)
-            yield measured
+            found += [meter.lost(scan) for scan in lost]
+            found.append(measured)
+        yield found

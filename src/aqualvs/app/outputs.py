@@ -101,13 +101,14 @@ class RunOutputs:
             self._points = stack.enter_context(PointsJournal(folder / JOURNAL))
             self._open_files = stack.pop_all()
 
-    def write(self, scan: Scan) -> None:
-        """Write one frame; when this returns, the frame outlives the process."""
+    def write(self, *scans: Scan) -> None:
+        """Write frames; when this returns, they outlive the process."""
         with writing(self.folder):
             # Points first: a frame that has its row in posture.csv has its points too.
-            self._points.write(scan)
-            self._posture.write(scan)
-        self.tally.add(scan)
+            self._points.write(*scans)
+            self._posture.write(*scans)
+        for scan in scans:
+            self.tally.add(scan)
 
     def __enter__(self) -> Self:
         """Return the writer."""

@@ -57,9 +57,9 @@ class PostureCsv:
             self.close()
             raise
 
-    def write(self, scan: Scan) -> None:
-        """Append the row of one frame."""
-        self._append(posture_row(scan))
+    def write(self, *scans: Scan) -> None:
+        """Append the rows of frames, all or none."""
+        self._append("".join(map(posture_row, scans)))
 
     def close(self) -> None:
         """Close the file; further calls do nothing."""

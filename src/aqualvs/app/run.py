@@ -184,8 +184,8 @@ def run(
                     writers.tally.agreement = agreement
                     writers.tally.net_check = net_check(request.target, rig)
                     scanner = writers.recorded(scanner)
-                    with closing(measuring.measured(scanner, one_by_one=request.mcap)) as found:
-                        _write_all(found, writers, stop, tick)
+                    with closing(measuring.blocks(scanner, one_by_one=request.mcap)) as blocks:
+                        _write_all(blocks, writers, stop, tick)
             except SourceError as broken_off:
                 fault = broken_off
     return RunResult(
@@ -203,12 +203,12 @@ def run(
 
 
 def _write_all(
-    found: Iterable[Measured], writers: RunWriters, stop: StopSignals, tick: Tick
+    blocks: Iterable[list[Measured]], writers: RunWriters, stop: StopSignals, tick: Tick
 ) -> None:
     """Write what is found until it ends, or a signal stops it."""
-    for measured in found:
-        writers.write(measured)
-        tick(1)
+    for block in blocks:
+        writers.write(*block)
+        tick(len(block))
         if stop.caught:
             writers.interrupt()
             return

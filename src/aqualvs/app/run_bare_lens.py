@@ -37,15 +37,19 @@ class RunBareLens:
             with writing(self._path):
                 self._file = PostureCsv(self._path)
 
-    def write(self, measured: Measured) -> None:
-        """Append the row of one frame."""
-        scan, posture = measured.scan, measured.bare
-        if posture is None or self._file is None:
+    def write(self, *found: Measured) -> None:
+        """Append the rows of frames."""
+        if self._file is None:
             return
-        if isinstance(posture, Posture) and isinstance(scan.posture, Posture):
-            self._ratios.append(posture.range / scan.posture.range)
+        rows = []
+        for measured in found:
+            scan, posture = measured.scan, measured.bare
+            if isinstance(posture, Posture) and isinstance(scan.posture, Posture):
+                self._ratios.append(posture.range / scan.posture.range)
+            if posture is not None:
+                rows.append(replace(scan, posture=posture))
         with writing(self._path):
-            self._file.write(replace(scan, posture=posture))
+            self._file.write(*rows)
 
     def lines(self) -> list[str]:
         """Say in words what the dome is worth."""

@@ -7,17 +7,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from aqualvs.app.blocks import block_length, in_blocks, read_ahead
+from aqualvs.app.blocks import in_blocks, read_ahead
 from aqualvs.app.crew import Crew
 from aqualvs.app.crew_work import CrewWork
-from aqualvs.app.measuring import Measured, Meter, measured_frames
+from aqualvs.app.measuring import Measured, Meter, measured_blocks
 from aqualvs.app.run_frames import ready, window_of, with_losses
 from aqualvs.app.run_inputs import FrameWindow
 from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.app.run_replay import Replay
 from aqualvs.live.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.scan import Frame
 
 
@@ -53,14 +52,14 @@ class RunMeasuring:
     ) -> None:
         self._source, self._rig, self._window = source, rig, window
         self._crew = None if work is None else Crew(work, n_processes)
-        self._head: Measured | None = None
-        self._shared: Iterator[Measured] = iter(())
+        self._head: list[Measured] | None = None
+        self._shared: Iterator[list[Measured]] = iter(())
         self._frames: Iterator[Frame] = iter(())
         self._stack = ExitStack()
 
-    def measured(
+    def blocks(
         self, scanner: ScansFrames, *, one_by_one: bool
-    ) -> Generator[Measured, None, None]:
+    ) -> Generator[list[Measured], None, None]:
         """Yield what is found, in the order of the dive; to be closed before the source is.
 
         Parameters
@@ -87,16 +86,15 @@ class RunMeasuring:
         first = None if isinstance(self._source, Replay) else self._window.first
         pairs = with_losses(self._frames, first, self._rig.n_water)
         ahead = _is_at_hand(self._source) and not one_by_one
-        together = ahead and isinstance(scanner, Scanner)
-        blocks = in_blocks(pairs, block_length(self._rig.size_px) if together else 1)
         meter = Meter(self._rig, scanner)
-        yield from measured_frames(read_ahead(blocks) if ahead else blocks, meter)
+        frames = in_blocks(pairs, meter.block_length if ahead else 1)
+        yield from measured_blocks(read_ahead(frames) if ahead else frames, meter)
 
     def __enter__(self) -> Self:
         """Wait for the first frame."""
         with self._stack as stack:
             if self._crew is not None:
-                self._shared = stack.enter_context(self._crew).measured()
+                self._shared = stack.enter_context(self._crew).blocks()
                 self._head = next(self._shared, None)
             if self._head is None:
                 frames = window_of(self._source, self._window)

@@ -44,16 +44,16 @@ class RunWriters:
         """Return the scanner to measure with: it has what it finds recorded, if that is wanted."""
         return self._mcap.recorded(scanner)
 
-    def write(self, measured: Measured) -> None:
-        """Write what was found in a frame, or what stands for a lost one."""
-        scan = measured.scan
-        if measured.is_lost:
-            self._mcap.lost(scan)
-        else:
-            self._net.add(scan)
-        self._outputs.write(scan)
-        self._bare_lens.write(measured)
-        self._overlay.write(measured.frame, scan)
+    def write(self, *found: Measured) -> None:
+        """Write what was found in frames, and what stands for lost ones, in their order."""
+        self._outputs.write(*(measured.scan for measured in found))
+        self._bare_lens.write(*found)
+        for measured in found:
+            self._overlay.write(measured.frame, measured.scan)
+            if measured.is_lost:
+                self._mcap.lost(measured.scan)
+            else:
+                self._net.add(measured.scan)
 
     def interrupt(self) -> None:
         """Note that the run ends before its source does."""

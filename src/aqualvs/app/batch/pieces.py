@@ -14,10 +14,10 @@ from aqualvs.app.batch.ledger import drafted, seal, sealed
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.watchers import NoteTaker, write_notes
 from aqualvs.app.batch.work import DiveWork, OpenDive, agreement_for, digest, open_dive
-from aqualvs.app.blocks import block_length, in_blocks
+from aqualvs.app.blocks import in_blocks
 from aqualvs.app.disk import writing
 from aqualvs.app.journal import PointsJournal
-from aqualvs.app.measuring import Measured, Meter, measured_frames
+from aqualvs.app.measuring import Measured, Meter, measured_blocks
 from aqualvs.app.net_check import net_check
 from aqualvs.app.outputs import JOURNAL, POSTURE_BARE_CSV, POSTURE_CSV
 from aqualvs.app.posture_csv import PostureCsv
@@ -26,7 +26,7 @@ from aqualvs.app.run_frames import ready, with_losses
 from aqualvs.app.run_inputs import FrameWindow
 from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.errors import SourceError
-from aqualvs.live.sources.span_frames import image_frames, video_frames
+from aqualvs.live.sources.span_frames import VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind
 from aqualvs.scanning.scan import Frame
 
@@ -128,14 +128,15 @@ def _write_piece(
         points = files.enter_context(PointsJournal(folder / JOURNAL))
         bare = files.enter_context(RunBareLens(folder, dive.rig))
         try:
-            for measured in _measured(dive, span, frames, meter):
-                scan = measured.scan
-                points.write(scan)
-                posture.write(scan)
-                bare.write(measured)
-                taker.add(scan)
-                n_valid += bool(scan.posture)
-                last_s = scan.time_s
+            for block in _blocks(dive, span, frames, meter):
+                scans = [measured.scan for measured in block]
+                points.write(*scans)
+                posture.write(*scans)
+                bare.write(*block)
+                for scan in scans:
+                    taker.add(scan)
+                n_valid += sum(bool(scan.posture) for scan in scans)
+                last_s = scans[-1].time_s
         except SourceError as broken_off:
             fault = str(broken_off)
     write_notes(taker.notes, folder / NOTES)
@@ -155,20 +156,25 @@ def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
     """Return the frames of a piece; the first of them has been decoded."""
     path = Path(dive.request.source)
     if span.kind is SpanKind.VIDEO:
-        return video_frames(path, span, dive.rig.size_px)
+        return _video_frames(path, span, dive.rig.size_px)
     if span.kind is SpanKind.IMAGES:
         return image_frames(path, span, dive.request.fps or 1.0)
     return ready(iter(dive.source), dive.source, FrameWindow())
 
 
-def _measured(
+def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[Frame]:
+    with VideoParts(path, size_px) as video:
+        yield from video.frames(span)
+
+
+def _blocks(
     dive: OpenDive, span: Span, frames: Iterator[Frame], meter: Meter
-) -> Iterator[Measured]:
+) -> Iterator[list[Measured]]:
     """Yield what is found in a piece's frames, and what stands for lost ones."""
     # A recording tells of lost frames itself.
     first = None if dive.replay is not None else span.first
     pairs = with_losses(frames, first, dive.rig.n_water)
-    return measured_frames(in_blocks(pairs, block_length(dive.rig.size_px)), meter)
+    return measured_blocks(in_blocks(pairs, meter.block_length), meter)
 
 
 class _Kept(threading.local):

@@ -3,6 +3,8 @@
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
+from typing import Self, cast
 
 import av
 from av.container import InputContainer
@@ -24,42 +26,81 @@ class UnlikeSurveyError(Exception):
     """A part of a dive does not hold what it should; the dive must be measured in one piece."""
 
 
-def video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[Frame]:
-    """Decode a part of a video; frames have the index and the time that the whole video gives them.
+class VideoParts:
+    """Reads parts of a video, opened once for all of them; a context manager.
 
     Parameters
     ----------
     path : Path
-    span : Span
-        From `video_spans` of the same file.
     size_px : (int, int)
         Width and height of every picture.
-
-    Raises
-    ------
-    UnlikeSurveyError
-        If any picture is damaged or missing: only the whole video tells what becomes of those that
-        follow.
     """
-    index, latest = span.first, span.origin_pts - 1
-    try:
-        with av.open(str(path), timeout=_PATIENCE_S) as container:
-            stream = container.streams.video[0]
-            _prepare(stream)
-            for picture in _pictures(container, stream, span):
+
+    def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
+        self._path, self._size_px = path, size_px
+        self._container: InputContainer | None = None
+
+    def frames(self, span: Span) -> Iterator[Frame]:
+        """Decode a part; frames have the index and the time that the whole video gives them.
+
+        Parameters
+        ----------
+        span : Span
+            From `video_spans` of the same file.
+
+        Raises
+        ------
+        UnlikeSurveyError
+            If any picture is damaged or missing: only the whole video tells what becomes of those
+            that follow.
+        """
+        index, latest = span.first, span.origin_pts - 1
+        try:
+            stream = self._stream(span)
+            for picture in _pictures(stream, span):
                 if picture.is_corrupt or picture.pts is None or picture.pts <= latest:
                     raise UnlikeSurveyError(f"picture {index} is damaged")
-                if (picture.width, picture.height) != size_px:
+                if (picture.width, picture.height) != self._size_px:
                     raise UnlikeSurveyError(f"picture {index} has another size")
                 latest = picture.pts
                 ticks = picture.pts - span.origin_pts
                 luma, chroma = planes_of(picture)
                 yield Frame(index, float(ticks * (stream.time_base or 0)), luma, chroma)
                 index += 1
-    except (av.error.FFmpegError, OSError) as fault:
-        raise UnlikeSurveyError(f"picture {index} or a later one is damaged ({fault})") from fault
-    if index != span.stop:
-        raise UnlikeSurveyError(f"{index - span.first} pictures of {span.stop - span.first}")
+        except (av.error.FFmpegError, OSError) as fault:
+            raise UnlikeSurveyError(
+                f"picture {index} or a later one is damaged ({fault})"
+            ) from fault
+        if index != span.stop:
+            raise UnlikeSurveyError(f"{index - span.first} pictures of {span.stop - span.first}")
+
+    def close(self) -> None:
+        """Close the file; frames already delivered stay valid."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+    def _stream(self, span: Span) -> VideoStream:
+        if not span.first:
+            # Some containers cannot be wound back.
+            self.close()
+        if self._container is None:
+            self._container = av.open(str(self._path), timeout=_PATIENCE_S)
+            _prepare(self._container.streams.video[0])
+        return self._container.streams.video[0]
+
+    def __enter__(self) -> Self:
+        """Return itself; the file is opened when it is needed."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
 
 
 def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
@@ -91,10 +132,10 @@ def _prepare(stream: VideoStream) -> None:
     context.options = {"err_detect": "explode"}
 
 
-def _pictures(container: InputContainer, stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
+def _pictures(stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
     """Yield the pictures of exactly the packets of a part."""
     checksums = []
-    for packet in itertools.islice(_packets_from(container, stream, span), span.stop - span.first):
+    for packet in itertools.islice(_packets_from(stream, span), span.stop - span.first):
         checksums.append(packet_checksum(packet))
         yield from packet.decode()
     if joint_checksum(checksums) != span.checksum:
@@ -102,10 +143,12 @@ def _pictures(container: InputContainer, stream: VideoStream, span: Span) -> Ite
     yield from stream.codec_context.decode(None)
 
 
-def _packets_from(
-    container: InputContainer, stream: VideoStream, span: Span
-) -> "Iterator[Packet[VideoStream]]":
-    """Yield the packets of a stream from where a part begins."""
+def _packets_from(stream: VideoStream, span: Span) -> "Iterator[Packet[VideoStream]]":
+    """Yield the packets of a stream from where a part begins.
+
+    Seeking has the decoder forget what it holds, as if nothing had been decoded before.
+    """
+    container = cast("InputContainer", stream.container)
     if not span.first:
         return (packet for packet in container.demux(stream) if packet.size)
     for before_s in _SEEK_BEFORE_S:
