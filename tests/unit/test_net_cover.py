@@ -13,7 +13,7 @@ from aqualvs.scanning.net_lines import NetSignal
 from aqualvs.scanning.net_track import LatticeFitter
 from aqualvs.scanning.net_twine import Twine
 
-BAR, STEP, HALF, HEIGHT = 0.05, 5e-4, 0.4, 100.0
+BAR, STEP, HALF, HEIGHT, PIXEL = 0.05, 5e-4, 0.4, 100.0, 6e-4
 NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0, np.ones(2))
 TURN = np.deg2rad(40.0)
 # Body 2.4 mm, halo 0.6 mm and a share of a step of the search lines.
@@ -49,7 +49,7 @@ def view_of(
         origin=np.zeros((2, 2)),
         direction=direction,
         search=search,
-        pixel=6e-4,
+        pixel=PIXEL,
         along=np.tile(along, (2, 1)),
         step=np.full(state.shape, STEP),
         state=state,
@@ -80,8 +80,9 @@ def test_dashes_are_sorted_by_laser_and_family() -> None:
     for kind in (level, slanted):
         usual = TWINE.usual(*(np.array(v) for v in (kind.across, kind.slant, STEP, HEIGHT)))
         assert kind.length == pytest.approx(float(usual), abs=STEP)
-        # Width square to the line: the search line leans.
-        assert kind.width == pytest.approx(4e-3 * np.cos(TURN))
+        # Pixels are as large as search lines are apart; width square to the line: that leans.
+        assert kind.pixel == pytest.approx(STEP * np.cos(TURN))
+        assert kind.width == pytest.approx(4e-3 * np.cos(TURN) * kind.pixel / PIXEL)
         assert kind.step == pytest.approx(STEP)
 
 
@@ -132,6 +133,8 @@ def test_growth_is_solid() -> None:
     # On the lines 0.4 of 20 (cos + sin) dashes a metre are 4 mm longer; some run together.
     more = 0.4 * 4e-3 * (np.cos(TURN) + np.sin(TURN)) / BAR
     assert 0.7 * more < grown[0] - bare[0] < 1.05 * more
+    # A quarter of what growth adds is open.
+    assert grown[1] > np.hypot(bare[1], 0.2 * more)
 
 
 def test_holes_are_no_part_of_the_sound_net() -> None:

@@ -69,6 +69,21 @@ def measured(heights: list[float], widths: list[float] | None = None) -> tuple[f
     return float(dashes.length[0]) / STEP, float(dashes.width[0])
 
 
+def test_an_overexposed_core_does_not_end_a_dash() -> None:
+    def dashes_of(left: list[float], dark: int, right: list[float]) -> np.ndarray:
+        signal = signal_of(".." + "#" * len(left) + "." * dark + "#" * len(right) + "..")
+        signal.height[signal.state == 2] = left + right
+        return find_dashes(signal).dashes.length / STEP
+
+    white = dashes_of([40.0, 150.0], 3, [155.0, 90.0])
+    # As a core that is seen: 62 lies between 0 and 90, and a sixth of a step up from 40.
+    whole = dashes_of([40.0, 150.0, 150.0, 150.0], 0, [150.0, 155.0, 90.0])
+    np.testing.assert_allclose(white, whole)
+    # Two strands: the light fades between them, or the dark is too wide.
+    assert len(dashes_of([40.0, 150.0, 90.0], 3, [90.0, 155.0, 90.0])) == 2
+    assert len(dashes_of([40.0, 150.0], 4, [155.0, 90.0])) == 2
+
+
 def test_a_dash_ends_where_its_light_falls_below_a_share_of_its_peak() -> None:
     # 40 of 100 lies a quarter of a step from 30 towards 70, at both ends.
     assert measured([30.0, 70.0, 100.0, 70.0, 30.0])[0] == pytest.approx(3.5)

@@ -77,6 +77,8 @@ def found_in(seed: int, *net: object, n_frames: int = 12, noise: float = 5e-4) -
         ("square", 0.025, 3.0, 45.0),
         ("square", 0.040, 33.0, 45.0),
         ("diamond", 0.018, 80.0, 33.0),
+        # Its waves lie as a honeycomb's do.
+        ("diamond", 0.026, 50.0, 30.0),
         ("hexagon", 0.022, 17.0, 0.0),
     ],
 )
@@ -144,6 +146,27 @@ def test_power_is_that_of_a_sum_over_places() -> None:
         expected += abs(swing) ** 2
     n = sum(len(one.place) for one in frames)
     assert Spectrum.of(frames).at(wave)[0] == pytest.approx(expected / n, rel=1e-3)
+
+
+def test_power_of_a_rest_is_that_of_its_pieces_one_by_one() -> None:
+    rng = np.random.default_rng(9)
+    frames = [frame(rng, "square", 0.02, 0.3, np.pi / 4.0, 1e-3) for _ in range(3)]
+    one, other = families("square", 0.02, 0.3, np.pi / 4.0)
+    rest = Spectrum.of(frames).without(one)
+    assert len(rest.begin) > 60
+    power = np.zeros(3)
+    for h in range(3):
+        wave = (h + 1) * other
+        for k in range(3):
+            swing = np.sum(
+                np.exp(2j * np.pi * rest.place[rest.start[k] : rest.start[k + 1]] @ wave)
+            )
+            mine = slice(rest.span_start[k], rest.span_start[k + 1])
+            turns = (rest.end[mine] - rest.begin[mine]) @ wave
+            middle = 0.5 * (rest.begin[mine] + rest.end[mine]) @ wave
+            swing -= np.sum(rest.expected[mine] * np.sinc(turns) * np.exp(2j * np.pi * middle))
+            power[h] += abs(swing) ** 2
+    np.testing.assert_allclose(rest.at(other, 3), power / rest.n_crossings, rtol=1e-9)
 
 
 def test_without_a_family_its_crossings_are_gone() -> None:

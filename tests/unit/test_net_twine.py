@@ -11,8 +11,8 @@ from aqualvs.scanning.net_twine import DashKind, measure_twine
 
 # Silhouette of a diameter, how much of it is lit and what blur adds at the usual height with search
 # lines STEP apart; widths of the sheet, lit and at half height; as `net_twine` expects them.
-BODY, SEEN, STEP, PIXEL, HALO = 0.95, 0.81, 6e-4, 6e-4, 0.778e-3
-SHEET, HALF_HEIGHT = 3.5e-3, 4.655e-3
+BODY, SEEN, STEP, PIXEL, HALO = 0.95, 0.82, 6e-4, 6e-4, 0.694e-3
+SHEET, HALF_HEIGHT = 2.8e-3, 2.66e-3
 
 
 def kinds_of(
@@ -20,17 +20,18 @@ def kinds_of(
 ) -> list[DashKind]:
     """Dashes exactly as the model has them."""
     body = BODY * twine
+    lit = SEEN * body + HALO
     # Brighter dashes are longer.
-    lit = SEEN * body + HALO + 0.4e-3 * np.log(height / 100.0)
+    brighter = (height / 100.0) ** 0.25
     return [
         DashKind(
             laser=i % 3,
             family=i // 3,
             across=a,
             slant=k,
-            length=float(np.hypot(lit / a, SHEET * k)),
+            length=float(brighter * np.hypot(lit / a, SHEET * k)),
             width=float(
-                (HALF_HEIGHT**-2.5 + (k * a / (body + 1.2 * PIXEL)) ** 2.5) ** (-1.0 / 2.5)
+                (HALF_HEIGHT**-2.5 + (k * a / (body + 0.95 * PIXEL)) ** 2.5) ** (-1.0 / 2.5)
             ),
             height=height,
             step=STEP,
@@ -52,8 +53,9 @@ def test_twine_is_found_at_any_angles(twine: float, angles: list[float]) -> None
     slant = [float(1.0 / np.tan(np.deg2rad(a))) for a in angles]
     found = measure_twine(kinds_of(twine, across, slant))
     assert found is not None
-    # The prior of the sheet is met exactly, that of the twine pulls a little.
-    assert found.thickness == pytest.approx(twine, rel=0.06)
+    # The prior of the sheet is met exactly, that of the twine pulls a little: most where it is thin
+    # and no strand is square to its line.
+    assert found.thickness == pytest.approx(twine, rel=0.08)
     assert abs(found.thickness - twine) < 2.0 * found.sigma
 
 
@@ -93,7 +95,7 @@ def test_known_twine_measures_the_halo() -> None:
     # What is lit is as before: what was twine is halo now.
     lit = found.usual(np.ones(1), np.zeros(1), np.full(1, STEP), np.full(1, 100.0))
     assert lit[0] == pytest.approx(SEEN * BODY * 2.0e-3 + HALO, rel=0.05)
-    assert found.halo == pytest.approx(lit[0] - BODY * 1.6e-3 - 0.28 * STEP)
+    assert found.halo == pytest.approx(lit[0] - BODY * 1.6e-3 - 0.44 * STEP)
 
 
 @pytest.mark.parametrize("height", [30.0, 200.0])
@@ -114,7 +116,7 @@ def test_faint_and_far_strands_are_less_certain() -> None:
     assert faint is not None
     assert far is not None
     assert faint.sigma > 1.5 * near.sigma
-    assert far.sigma > 1.55 * near.sigma
+    assert far.sigma > 1.4 * near.sigma
 
 
 def test_no_dashes_no_twine() -> None:

@@ -21,10 +21,10 @@ from aqualvs.scanning.net_twine import USUAL_HEIGHT, DashKind, Twine
 _LEAST_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
 _LEAST_DASHES = 6
 # Growth lengthens dashes, and makes them differ; up to this share of all light on a kind's dashes
-# they are bare still, less the more they differ. Measured on simulated dives. They also differ by
-# noise, which is so many grey levels.
-_BARE_SHARE, _LESS_BARE, _LEAST_BARE = 0.4, 0.9, 0.08
-_NOISE = 6.0
+# they are bare still, falling with how much they differ by this scale. They also differ by noise,
+# which is so many grey levels, and where there is none. From simulated dives.
+_BARE_SHARE, _DIFFER, _LEAST_BARE = 0.45, 0.22, 0.08
+_NOISE, _NO_NOISE = 7.0, 0.03
 _SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
 _WIDTH_QUANTILE = 0.4
 # Sines of smaller angles say no more than that a strand runs along the line.
@@ -35,6 +35,8 @@ _BLOCKS = 6
 # Errors of solidity for dashes that run together or are not seen, as shares: of any net, and per
 # pixel in the distance of two strands (simulated dives).
 _SHARE_ERROR, _UNRESOLVED = 0.04, 1.5
+# And as a share of what growth adds: it stands out of the net, and is lit and seen askew.
+_GROWTH_ERROR = 0.25
 # Growth so far apart along the net, in metres, is independent.
 _ALIKE = 0.02
 # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
@@ -115,8 +117,9 @@ def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind
 def _kind(mine: FloatArray, spread: float) -> DashKind:
     """Take dashes (rows as `_rows` makes them) together."""
     across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
-    grown = np.sqrt(max(spread**2 - (_NOISE / max(height, 1.0)) ** 2, 0.0))
-    share = float(np.clip(_BARE_SHARE - _LESS_BARE * grown, _LEAST_BARE, _BARE_SHARE))
+    noise = np.hypot(_NOISE / max(height, 1.0), _NO_NOISE)
+    grown = np.sqrt(max(spread**2 - noise**2, 0.0))
+    share = float(max(_BARE_SHARE * np.exp(-grown / _DIFFER), _LEAST_BARE))
     return DashKind(
         laser=int(mine[0, 0]),
         family=int(mine[0, 1]),
@@ -147,16 +150,21 @@ def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
     clear &= angles.across > _LEAST_ACROSS
     if lattice.mesh is Mesh.FOUR_SIDED:
         clear &= fit.clear > _CLEAR * pitch.min()
+    step = one.view.step[dashes.laser]
+    # A search line stands for a whole number of pixels; it tells better than the range does how
+    # large they are on the net.
+    lines = np.maximum(np.rint(step * angles.square / one.view.pixel), 1.0)
+    pixel = step * angles.square / lines
     columns = [
         dashes.laser,
         fit.family,
         angles.across,
         angles.slant,
         dashes.length,
-        dashes.width * angles.square,
+        dashes.width * angles.square * pixel / one.view.pixel,
         dashes.height,
-        one.view.step[dashes.laser],
-        np.full(len(dashes), one.view.pixel),
+        step,
+        pixel,
     ]
     return np.stack([column[clear].astype(np.float64) for column in columns], axis=1)
 
@@ -197,7 +205,9 @@ def measure_solidity(
     chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
     unresolved = _UNRESOLVED * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
     shares = [_spread_of_mean(np.concatenate(rows)), _SHARE_ERROR, unresolved]
-    sigmas = [chance, _family_sum(error, seen, counts), *(solidity * one for one in shares)]
+    bare = float(np.sum(twine.body * lattice.density / lattice.pitch))
+    grown = _GROWTH_ERROR * max(solidity - bare, 0.0)
+    sigmas = [chance, _family_sum(error, seen, counts), grown, *(solidity * one for one in shares)]
     return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
 
 

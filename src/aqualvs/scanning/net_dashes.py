@@ -5,15 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.scanning.net_cut import cut_lines
 from aqualvs.scanning.net_lines import LineState, NetSignal
 from aqualvs.scanning.net_spectrum import Crossings
 
-# A dark gap of one search line does not end a dash: compression and specks make such gaps.
-_BRIDGED = 1
-# A dash is as long as its light stands above this share of its peak, whatever the exposure; above
-# the greater one it is as wide as it gets.
-_LEVEL, _BRIGHT = 0.4, 0.8
 # Dark pieces so many times longer than most (this quantile) are holes; a lattice is not looked for
 # there.
 _HOLE, _MOST = 2.5, 0.8
@@ -143,7 +138,7 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
     most = n_lasers * n_lines
     dash, gap, span = np.empty((most, 6)), np.empty((2 * most, 8)), np.empty((most, 3))
     usual = np.empty((n_lasers, 2))
-    n, k, m = _cut(
+    n, k, m = cut_lines(
         np.ascontiguousarray(state, np.uint8),
         signal.along,
         signal.step,
@@ -212,6 +207,8 @@ def _without(
     laser: IntArray, span: FloatArray, gap_laser: IntArray, gap: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """Cut gaps out of spans; laser (n,) and ends (n, 2) of what remains."""
+    if not len(gap):
+        return laser, span
     kept: list[tuple[int, float, float]] = []
     for i, (first, last) in zip(laser, span, strict=True):
         at = float(first)
@@ -221,179 +218,3 @@ def _without(
         kept.append((i, at, float(last)))
     table = np.array([one for one in kept if one[2] > one[1]], np.float64).reshape(-1, 3)
     return table[:, 0].astype(np.int64), table[:, 1:]
-
-
-@kernel
-def _cut(
-    state: IntArray,
-    along: FloatArray,
-    step: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    beyond: BoolArray,
-    dash: FloatArray,
-    gap: FloatArray,
-    span: FloatArray,
-    usual: FloatArray,
-) -> tuple[int, int, int]:
-    """Write dashes, gaps and spans as their classes have them, and `step` and `beyond`.
-
-    Rows of `dash`: laser, whole, middle, length, height, width. Of `gap`: laser, ends, middles,
-    closed, beyond. Of `span`: laser, ends.
-    """
-    n_lasers, n_lines = state.shape
-    n, k, m = 0, 0, 0
-    for i in range(n_lasers):
-        steps = step[i][step[i] > 0.0]
-        usual[i, 0] = np.median(steps) if len(steps) else 0.0
-        n_dark, n_beyond = 0, 0
-        # Gaps and dashes ascend along the line, whichever way the search lines run.
-        back = _descends(along[i])
-        begin = 0
-        while begin < n_lines:
-            end = begin
-            while end < n_lines and state[i, _turned(end, n_lines, back)] != 0:
-                j = _turned(end, n_lines, back)
-                dark = state[i, j] == 1
-                n_dark += dark
-                n_beyond += dark and beyond[i, j]
-                end += 1
-            if end == begin:
-                begin += 1
-                continue
-            span[m, 0] = i
-            span[m, 1], span[m, 2] = _ends(i, begin, end - 1, back, along, step)
-            n, k = _cut_span(
-                i, begin, end, back, state, along, step, height, width, beyond, dash, n, gap, k
-            )
-            m += 1
-            begin = end
-        usual[i, 1] = n_beyond / max(n_dark, 1)
-    return n, k, m
-
-
-@kernel
-def _cut_span(
-    i: int,
-    begin: int,
-    end: int,
-    back: bool,
-    state: IntArray,
-    along: FloatArray,
-    step: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    beyond: BoolArray,
-    dash: FloatArray,
-    n: int,
-    gap: FloatArray,
-    k: int,
-) -> tuple[int, int]:
-    """Append the dashes and gaps of one span; the new counts."""
-    n_lines = state.shape[1]
-    j, dark_from, before = begin, begin, -1
-    while j < end:
-        if state[i, _turned(j, n_lines, back)] != 2:
-            j += 1
-            continue
-        first, last = j, j
-        while j < end and j - last <= _BRIDGED + 1:
-            if state[i, _turned(j, n_lines, back)] == 2:
-                last = j
-            j += 1
-        j = last + 1
-        peak, wide, n_bright = 0.0, 0.0, 0
-        for a in range(first, last + 1):
-            peak = max(peak, height[i, _turned(a, n_lines, back)])
-        for a in range(first, last + 1):
-            b = _turned(a, n_lines, back)
-            if height[i, b] >= _BRIGHT * peak:
-                wide += width[i, b]
-                n_bright += 1
-        length = _length_above(i, first, last, back, _LEVEL * peak, step, height)
-        low, high = _ends(i, first, last, back, along, step)
-        dash[n, 0], dash[n, 1] = i, 1.0 if first > begin and last < end - 1 else 0.0
-        dash[n, 2], dash[n, 3] = 0.5 * (low + high), length
-        dash[n, 4], dash[n, 5] = peak, wide / n_bright
-        if first > dark_from:
-            _put_gap(i, dark_from, first - 1, back, along, step, beyond, gap, k, dash, before, n)
-            k += 1
-        dark_from, before = last + 1, n
-        n += 1
-    if end > dark_from:
-        _put_gap(i, dark_from, end - 1, back, along, step, beyond, gap, k, dash, before, -1)
-        k += 1
-    return n, k
-
-
-@kernel
-def _length_above(
-    i: int, first: int, last: int, back: bool, level: float, step: FloatArray, height: FloatArray
-) -> float:
-    """Metres of a run of search lines above a level; heights change evenly, beyond it is dark."""
-    n_lines = step.shape[1]
-    length, before = 0.0, 0.0
-    for a in range(first, last + 1):
-        b = _turned(a, n_lines, back)
-        here = height[i, b]
-        after = height[i, _turned(a + 1, n_lines, back)] if a < last else 0.0
-        if here >= level:
-            length += step[i, b]
-            if before < level:
-                length += step[i, b] * ((here - level) / (here - before) - 0.5)
-            if after < level:
-                length += step[i, b] * ((here - level) / (here - after) - 0.5)
-        before = here
-    return length
-
-
-@kernel
-def _put_gap(
-    i: int,
-    first: int,
-    last: int,
-    back: bool,
-    along: FloatArray,
-    step: FloatArray,
-    beyond: BoolArray,
-    gap: FloatArray,
-    k: int,
-    dash: FloatArray,
-    before: int,
-    behind: int,
-) -> None:
-    """Write gap k between two dashes by their rows; -1 where the span ends."""
-    seen = 0
-    for a in range(first, last + 1):
-        seen += beyond[i, _turned(a, along.shape[1], back)]
-    gap[k, 0] = i
-    gap[k, 1], gap[k, 2] = _ends(i, first, last, back, along, step)
-    gap[k, 3] = dash[before, 2] if before >= 0 else gap[k, 1]
-    gap[k, 4] = dash[behind, 2] if behind >= 0 else gap[k, 2]
-    gap[k, 5], gap[k, 6] = 1.0 if before >= 0 else 0.0, 1.0 if behind >= 0 else 0.0
-    gap[k, 7] = seen / (last - first + 1)
-
-
-@kernel
-def _ends(
-    i: int, first: int, last: int, back: bool, along: FloatArray, step: FloatArray
-) -> tuple[float, float]:
-    """Both ends of a run of search lines on the laser's line, ascending."""
-    a, b = _turned(first, along.shape[1], back), _turned(last, along.shape[1], back)
-    return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
-
-
-@kernel
-def _turned(j: int, n: int, back: bool) -> int:
-    return n - 1 - j if back else j
-
-
-@kernel
-def _descends(along: FloatArray) -> bool:
-    first, last = np.nan, np.nan
-    for value in along:
-        if np.isfinite(value):
-            if not np.isfinite(first):
-                first = value
-            last = value
-    return bool(last < first)

@@ -17,9 +17,11 @@ from aqualvs.scanning.net_hypotheses import (
 )
 from aqualvs.scanning.net_spectrum import Crossings, Spectrum
 
-_MOST_FRAMES = 30
+# Frames that a lattice is fitted to, and among them those in which it is searched for.
+_MOST_FRAMES, _SEARCHED_FRAMES = 30, 12
 # Likely lattices that are refined roughly, and the best of them well, before they are compared.
 _FOLLOWED, _COMPARED = 12, 4
+_FIRST_ROUNDS, _ROUNDS, _LAST_ROUNDS = 2, 5, 7
 # Fewer crossings in a frame say nothing.
 _LEAST_CROSSINGS = 5
 # Lattices with less log-likelihood per frame may as well be chance.
@@ -105,8 +107,10 @@ def find_lattice(
     spectrum = Spectrum.of(chosen)
     best = _known(before, spectrum) if before is not None else None
     if best is None:
-        best = _searched(spectrum)
-    if best is None:
+        best = _searched(Spectrum.of(_spread(chosen, _SEARCHED_FRAMES)))
+        best = best and refine(best, spectrum, _LAST_ROUNDS)
+    # What few frames show by chance all of them do not.
+    if best is None or best.score < _LEAST_SCORE:
         return None
     return _lattice(best, _sigma(best, chosen))
 
@@ -114,14 +118,14 @@ def find_lattice(
 def _searched(spectrum: Spectrum) -> Hypothesis | None:
     rough = [one.scored(score(spectrum, one)) for one in hypotheses(spectrum)]
     rough.sort(key=lambda one: -one.score)
-    tried = [refine(one, spectrum, 2) for one in rough[:_FOLLOWED]]
+    tried = [refine(one, spectrum, _FIRST_ROUNDS) for one in rough[:_FOLLOWED]]
     tried.sort(key=lambda one: -one.score)
-    tried[:_COMPARED] = [refine(one, spectrum, 6) for one in tried[:_COMPARED]]
+    tried[:_COMPARED] = [refine(one, spectrum, _ROUNDS) for one in tried[:_COMPARED]]
     best = max(tried, key=lambda one: one.score)
     others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > _SAME_BAR]
     if best.score < max([_LEAST_SCORE, *(score + _LEAST_LEAD for score in others)]):
         return None
-    return refine(best, spectrum, 10)
+    return best
 
 
 def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
@@ -137,10 +141,15 @@ def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
 def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
     """Return some frames, evenly spread, of those with enough crossings to tell anything."""
     useful = [one for one in frames if len(one.place) >= _LEAST_CROSSINGS]
-    if len(useful) <= _MOST_FRAMES:
-        return useful
-    index = np.linspace(0, len(useful) - 1, _MOST_FRAMES).round().astype(int)
-    return [useful[i] for i in index]
+    return _spread(useful, _MOST_FRAMES)
+
+
+def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
+    """Return so many frames at most, evenly spread."""
+    if len(frames) <= most:
+        return list(frames)
+    index = np.linspace(0, len(frames) - 1, most).round().astype(int)
+    return [frames[i] for i in index]
 
 
 def _sigma(best: Hypothesis, frames: Sequence[Crossings]) -> float:

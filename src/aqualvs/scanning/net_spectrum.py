@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.scanning.net_waves import comb_power, crest_phases, off_crests
+from aqualvs.scanning.net_likelihood import HIGHEST
+from aqualvs.scanning.net_waves import comb_power, crest_phases, expected_on, off_crests
 
 LARGEST_PITCH = 0.09
 """Distance between parallel strands up to which they are looked for, in metres."""
-HIGHEST = 125.0
-"""End of the spectrum, in periods a metre."""
 N_ANGLES = 180
 """Directions of waves in half a turn."""
 STEP = 0.9
@@ -33,7 +32,8 @@ _ALONG: FloatArray = np.arange(-HIGHEST, HIGHEST + STEP, STEP)
 _UPWARD: FloatArray = np.arange(-2.0 * STEP, HIGHEST + STEP, STEP)
 # On the grid evenly spread crossings are so far apart, in metres: their own period is beyond its
 # end. The grid shows where to look, so some of the frames are enough.
-_APART, _MOST_ON_GRID = 6.5e-3, 16
+_APART = 7.5e-3
+_MOST_ON_GRID = 12
 
 
 Swings: TypeAlias = NDArray[np.complex64]
@@ -90,8 +90,10 @@ class Spectrum:
 
     Attributes
     ----------
-    lines, laser, lit
+    place, line, start, begin, end, span_line, span_start, lines, laser, lit
         As given.
+    expected : array, shape (M,)
+        Crossings on every piece if those of its line were spread evenly.
     n_frames, n_crossings : int
         Frames and all crossings.
     per_frame : float
@@ -113,17 +115,15 @@ class Spectrum:
         laser: IntArray,
         lit: float,
     ) -> None:
-        self._place, self._line, self._start = place, line, start
-        self._begin, self._end = begin, end
-        self._span_line, self._span_start = span_line, span_start
+        self.place, self.line, self.start = place, line, start
+        self.begin, self.end = begin, end
+        self.span_line, self.span_start = span_line, span_start
         self.lines, self.laser, self.lit = lines, laser, lit
         self.n_frames = len(start) - 1
         self.n_crossings = len(place)
         self.per_frame = self.n_crossings / self.n_frames
         seen = np.bincount(line, minlength=len(lines))
-        length = np.hypot(*(end - begin).T)
-        per_metre = seen / np.maximum(np.bincount(span_line, length, minlength=len(lines)), 1e-9)
-        self._expected = length * per_metre[span_line]
+        self.expected = expected_on(line, begin, end, span_line, len(lines))
         self.seen = np.bincount(laser, seen, minlength=laser.max(initial=0) + 1)
 
     @classmethod
@@ -145,39 +145,39 @@ class Spectrum:
 
     def without(self, wave: FloatArray) -> "Spectrum":
         """Return the spectrum of what does not lie on the crests of a wave."""
-        phase = crest_phases(self._place, self._start, wave[0], wave[1])
+        phase = crest_phases(self.place, self.start, wave[0], wave[1])
         kept, start, begin, end, origin, span_start = off_crests(
-            self._place,
-            self._start,
-            self._begin,
-            self._end,
-            self._span_start,
+            self.place,
+            self.start,
+            self.begin,
+            self.end,
+            self.span_start,
             phase,
             wave[0],
             wave[1],
         )
         return Spectrum(
-            self._place[kept],
-            self._line[kept],
+            self.place[kept],
+            self.line[kept],
             start,
             begin,
             end,
-            self._span_line[origin],
+            self.span_line[origin],
             span_start,
             self.lines,
             self.laser,
             self.lit,
         )
 
-    def _on_grid(self) -> FloatArray:
+    def _on_grid(self, most: int) -> FloatArray:
         """Power over the upper half plane, some rows more; the rest of the plane is its mirror."""
         power = np.zeros((len(_ALONG), len(_UPWARD)), np.float32)
         count = 0
-        every = max(1, -(-self.n_frames // _MOST_ON_GRID))
-        frames = list(zip(pairwise(self._start), pairwise(self._span_start), strict=True))
+        every = max(1, -(-self.n_frames // most))
+        frames = list(zip(pairwise(self.start), pairwise(self.span_start), strict=True))
         for (first, last), (from_, to) in frames[::every]:
             even, weight = self._evenly_spread(from_, to)
-            place = np.concatenate([self._place[first:last], even])
+            place = np.concatenate([self.place[first:last], even])
             x = _swings(place[:, 0], _ALONG[0], len(_ALONG))
             x *= np.r_[np.ones(last - first), -weight].astype(np.float32)[:, None]
             amplitude = x.T @ _swings(place[:, 1], _UPWARD[0], len(_UPWARD))
@@ -187,34 +187,37 @@ class Spectrum:
 
     def _evenly_spread(self, first: int, last: int) -> tuple[FloatArray, FloatArray]:
         """Places spread over some spans, and how many crossings each of them stands for."""
-        begin, end = self._begin[first:last], self._end[first:last]
+        begin, end = self.begin[first:last], self.end[first:last]
         length = np.hypot(*(end - begin).T)
         pieces = np.maximum(np.ceil(length / _APART), 1.0).astype(np.int64)
         number = np.repeat(np.arange(len(pieces)), pieces)
         share = np.arange(len(number)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5
         share /= pieces[number]
         place = begin[number] + share[:, None] * (end - begin)[number]
-        return place, (self._expected[first:last] / pieces)[number]
+        return place, (self.expected[first:last] / pieces)[number]
 
     def at(self, wave: FloatArray, n_harmonics: int = 1) -> FloatArray:
         """Power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
         power = np.zeros(n_harmonics)
         comb_power(
-            self._place,
-            self._start,
-            self._begin,
-            self._end,
-            self._expected,
-            self._span_start,
+            self.place,
+            self.start,
+            self.begin,
+            self.end,
+            self.expected,
+            self.span_start,
             wave[0],
             wave[1],
             power,
         )
         return power / max(self.n_crossings, 1)
 
-    def polar(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Power at sizes (K,) and directions (A,) of waves, the highest nearby, shape (K, A)."""
-        highest: FloatArray = maximum_filter(self._on_grid(), 3)
+    def polar(self, most: int = _MOST_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Power at sizes (K,) and directions (A,) of waves, the highest nearby, shape (K, A).
+
+        So many frames at most are looked at, evenly spread.
+        """
+        highest: FloatArray = maximum_filter(self._on_grid(most), 3)
         step = 0.5 * STEP
         n_sizes = int((HIGHEST - 2.0 * STEP - 0.5 / LARGEST_PITCH) / step)
         size: FloatArray = 0.5 / LARGEST_PITCH + step * np.arange(n_sizes, dtype=np.float64)

@@ -4,15 +4,15 @@ The light on a strand is where strand and laser sheet overlap: a parallelogram w
 Search lines meet it over a length that follows in quadrature from strand and sheet, and across the
 line it is as wide as the sheet or as the strand lets it be, whichever is less:
 
-    length² = (l / sin a)² + (w k)²,        width⁻ᵖ = (r w)⁻ᵖ + (k sin a / (d + e))ᵖ,
+    (length / b)² = (l / sin a)² + (w k)²,    width⁻ᵖ = (r w)⁻ᵖ + (k sin a / (d + e))ᵖ,
 
 with the silhouette d, its lit width l, the crossing angle a, the sheet's lit width w and the slant
 k, by which the strand runs away from the search lines on its way across the sheet. Dashes at
 several angles tell strand and sheet apart; r says how the sheet's width at half height compares
 with its lit one. A dash ends where its light falls below a share of its own peak (`net_dashes`), so
-that its length depends on brightness little: l is less than d, because round strands are dim at
-their edges, and more by blur. How much was measured in simulation; the uncertainty holds what it
-varied.
+that its length depends on brightness little, as b says: overexposed tops are cut off, and faint
+edges are lost. l is less than d, because round strands are dim at their edges, and more by blur.
+How much was measured in simulation; the uncertainty holds what it varied.
 """
 
 import math
@@ -23,32 +23,33 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 
-# Lit width of a strand: so much of its silhouette, and so much more in metres, in steps of the
-# search lines, and in metres per logarithm of its height over the usual one in grey levels (bright
-# tops are cut off, faint edges are lost). From simulated dives in clear and turbid water at 0.3 to
-# 1.0 m with two rigs, hardly fouled, whose twine was known.
-_SEEN, _HALO, _HALO_STEPS, _HALO_HEIGHT = 0.81, 0.61e-3, 0.28, 0.4e-3
+# Lit width of a strand: so much of its silhouette, and so much more in metres and in steps of the
+# search lines; and the power of its height over the usual one, in grey levels, with which dashes
+# grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m whose twine was known.
+_SEEN, _HALO, _HALO_STEPS, _BRIGHTER = 0.82, 0.43e-3, 0.44, 0.25
 _LEAST_HEIGHT = 25.0
 USUAL_HEIGHT = np.array(100.0)
 """Height of a dash at which `Twine.halo` holds, in grey levels."""
 # What that varies in steps; and as a share of the strand where there is no light at all, less up to
 # a height at which strands are no longer seen in part.
-_SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.12, 0.3, 90.0
+_SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.07, 0.12, 90.0
 # The silhouette of twisted twine is on average narrower than its diameter.
 _SILHOUETTE = 0.95
 # Width of a strand at half height less its silhouette, in pixels; and the exponent p (same dives).
-_STRAND_MORE, _CORNER = 1.2, 2.5
+_STRAND_MORE, _CORNER = 0.95, 2.5
 # Before any dash was seen: silhouette of a strand and lit width of the sheet in metres, the sheet's
 # width at half height over its lit one; and their spreads as logarithms.
-_USUAL, _SPREAD = np.log([2.2e-3, 3.5e-3, 1.33]), np.array([1.5, 0.2, 0.1])
+_USUAL, _SPREAD = np.log([2.2e-3, 2.8e-3, 0.95]), np.array([1.5, 0.2, 0.1])
 # Errors of a kind's length and width: relative, relative for one dash, and in search lines.
-_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.045, 0.2, 0.2, 0.2
+_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.06, 0.115, 0.2, 0.2
 # Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
 _SPREAD_ERROR = 0.15
 # The model holds the less the more slanted the strand is.
-_SLANT_ERROR = 0.25
+_SLANT_ERROR = 0.7
 # Uncertainty of what slant adds to a dash, as a share.
 _SLANT_TOLD = 0.1
+# True errors over those of the fit, which is cautious with single kinds.
+_TRUE_ERROR = 0.7
 _ROUNDS = 40
 
 
@@ -121,17 +122,20 @@ class Twine:
         self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> FloatArray:
         """Length of dashes, in metres, by crossing angle, slant, step, height as in `DashKind`."""
-        lit = self.body + self.halo + _beyond(step, height)
-        return np.asarray(np.hypot(lit / across, self.sheet * slant))
+        return np.asarray(_bright(height) * np.hypot(self._lit(step) / across, self.sheet * slant))
 
     def excess(
         self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return what of `usual` is not twine, in metres, and its standard deviation."""
         usual = self.usual(across, slant, step, height)
-        straight = (self.body + self.halo + _beyond(step, height)) / across
+        straight = _bright(height) * self._lit(step) / across
         sigma = np.hypot(self.sigma_halo / across, _SLANT_TOLD * (usual - straight))
         return usual - self.body / across, np.asarray(sigma)
+
+    def _lit(self, step: FloatArray) -> FloatArray:
+        """Lit width at the usual height, in metres."""
+        return np.asarray(self.body + self.halo + _HALO_STEPS * step)
 
 
 def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twine | None:
@@ -148,7 +152,7 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
         return None
     at, covariance = _fit(kinds)
     strand, sheet, _ = np.exp(at)
-    sigma_strand = float(strand * np.sqrt(covariance[0, 0]))
+    sigma_strand = _TRUE_ERROR * float(strand * np.sqrt(covariance[0, 0]))
     if known is not None:
         body = _SILHOUETTE * known
         halo = _SEEN * float(strand) + _HALO - body
@@ -168,10 +172,9 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
     )
 
 
-def _beyond(step: FloatArray, height: FloatArray) -> FloatArray:
-    """How much wider a strand is lit than where steps are short and its height is usual, in m."""
-    bright = np.log(np.maximum(height, _LEAST_HEIGHT) / USUAL_HEIGHT)
-    return np.asarray(_HALO_STEPS * step + _HALO_HEIGHT * bright)
+def _bright(height: FloatArray) -> FloatArray:
+    """How much longer dashes are than those of the usual height."""
+    return np.asarray((np.maximum(height, _LEAST_HEIGHT) / USUAL_HEIGHT) ** _BRIGHTER)
 
 
 def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
@@ -183,8 +186,8 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
         [[k.across, k.slant, k.length, k.width, k.step, k.pixel, k.height, k.count] for k in kinds],
         np.float64,
     ).T
-    blur = _HALO + _beyond(step, height), _STRAND_MORE * pixel
-    seen = np.log(np.r_[length, width])
+    blur = _HALO + _HALO_STEPS * step, _STRAND_MORE * pixel
+    seen = np.log(np.r_[length / _bright(height), width])
     grown = _SPREAD_ERROR * np.array([k.spread for k in kinds])
     of_length = np.hypot(np.hypot(_LENGTH_ERROR, grown), _ERROR_PX * step / length)
     error = np.r_[of_length, np.full(len(kinds), _WIDTH_ERROR)]

@@ -12,6 +12,8 @@ from aqualvs.geometry.compiled import inline_kernel, kernel
 # So near to a crest, in periods, a crossing belongs to the wave's family.
 _ON_CREST = 0.12
 _TURN = 2.0 * np.pi
+# Lengths that differ by no more, in metres, and half a span's phase that counts as none.
+_SAME, _SHORT = 1e-10, 1e-6
 
 
 @kernel
@@ -40,7 +42,7 @@ def comb_power(
         Of n harmonics; added to in place.
     """
     n = power.shape[0]
-    real, imaginary = np.zeros(n), np.zeros(n)
+    real, imaginary, share = np.zeros(n), np.zeros(n), np.zeros(n)
     for g in range(start.shape[0] - 1):
         real[:] = 0.0
         imaginary[:] = 0.0
@@ -52,22 +54,59 @@ def comb_power(
                 x, y = x * c - y * s, x * s + y * c
                 real[h] += x
                 imaginary[h] += y
-        for i in range(span_start[g], span_start[g + 1]):
-            first = _TURN * (qx * begin[i, 0] + qy * begin[i, 1])
-            last = _TURN * (qx * end[i, 0] + qy * end[i, 1])
-            middle, half = 0.5 * (first + last), 0.5 * (last - first)
-            c, s = np.cos(middle), np.sin(middle)
-            ch, sh = np.cos(half), np.sin(half)
-            x, y, xh, yh = 1.0, 0.0, 1.0, 0.0
-            for h in range(n):
-                x, y = x * c - y * s, x * s + y * c
-                xh, yh = xh * ch - yh * sh, xh * sh + yh * ch
-                phase = (h + 1) * half
-                share = yh / phase if abs(phase) > 1e-6 else 1.0
-                real[h] -= expected[i] * share * x
-                imaginary[h] -= expected[i] * share * y
+        _add_spans(
+            begin, end, expected, span_start[g], span_start[g + 1], qx, qy, real, imaginary, share
+        )
         for h in range(n):
             power[h] += real[h] ** 2 + imaginary[h] ** 2
+
+
+@inline_kernel
+def _add_spans(
+    begin: FloatArray,
+    end: FloatArray,
+    expected: FloatArray,
+    from_: int,
+    to: int,
+    qx: float,
+    qy: float,
+    real: FloatArray,
+    imaginary: FloatArray,
+    share: FloatArray,
+) -> None:
+    """Take what is expected on some spans off the sums of a wave's harmonics.
+
+    Pieces of one line that follow one another evenly turn by the same angle: that saves most of
+    the sines.
+    """
+    n = real.shape[0]
+    c, s, turn_c, turn_s, ch, sh = 1.0, 0.0, 1.0, 0.0, 1.0, 0.0
+    middle_x, middle_y, step_x, step_y, half_x, half_y = 0.0, 0.0, np.inf, 0.0, np.inf, 0.0
+    for i in range(from_, to):
+        x, y = 0.5 * (begin[i, 0] + end[i, 0]), 0.5 * (begin[i, 1] + end[i, 1])
+        u, v = 0.5 * (end[i, 0] - begin[i, 0]), 0.5 * (end[i, 1] - begin[i, 1])
+        if abs(x - middle_x - step_x) + abs(y - middle_y - step_y) < _SAME:
+            c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
+        else:
+            angle = _TURN * (qx * x + qy * y)
+            before_c, before_s = c, s
+            c, s = np.cos(angle), np.sin(angle)
+            turn_c, turn_s = c * before_c + s * before_s, s * before_c - c * before_s
+            step_x, step_y = x - middle_x, y - middle_y
+        middle_x, middle_y = x, y
+        if abs(u - half_x) + abs(v - half_y) > _SAME:
+            half_x, half_y = u, v
+            half = _TURN * (qx * u + qy * v)
+            ch, sh = np.cos(half), np.sin(half)
+            xh, yh = 1.0, 0.0
+            for h in range(n):
+                xh, yh = xh * ch - yh * sh, xh * sh + yh * ch
+                share[h] = yh / ((h + 1) * half) if abs(half) > _SHORT else 1.0
+        a, b = 1.0, 0.0
+        for h in range(n):
+            a, b = a * c - b * s, a * s + b * c
+            real[h] -= expected[i] * share[h] * a
+            imaginary[h] -= expected[i] * share[h] * b
 
 
 @kernel
@@ -179,6 +218,22 @@ def _between(
             m += 1
         crest += 1.0
     return m
+
+
+@kernel
+def expected_on(
+    line: IntArray, begin: FloatArray, end: FloatArray, span_line: IntArray, n_lines: int
+) -> FloatArray:
+    """Crossings (M,) on every span if those of its line were spread evenly over what is seen."""
+    length, total, seen = np.empty(len(span_line)), np.zeros(n_lines), np.zeros(n_lines)
+    for i in range(len(span_line)):
+        length[i] = np.hypot(end[i, 0] - begin[i, 0], end[i, 1] - begin[i, 1])
+        total[span_line[i]] += length[i]
+    for one in line:
+        seen[one] += 1.0
+    for i in range(len(span_line)):
+        length[i] *= seen[span_line[i]] / max(total[span_line[i]], 1e-9)
+    return length
 
 
 @kernel
