@@ -1,7 +1,8 @@
 """Condition of random nets: mesh, twine, solidity, holes, false alarms, and what it costs.
 
-Two kinds of short dives: rendered ones (`AQUALVS_NET_DIVES` of each kind, default 4, half a minute
-each), and ones without pictures, in which the true lit points are what the detector returns but for
+Short rendered dives (`AQUALVS_NET_DIVES` of each kind, default 4, half a minute each); long
+rendered ones past many holes (`AQUALVS_NET_LONG`, default 4, a minute and a square metre each); and
+short ones without pictures, in which the true lit points are what the detector returns but for
 drop-outs, until `AQUALVS_NET_AREA` square metres (default 10) are passed.
 """
 
@@ -13,7 +14,16 @@ from typing import Any
 
 import numpy as np
 from tests.net_cases import NetCamera
-from tests.net_dives import Dive, passed_holes, random_dive, scans_of, true_solidity
+from tests.net_dives import (
+    Dive,
+    long_dive,
+    passed_holes,
+    random_dive,
+    scans_of,
+    shown_holes,
+    true_solidity,
+)
+from tests.quick_pictures import quick_scans
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
@@ -21,6 +31,8 @@ from aqualvs.scanning.net_condition import NetCondition, NetStretch
 from aqualvs.scanning.net_holes import Hole
 from aqualvs.scanning.scan import Scan
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.random_scenes import Difficulty
+from aqualvs.simulation.scene import Net
 
 SERIES = 2031
 # Of rendered dives: difficulty; whether there is a hole, a compressed video, another rig.
@@ -34,6 +46,8 @@ KINDS: dict[str, tuple[Any, bool, bool, bool]] = {
     "plain-usual-x": ("usual", False, True, False),
     "plain-usual-w": ("usual", False, False, True),
 }
+# Of long dives, in turn.
+_LONG: tuple[Difficulty, ...] = ("usual", "hard", "clean", "hard", "usual", "hard")
 _HOLE_BARS = (2.0, 7.0)
 # Without pictures: share of lights that are lost in a frame, and in every frame.
 _MISSED, _DARK = 0.05, 0.01
@@ -92,6 +106,8 @@ def run() -> list[dict[str, Any]]:
         rows += accuracy_rows(kind, outcomes)
     everything = [one for outcomes in rendered.values() for one in outcomes]
     rows += accuracy_rows("all rendered", everything) + hole_rows("rendered", everything)
+    n = int(os.environ.get("AQUALVS_NET_LONG", "4"))
+    rows += hole_rows("long rendered", [long_rendered_dive(i) for i in range(n)])
     area = float(os.environ.get("AQUALVS_NET_AREA", "10"))
     rows += hole_rows("without pictures", dives_without_pictures(area))
     return [*rows, cost_row()]
@@ -103,6 +119,25 @@ def rendered_dive(kind: str, index: int) -> Outcome:
     rig = bluerov2_rig() if wide else example_rig()
     dive = dive_of(kind, index)
     return judge(dive, scans_of(dive, rig, h264=compressed, seed=index), rig)
+
+
+def long_rendered_dive(index: int, series: int = 2 * SERIES) -> Outcome:
+    """Render, scan and judge a long dive: of its holes, those of which enough could be seen."""
+    rig = example_rig()
+    rng = np.random.default_rng([series, index])
+    dive = long_dive(rng, _LONG[index // 2 % len(_LONG)])
+    scans = quick_scans(dive, rig, seed=index)
+    shown = shown_holes(dive, rig, scans, opening_of(dive.net))
+    return judge(dive, scans, rig, shown)
+
+
+def opening_of(net: Net) -> float:
+    """Area of a mesh, from strand to strand, in square metres."""
+    if net.mesh == "hexagon":
+        return float(1.5 * np.sqrt(3.0) * net.bar**2)
+    if net.mesh == "square":
+        return net.bar**2
+    return float(net.bar**2 * np.sin(2.0 * np.arcsin(net.hanging_ratio)))
 
 
 def dive_of(kind: str, index: int, series: int = SERIES) -> Dive:
@@ -129,8 +164,13 @@ def dives_without_pictures(area: float, series: int = SERIES + 1) -> list[Outcom
     return outcomes
 
 
-def judge(dive: Dive, scans: Sequence[Scan], rig: Rig) -> Outcome:
-    """Compare what is said about a dive's net with the truth."""
+def judge(
+    dive: Dive,
+    scans: Sequence[Scan],
+    rig: Rig,
+    passed: Sequence[tuple[FloatArray, float]] | None = None,
+) -> Outcome:
+    """Compare what is said about a dive's net with the truth; holes passed are swept half over."""
     condition = NetCondition(rig)
     told = told_velocity(dive)
     for scan in scans:
@@ -139,7 +179,8 @@ def judge(dive: Dive, scans: Sequence[Scan], rig: Rig) -> Outcome:
     measured = [one for one in condition.stretches if one.lattice is not None]
     stretch = measured[-1] if measured else None
     errors, sigmas = _errors(dive, stretch)
-    passed = passed_holes(dive, rig) if dive.net.holes else []
+    if passed is None:
+        passed = passed_holes(dive, rig) if dive.net.holes else []
     return Outcome(
         stretch=stretch,
         errors=errors,

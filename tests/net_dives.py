@@ -1,7 +1,7 @@
 """Random short dives along nets: scene, motion and truth, and scans of them from pictures."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,6 +33,13 @@ _VIEW, _CLEAR = 0.6, 0.05
 _SEEN_BESIDE = 0.3
 # Pictures in which a laser's line must cross a hole that was passed.
 _LOOKS = 3
+# Long dives: pictures, bars from one to the next, frame rate at most; share with holes, and how far
+# these are apart; things a second are as many as in a dive of so many seconds.
+_LONG, _PACE, _MOST_FPS = 240, 0.35, 25.0
+_WITH_HOLES, _APART, _COMPANY_S = 0.85, (0.35, 0.9), 3.0
+# A frame is measured at its true range within this share; a line of light has no break where it
+# has none of so many usual steps.
+_TRUE_RANGE, _BREAK = 0.05, 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +145,59 @@ def random_dive(
     )
 
 
+def long_dive(rng: np.random.Generator, difficulty: Difficulty = "usual") -> Dive:
+    """Return a dive of some metres along a random net with a hole every half metre, or none.
+
+    The frame rate is as low as the track allows: a third of a bar from picture to picture.
+    """
+    scene = random_scene(rng, difficulty)
+    net = scene.nets[0]
+    speed = min(float(rng.uniform(0.2, 0.3)), _PACE * net.bar * _MOST_FPS)
+    fps = speed / (_PACE * net.bar)
+    angle = float(rng.uniform(0.0, 2.0 * np.pi))
+    velocity = speed * np.array([np.cos(angle), np.sin(angle)])
+    begin = float(rng.uniform(0.45, 0.9))
+    end = float(np.clip(begin + rng.uniform(-0.25, 0.25), 0.42, 0.95))
+    pitch, yaw = np.deg2rad(rng.uniform(-18.0, 18.0, 2))
+    sway = np.deg2rad(rng.uniform(0.0, 1.5, 2))
+    phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    seconds = _LONG / fps
+    net = replace(net, holes=_holes_on_the_way(rng, net.bar, seconds, velocity))
+    many = max(1, round(seconds / _COMPANY_S))
+    scene = replace(scene, nets=(net,), fish=scene.fish * many, bubbles=scene.bubbles * many)
+    return Dive(
+        scene=_with_company(rng, scene, seconds, velocity),
+        fps=fps,
+        n_frames=_LONG,
+        range=(begin, end),
+        pitch=(float(pitch), float(sway[0])),
+        yaw=(float(yaw), float(sway[1])),
+        phase=(float(phase[0]), float(phase[1])),
+        velocity=velocity,
+    )
+
+
+def _holes_on_the_way(
+    rng: np.random.Generator, bar: float, seconds: float, velocity: FloatArray
+) -> tuple[tuple[float, float, float], ...]:
+    """Return holes of 2.5 bars or more, well apart, up to 0.1 m beside the way."""
+    holes: list[tuple[float, float, float]] = []
+    if rng.random() >= _WITH_HOLES:
+        return ()
+    speed, before = float(np.hypot(*velocity)), 0.0
+    ahead = velocity / speed
+    at = float(rng.uniform(0.1, 0.4))
+    while at < speed * seconds - 0.05:
+        radius = 0.5 * bar * float(rng.uniform(2.5, max(3.5, min(8.0, 0.22 / bar))))
+        if holes:
+            at = max(at, before + radius + holes[-1][2] + max(0.1, 4.0 * bar))
+        middle = at * ahead + np.array([-ahead[1], ahead[0]]) * rng.uniform(-0.1, 0.1)
+        holes.append((float(middle[0]), float(middle[1]), radius))
+        before = at
+        at += float(rng.uniform(*_APART))
+    return tuple(holes)
+
+
 def _with_company(
     rng: np.random.Generator, scene: Scene, seconds: float, velocity: FloatArray
 ) -> Scene:
@@ -168,7 +228,7 @@ def scans_of(dive: Dive, rig: Rig, *, h264: bool = False, seed: int = 0) -> list
     scanner = Scanner(rig)
     if not h264:
         frames = enumerate(_pictures(dive, rig, seed))
-        return [scanner.process(_frame(i, dive.times[i], image)) for i, image in frames]
+        return [scanner.process(frame_of(i, dive.times[i], image)) for i, image in frames]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dive.mp4"
         with VideoWriter(
@@ -185,7 +245,8 @@ def _pictures(dive: Dive, rig: Rig, seed: int) -> Iterator[NDArray[np.uint8]]:
         yield renderer.render(dive.scene_at(t), t, np.random.default_rng([seed, i])).image
 
 
-def _frame(index: int, time_s: float, image: NDArray[np.uint8]) -> Frame:
+def frame_of(index: int, time_s: float, image: NDArray[np.uint8]) -> Frame:
+    """Return a picture (red, green, blue) as a camera's frame."""
     luma, chroma = planes_of_image(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return Frame(index, float(time_s), luma, chroma)
 
@@ -242,3 +303,49 @@ def _offsets(
             normal = np.array([-along[1], along[0]]) / length
             offsets.append(float(np.mean(inside @ normal)) * (1.0 if along[0] > 0.0 else -1.0))
     return offsets
+
+
+def shown_holes(
+    dive: Dive, rig: Rig, scans: Sequence[Scan], opening: float
+) -> list[tuple[FloatArray, float]]:
+    """Middle and radius of the holes of which one laser's line showed two meshes, in three frames.
+
+    Without interruption, in frames that measured the net at its true range. Told from the truth.
+
+    Parameters
+    ----------
+    dive, rig, scans
+        What was scanned, and what came of it.
+    opening : float
+        Area of a mesh in square metres.
+    """
+    renderer = Renderer(rig)
+    shown = np.zeros((len(dive.net.holes), len(rig.lasers)), np.int64)
+    for scan, t in zip(scans, dive.times, strict=True):
+        plane = dive.scene_at(t).target_plane()
+        if scan.posture and abs(scan.posture.range / plane.offset - 1.0) < _TRUE_RANGE:
+            shown += _longest_chords(renderer, dive, t) >= 2.0 * np.sqrt(opening)
+    return [
+        (np.array([x, z]), radius)
+        for (x, z, radius), n in zip(dive.net.holes, shown, strict=True)
+        if n.max() >= _LOOKS
+    ]
+
+
+def _longest_chords(renderer: Renderer, dive: Dive, t: float) -> FloatArray:
+    """Longest unbroken piece (holes, lasers) of every line inside every hole, in metres."""
+    scene = dive.scene_at(t)
+    solid = replace(scene, nets=(), walls=(Wall(depth=0.0),), target="wall")
+    lit = renderer.lit_points(solid, t)
+    own = scene.dome_from_scene.inverse().apply(lit.points_in_dome)[:, [0, 2]]
+    longest = np.zeros((len(dive.net.holes), len(renderer.rig.lasers)))
+    for k, (x, z, radius) in enumerate(dive.net.holes):
+        for i in range(longest.shape[1]):
+            line = own[(lit.laser == i) & (lit.label == Label.WALL)] - [x, z]
+            inside = line[np.hypot(*line.T) < radius]
+            if len(inside) < 2:
+                continue
+            steps = np.hypot(*np.diff(inside, axis=0).T)
+            pieces = np.split(inside, np.flatnonzero(steps > _BREAK * np.median(steps)) + 1)
+            longest[k, i] = max(float(np.hypot(*(one[-1] - one[0]))) for one in pieces)
+    return longest

@@ -8,9 +8,10 @@ import pytest
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanning.net_dashes import Dashes, Gaps, NetView
 from aqualvs.scanning.net_discs import find_discs
-from aqualvs.scanning.net_holes import Hole, HoleMap, _Looks, opening_area
+from aqualvs.scanning.net_holes import Hole, HoleMap, opening_area
 from aqualvs.scanning.net_hypotheses import Mesh
 from aqualvs.scanning.net_lattice import NetLattice
+from aqualvs.scanning.net_looks import LASERS, Looks
 from aqualvs.scanning.net_strands import Strands, predicted_strands
 
 BAR, HALF = 0.025, 0.2
@@ -318,10 +319,10 @@ def test_the_map_does_not_grow_on_one_spot() -> None:
 
 def test_looking_for_long_proves_no_more() -> None:
     sums = np.array([[1.0, 0.0, 0.0, 3.0], [50.0, 0.0, 0.0, 150.0], [50.0, 0.0, 0.0, -150.0]])
-    looks = _Looks(np.array([1, 65, 128]), sums)
+    looks = Looks(np.array([1, 65, 128]), sums)
     np.testing.assert_allclose(looks.weights(), [3.0, 3.0, -4.0])
     # Seen as often as missed, a strand proves nothing.
-    both = _Looks(np.array([64, 65]), sums[[2, 1]])
+    both = Looks(np.array([64, 65]), sums[[2, 1]])
     np.testing.assert_allclose(both.weights(), 0.0)
 
 
@@ -368,3 +369,20 @@ def test_two_holes_are_two_discs() -> None:
     assert first.radius == pytest.approx(2.2 * BAR, abs=0.3 * BAR)
     assert second.radius == pytest.approx(1.7 * BAR, abs=0.3 * BAR)
     assert first.score > second.score > 12.0
+
+
+@pytest.mark.parametrize("apart", [9.0, 9.5])
+def test_a_hole_at_the_border_of_anothers_surroundings_keeps_its_size(apart: float) -> None:
+    side = np.arange(-9.0, 20.0, 0.4)
+    place = BAR * np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    n = len(place)
+    middles = BAR * np.array([[0.0, 0.0], [apart, 0.0]])
+    dark = np.any(np.hypot(*(place[:, None] - middles).transpose(2, 0, 1)) < 2.4 * BAR, axis=1)
+    rows = np.c_[np.ones(n), place, np.where(dark, 3.0, -3.0)]
+    holes = HoleMap(_bar=BAR, _mesh=BAR, _feet={(0, 0): (0, 0.0, np.zeros(2))})
+    for laser in range(2):
+        keys = (np.arange(n) * LASERS + laser) * 2 + dark
+        holes._looks = holes._looks.added(keys, rows, np.zeros(n, np.int64))
+    found = sorted(holes._find(NET), key=lambda hole: float(hole.place[0]))
+    np.testing.assert_allclose([hole.place for hole in found], middles, atol=0.3 * BAR)
+    np.testing.assert_allclose([hole.diameter for hole in found], 4.8 * BAR, atol=0.5 * BAR)

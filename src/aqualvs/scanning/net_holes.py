@@ -11,23 +11,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.scanning.net_dashes import NetView
 from aqualvs.scanning.net_discs import RIM, Disc, find_discs, local_sums
 from aqualvs.scanning.net_hypotheses import Mesh
 from aqualvs.scanning.net_lattice import NetLattice
+from aqualvs.scanning.net_looks import HERE, LASERS, Looks, looks_say
 from aqualvs.scanning.net_strands import Strands, predicted_strands
 
 # Side of the map's cells, in bars: looks of one laser at one cell are alike.
 _CELL = 0.4
-# Pieces of strand that are always dark without a hole, as a share; light where the net has a hole
-# (a fish, a loose end); and how much the looks at one cell say at most against a hole.
-_DARK, _FALSE_LIGHT, _MOST_SOUND = 0.03, 0.03, 4.0
-# Of one laser's crossings with one family, so many count as seen beforehand: with few, the share
-# that is missed is not known. The same for a piece of its line, so many ranges long.
-# Where this share takes turns, all that is missed there counts; where more is missed than the last
-# share, missing strands tell nothing.
-_BEFORE, _BEFORE_HERE, _HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.1, 0.12, 0.3
 # Where more than this share is missed between strands that are seen, the lattice is not the net's.
 _MOST_MISSED = 0.3
 # Missing strands so near to each other, in bars, and with so much evidence, may be a hole; so far
@@ -39,7 +32,7 @@ _TOUCH = 1.2
 _LOOK = 0.2
 # Cells farther from the vehicle than this are settled, in metres.
 _SETTLED = 2.0
-_ROW, _LASERS = 1 << 24, 1 << 5
+_ROW = 1 << 24
 # Squares of a side's 24th part measure the area of discs that overlap.
 _SQUARES = 24
 
@@ -84,48 +77,6 @@ class Hole:
 
 
 @dataclass(slots=True)
-class _Looks:
-    """Looks at cells, each of one laser and one outcome; n of them.
-
-    Attributes
-    ----------
-    keys : int array, shape (n,)
-        Cell, laser, and whether the strands were missed.
-    sums : array, shape (n, 4)
-        Number of looks, sums of their places and of what they say for a hole.
-    """
-
-    keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    sums: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
-
-    def added(self, keys: IntArray, rows: FloatArray) -> "_Looks":
-        """Return these and more of them."""
-        every, index = np.unique(np.concatenate([self.keys, keys]), return_inverse=True)
-        both = np.concatenate([self.sums, rows])
-        sums = [np.bincount(index, column, minlength=len(every)) for column in both.T]
-        return _Looks(every, np.stack(sums, axis=1))
-
-    def kept(self, mask: BoolArray) -> "_Looks":
-        """Return some of them."""
-        return _Looks(self.keys[mask], self.sums[mask])
-
-    @property
-    def places(self) -> FloatArray:
-        """Mean places, shape (n, 2)."""
-        return self.sums[:, 1:3] / self.sums[:, :1]
-
-    def weights(self) -> FloatArray:
-        """Say how much each speaks for a hole (n,): as one look, less where both were seen."""
-        number = self.sums[:, 0]
-        cell, missed = self.keys >> 1, self.keys & 1
-        _, index = np.unique(cell, return_inverse=True)
-        told = np.bincount(index, number)[index]
-        margin = np.maximum(2.0 * number - told, 0.0) / told
-        mean = self.sums[:, 3] / number
-        return np.where(missed == 1, mean, np.maximum(mean * number, -_MOST_SOUND)) * margin
-
-
-@dataclass(slots=True)
 class HoleMap:
     """The map of looks, fixed to the net, and the holes in it.
 
@@ -138,9 +89,9 @@ class HoleMap:
     holes: list[Hole] = field(default_factory=list)
     _bar: float = 0.0
     _piece: int = -1
-    _looks: _Looks = field(default_factory=_Looks)
+    _looks: Looks = field(default_factory=Looks)
     _meshes: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    _waiting: list[tuple[Strands, FloatArray, float]] = field(default_factory=list)
+    _waiting: list[tuple[Strands, FloatArray, float, int]] = field(default_factory=list)
     _feet: dict[tuple[int, int], tuple[int, float, FloatArray]] = field(default_factory=dict)
     _last: FloatArray | None = None
     _settled_meshes: int = 0
@@ -177,7 +128,7 @@ class HoleMap:
             self._start_over(piece)
         self._last = place.copy()
         strands = predicted_strands(lattice, view, knot)
-        self._waiting.append((strands, place.copy(), _HERE * view.range))
+        self._waiting.append((strands, place.copy(), HERE * view.range, view.index))
         column, row = np.floor(place / (_LOOK * self._bar)).astype(int)
         self._feet.setdefault((int(column), int(row)), (view.index, view.time_s, place.copy()))
 
@@ -196,15 +147,16 @@ class HoleMap:
     def _start_over(self, piece: int) -> None:
         self._settled_meshes += len(self._meshes)
         self._meshes = np.empty(0, np.int64)
-        self._looks, self._feet = _Looks(), {}
+        self._looks, self._feet = Looks(), {}
         self._piece, self._last = piece, None
 
     def _merge(self) -> None:
         if not self._waiting:
             return
-        strands = [one for one, _, _ in self._waiting]
-        place = np.concatenate([one.place + foot for one, foot, _ in self._waiting])
-        here = np.concatenate([np.floor(one.along / part) for one, _, part in self._waiting])
+        strands = [one for one, _, _, _ in self._waiting]
+        place = np.concatenate([one.place + foot for one, foot, _, _ in self._waiting])
+        here = np.concatenate([np.floor(one.along / part) for one, _, part, _ in self._waiting])
+        frame = np.concatenate([np.full(len(one.laser), k) for one, _, _, k in self._waiting])
         laser, family, missed, run, closed = (
             np.concatenate([getattr(one, name) for one in strands])
             for name in ("laser", "family", "missed", "run", "closed")
@@ -213,14 +165,10 @@ class HoleMap:
         between = float(np.sum(1.0 / run[closed]))
         if between > _MOST_MISSED * (between + np.count_nonzero(~missed)):
             return
-        share = np.maximum(
-            _missed_share(laser, family, missed, run), _missed_here(laser, here, missed)
-        )
-        dark = np.where(share < _TOO_MANY, -np.log(_DARK + share), 0.0)
-        says = np.where(missed, dark, np.log(_FALSE_LIGHT / (1.0 - share)))
+        says = looks_say(laser, family, here, missed, run)
         column, row = np.floor(place / (_CELL * self._bar)).astype(np.int64).T
-        keys = ((column + _ROW * row) * _LASERS + laser) * 2 + missed
-        self._looks = self._looks.added(keys, np.c_[np.ones(len(keys)), place, says])
+        keys = ((column + _ROW * row) * LASERS + laser) * 2 + missed
+        self._looks = self._looks.added(keys, np.c_[np.ones(len(keys)), place, says], frame)
         column, row = np.floor(place / self._mesh).astype(np.int64).T
         self._meshes = np.unique(np.concatenate([self._meshes, column + _ROW * row]))
 
@@ -242,9 +190,12 @@ class HoleMap:
             low, high = seeds.min(axis=0) - _AROUND * bar, seeds.max(axis=0) + _AROUND * bar
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
+            # Of a hole that another group is in, a part only may lie in these surroundings.
+            discs = [one for one in discs if _holds_any(one, seeds)]
             for disc in discs:
                 # Another group has this hole in its surroundings as well.
                 left[np.hypot(*(places - disc.middle).T) < disc.radius + RIM * bar] = 0.0
+            discs = [disc for disc in discs if self._looks.stays_dark(disc.middle, disc.radius)]
             found += [
                 self._hole(lattice, some, places[around], weights[around])
                 for some in _touching(discs, _TOUCH * bar)
@@ -302,39 +253,6 @@ def opening_area(lattice: NetLattice) -> float:
     return float(1.0 / abs(a[0] * b[1] - a[1] * b[0]))
 
 
-def _missed_share(
-    laser: IntArray, family: IntArray, missed: BoolArray, run: IntArray
-) -> FloatArray:
-    """Share of strands that are missed though they are there, for every crossing (N,).
-
-    Told from single ones, between others that are seen, of the same laser and family.
-    """
-    kind = laser * (int(family.max(initial=0)) + 1) + family
-    seen = np.bincount(kind[~missed], minlength=int(kind.max(initial=0)) + 1)
-    single = np.bincount(kind[missed & (run == 1)], minlength=len(seen))
-    share = (single + _DARK * _BEFORE) / (seen + single + _BEFORE)
-    return np.asarray(share[kind])
-
-
-def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatArray:
-    """Share of strands that are missed on a piece of a laser's line, for every crossing (N,).
-
-    Where light is scarce, seen and missed take turns as the net passes by; where a hole passes by
-    they do so once or twice.
-    """
-    _, kind = np.unique(np.stack([laser, here.astype(np.int64)]), axis=1, return_inverse=True)
-    order = np.argsort(kind, kind="stable")
-    again = kind[order][1:] == kind[order][:-1]
-    turned = again & (missed[order][1:] != missed[order][:-1])
-    n = int(kind.max(initial=0)) + 1
-    pairs = np.bincount(kind[order][1:], again, minlength=n) + _BEFORE_HERE
-    turns = np.bincount(kind[order][1:], turned, minlength=n) + 2.0 * _DARK * _BEFORE_HERE
-    # Of two in random order, 2 p (1 - p) differ.
-    share = 0.5 - np.sqrt(np.maximum(0.25 - 0.5 * turns / pairs, 0.0))
-    every = np.bincount(kind, missed, minlength=n) / np.bincount(kind, minlength=n)
-    return np.asarray(np.where(share > _SCARCE, np.maximum(share, every), share)[kind])
-
-
 def _groups(places: FloatArray, reach: float) -> list[IntArray]:
     """Return the indices of groups of places that steps of up to `reach` connect."""
     left = np.ones(len(places), np.bool_)
@@ -350,6 +268,11 @@ def _groups(places: FloatArray, reach: float) -> list[IntArray]:
             group = np.r_[group, fresh]
         groups.append(group)
     return groups
+
+
+def _holds_any(disc: Disc, places: FloatArray) -> bool:
+    """Whether some of the places (n, 2) are in a disc."""
+    return bool(np.any(np.hypot(*(places - disc.middle).T) < disc.radius))
 
 
 def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
