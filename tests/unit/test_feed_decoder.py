@@ -13,6 +13,7 @@ from av.video.frame import VideoFrame
 from aqualvs.live.sources.h264 import FrameNumbers
 from aqualvs.live.sources.live_decoder import LiveDecoder
 from aqualvs.live.sources.live_frames import LiveFrames
+from aqualvs.live.sources.packets import packet_with
 from aqualvs.live.sources.reception import Reception
 
 SIZE = (192, 128)
@@ -48,7 +49,7 @@ def encoded(n, options, codec="libx264", gop=12):
 
 
 def packet(data, pts):
-    made = av.Packet(data)
+    made = packet_with(data)
     made.pts, made.time_base = pts, Fraction(1, 25)
     return made
 

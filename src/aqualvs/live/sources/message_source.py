@@ -6,13 +6,12 @@ from types import TracebackType
 from typing import Self, TypeAlias, cast
 
 import av
-from av.packet import Packet
 from av.video.codeccontext import VideoCodecContext
-from av.video.stream import VideoStream
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.sources.image_messages import ENCODINGS, ImageMessage, planes_of_message
 from aqualvs.live.sources.live_decoder import LiveDecoder
+from aqualvs.live.sources.packets import packet_with
 from aqualvs.live.sources.planes import Planes, planes_of
 from aqualvs.scanning.scan import Frame
 
@@ -203,7 +202,7 @@ class _Video:
         self._decoder = LiveDecoder(context, hears_losses=False)
 
     def decode(self, index: int, data: bytes) -> Iterator[tuple[int, Planes]]:
-        packet = cast("Packet[VideoStream]", Packet(data))
+        packet = packet_with(data)
         packet.pts = index
         for picture in self._decoder.decode(packet):
             yield index if picture.pts is None else picture.pts, planes_of(picture)

@@ -21,6 +21,7 @@ from aqualvs.live.sources.inbox import (
     transport_content,
 )
 from aqualvs.live.sources.live_frames import LiveFrames
+from aqualvs.live.sources.packets import packet_with
 from aqualvs.live.sources.reception import Reception
 from aqualvs.live.sources.rtp import RtpOrder, RtpPacket, parse_rtp
 from aqualvs.live.sources.rtp_h264 import TICKS_HZ, AccessUnit, H264Depacketizer
@@ -205,6 +206,6 @@ def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
     ticks : int
         90 kHz.
     """
-    packet = cast("Packet[VideoStream]", Packet(data))
+    packet = packet_with(data)
     packet.pts, packet.time_base = ticks, Fraction(1, TICKS_HZ)
     return packet
