@@ -24,11 +24,11 @@ import av
 from aqualvs.app.batch.cluster import DaskWorkers, Outcome
 from aqualvs.app.batch.pieces import PieceResult
 from aqualvs.app.batch.season import Season, Steps
-from aqualvs.live.sources.spans import Span, SpanKind
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
 from aqualvs.app.demo import bundled_dive
 from aqualvs.app.run import RunRequest
+from aqualvs.live.sources.spans import Span, SpanKind
 
 _SHORT, _FRAMES, _PIECE = 100, 300, 100
 _DIVES, _PIECES_A_DIVE = 1000, 15
