@@ -357,5 +357,5 @@ def test_an_address_is_read_like_a_file(tmp_path):
 
 def test_decoding_takes_one_pass(tmp_path):
     path = write_video(tmp_path / "a.mp4", 5, size=SMALL)
-    with VideoSource(path, threads=1) as source:
+    with VideoSource(path) as source:
         assert sum(1 for _ in source) == 5

@@ -36,9 +36,6 @@ class VideoSource:
     ----------
     where : str or Path
         Path or address.
-    threads : int
-        Decoder threads; they decode ahead while the caller works on a frame, which delays a live
-        stream by `threads - 1` frames.
 
     Attributes
     ----------
@@ -58,13 +55,13 @@ class VideoSource:
     unseen.
     """
 
-    def __init__(self, where: str | Path, *, threads: int = 2) -> None:
+    def __init__(self, where: str | Path) -> None:
         self.name = str(where)
         self._container = _open(self.name)
         self._stream = self._video_stream()
-        # With frame threads FFmpeg marks the pictures it had to patch up; with slices it does not.
-        self._stream.codec_context.thread_type = "FRAME"
-        self._stream.codec_context.thread_count = threads
+        # Threads that share a picture leave patched ones unmarked; threads with a picture each do
+        # not wait for each other's patches, so that what follows would be left to chance.
+        self._stream.codec_context.thread_count = 1
         self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.fps = float(rate) if rate else None
