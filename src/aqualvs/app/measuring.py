@@ -2,14 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from aqualvs.app.blocks import block_length
-from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.comparison import BareLensComparison
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, Scan
+
+
+class ScansFrames(Protocol):
+    """What a run needs of a scanner."""
+
+    def process(self, frame: Frame) -> Scan:
+        """Return the scan of one frame."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 from aqualvs.app.crew_plan import crew_work
 from aqualvs.app.crew_work import CrewWork
-from aqualvs.app.measuring import Measured
+from aqualvs.app.measuring import Measured, ScansFrames
 from aqualvs.app.net_check import net_check
 from aqualvs.app.net_pass import NetRequest
 from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
@@ -25,7 +25,7 @@ from aqualvs.app.run_inputs import (
     scanner_facts,
     source_facts,
 )
-from aqualvs.app.run_mcap import RunMcap, ScansFrames, prepare_mcap
+from aqualvs.app.run_mcap import RunMcap, prepare_mcap
 from aqualvs.app.run_measuring import RunMeasuring
 from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay

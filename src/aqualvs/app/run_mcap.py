@@ -3,9 +3,10 @@
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 from aqualvs.app.disk import writing
+from aqualvs.app.measuring import ScansFrames
 from aqualvs.app.outputs import RUN_FILES
 from aqualvs.app.run_replay import Replay
 from aqualvs.app.run_water import WaterFollowingScanner
@@ -23,13 +24,6 @@ if TYPE_CHECKING:
 DIVE_MCAP = "dive.mcap"
 
 Measured = tuple[Rig, Scan, dict[SearchAxis, Returns]]
-
-
-class ScansFrames(Protocol):
-    """What a run needs of a scanner."""
-
-    def process(self, frame: Frame) -> Scan:
-        """Return the scan of one frame."""
 
 
 class RunMcap:

@@ -10,10 +10,9 @@ from typing import Self
 from aqualvs.app.blocks import in_blocks, read_ahead
 from aqualvs.app.crew import Crew
 from aqualvs.app.crew_work import CrewWork
-from aqualvs.app.measuring import Measured, Meter, measured_blocks
+from aqualvs.app.measuring import Measured, Meter, ScansFrames, measured_blocks
 from aqualvs.app.run_frames import ready, window_of, with_losses
 from aqualvs.app.run_inputs import FrameWindow
-from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.app.run_replay import Replay
 from aqualvs.live.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.optics.rig import Rig

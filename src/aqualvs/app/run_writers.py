@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from aqualvs.app.measuring import Measured
+from aqualvs.app.measuring import Measured, ScansFrames
 from aqualvs.app.outputs import RunOutputs
 from aqualvs.app.run_bare_lens import RunBareLens
-from aqualvs.app.run_mcap import RunMcap, ScansFrames
+from aqualvs.app.run_mcap import RunMcap
 from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay
 from aqualvs.app.runfile import Status

@@ -17,14 +17,13 @@ from aqualvs.app.batch.work import DiveWork, OpenDive, agreement_for, digest, op
 from aqualvs.app.blocks import in_blocks
 from aqualvs.app.disk import writing
 from aqualvs.app.journal import PointsJournal
-from aqualvs.app.measuring import Measured, Meter, measured_blocks
+from aqualvs.app.measuring import Measured, Meter, ScansFrames, measured_blocks
 from aqualvs.app.net_check import net_check
 from aqualvs.app.outputs import JOURNAL, POSTURE_BARE_CSV, POSTURE_CSV
 from aqualvs.app.posture_csv import PostureCsv
 from aqualvs.app.run_bare_lens import RunBareLens
 from aqualvs.app.run_frames import ready, with_losses
 from aqualvs.app.run_inputs import FrameWindow
-from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.span_frames import VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind

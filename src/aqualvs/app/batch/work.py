@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.measuring import ScansFrames
 from aqualvs.app.run import RunRequest
 from aqualvs.app.run_agreement import agreement_of
 from aqualvs.app.run_inputs import check_fits, prepared_rig, scanner_facts
-from aqualvs.app.run_mcap import ScansFrames
 from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
 from aqualvs.app.run_water import WaterFollowingScanner
 from aqualvs.app.runfile import versions
