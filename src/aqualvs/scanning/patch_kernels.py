@@ -104,7 +104,8 @@ def carry_to_tangent(
             jacobian[j, k] = (other[j] - m[j]) / step
     for i in range(3):
         for j in range(3):
-            out[i, j] = 0.0
+            total = 0.0
             for k in range(6):
                 for n in range(6):
-                    out[i, j] += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
+                    total += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
+            out[i, j] = total

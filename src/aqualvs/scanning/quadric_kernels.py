@@ -236,13 +236,15 @@ def _solve(
 def _substitute(factor: FloatArray, right: FloatArray) -> None:
     """Solve the system whose Cholesky factor is known, in place."""
     for j in range(N):
+        rest = right[j]
         for k in range(j):
-            right[j] -= factor[j, k] * right[k]
-        right[j] /= factor[j, j]
+            rest -= factor[j, k] * right[k]
+        right[j] = rest / factor[j, j]
     for j in range(N - 1, -1, -1):
+        rest = right[j]
         for k in range(j + 1, N):
-            right[j] -= factor[k, j] * right[k]
-        right[j] /= factor[j, j]
+            rest -= factor[k, j] * right[k]
+        right[j] = rest / factor[j, j]
 
 
 @kernel
@@ -401,10 +403,12 @@ def add_shared(
                     sums[0, k] += shift_px * pull[i] * terms[i, k]
                     sums[1, k] += tilt_px * pull[i] * terms[i, k] * along
         for mode in range(2):
-            moved = np.zeros(N)
+            moved = np.empty(N)
             for j in range(N):
+                total = 0.0
                 for k in range(N):
-                    moved[j] += inverse[j, k] * sums[mode, k]
+                    total += inverse[j, k] * sums[mode, k]
+                moved[j] = total
             for j in range(N):
                 for k in range(N):
                     covariance[j, k] += moved[j] * moved[k]

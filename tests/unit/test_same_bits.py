@@ -1,0 +1,43 @@
+"""A frame gives the same bits every time, wherever its arrays happen to lie in memory."""
+
+from dataclasses import astuple
+
+import numpy as np
+
+from aqualvs.app.demo import bundled_dive
+from aqualvs.live.sources import open_source
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanning.pipeline import Scanner
+
+ROUNDS = 12
+
+
+def bits(scan):
+    """Everything that was found, as bytes."""
+    posture = scan.posture
+    numbers = astuple(posture) if posture else ()
+    flat = [np.asarray(value, np.float64).ravel() for value in numbers if value is not None]
+    points = scan.points
+    arrays = [points.points_in_dome, points.sigma, points.quality, points.label, points.used]
+    return b"".join(np.ascontiguousarray(one).tobytes() for one in [*flat, *arrays])
+
+
+def test_the_same_frames_give_the_same_bits():
+    """LLVM asks whether arrays lie close to each other before it sums into memory eight at a time.
+
+    Sums then differ in the last bit from scan to scan: with one such loop, in every round.
+    """
+    folder = bundled_dive()
+    rig = load_rig(folder / "rig.yaml")
+    with open_source(str(folder / "dive.mp4")) as source:
+        frames = list(source)[::6]
+    rng = np.random.default_rng(0)
+    first = None
+    for _ in range(ROUNDS):
+        # What is allocated in between moves what the scanner allocates.
+        kept = [np.empty(int(rng.integers(1, 4000)), np.uint8) for _ in range(200)]
+        scanner = Scanner(rig)
+        found = [bits(scanner.process(frame)) for frame in frames]
+        first = first or found
+        assert [i for i, (a, b) in enumerate(zip(first, found, strict=True)) if a != b] == []
+        del kept
