@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.crew_start import n_cores
 from aqualvs.errors import OutputError, SourceError
 
 DEFAULT = Path("out/bench/history.json")
@@ -93,10 +94,8 @@ def entry_now(rows: Iterable[Row], failed: Iterable[str], *, quick: bool) -> Ent
 
 def machine() -> Machine:
     """Describe this machine; cores are those that the process may use."""
-    usable = getattr(os, "sched_getaffinity", None)
-    cores = len(usable(0)) if usable else os.cpu_count() or 1
     python = f"{platform.python_implementation()} {platform.python_version()}"
-    return Machine(f"{platform.system()} {platform.machine()}", _cpu(), cores, python)
+    return Machine(f"{platform.system()} {platform.machine()}", _cpu(), n_cores(), python)
 
 
 def _cpu() -> str:

@@ -12,7 +12,7 @@ import cv2
 
 from aqualvs.app.blocks import in_blocks
 from aqualvs.app.crew_messages import Ended, Message, packed
-from aqualvs.app.measuring import Measured, Meter
+from aqualvs.app.measuring import Meter
 from aqualvs.live.sources.span_frames import UnlikeSurveyError, VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind
 from aqualvs.optics.rig import Rig
@@ -60,7 +60,7 @@ class CrewWork:
 
 
 def serve(work: CrewWork, pipe: Connection) -> None:
-    """Measure the parts whose numbers come through a pipe, until None does, or nobody listens.
+    """Measure the parts whose numbers come through a pipe, until its other end is closed.
 
     What is found goes back block by block, and an `Ended` after each part.
     """
@@ -71,8 +71,8 @@ def serve(work: CrewWork, pipe: Connection) -> None:
     try:
         meter = Meter(work.rig, Scanner(work.rig, work.options))
         with VideoParts(work.path, work.rig.size_px) as video:
-            while (number := pipe.recv()) is not None:
-                part = work.parts[number]
+            while True:
+                part = work.parts[pipe.recv()]
                 for message in _messages(part, _frames(work, part, video), meter):
                     pipe.send_bytes(packed(message))
     except (EOFError, ConnectionError):
@@ -89,7 +89,7 @@ def _messages(part: Part, frames: Iterator[Frame], meter: Meter) -> Iterator[Mes
     )
     try:
         for block in in_blocks(wanted, meter.block_length, UnlikeSurveyError):
-            yield [Measured(found.scan, found.bare) for found in meter.measure(block)]
+            yield meter.measure(block)
     except UnlikeSurveyError:
         yield Ended.UNLIKE_SURVEY
     else:

@@ -11,7 +11,6 @@ import numpy as np
 
 from aqualvs.app.disk import writing
 from aqualvs.app.follow_fast_eye import SampledEye
-from aqualvs.app.follow_page import serve_page
 from aqualvs.app.follow_rendered import RenderedEye
 from aqualvs.app.follow_report import RunFacts, summary_lines, write_report
 from aqualvs.app.follow_sim import Eye, SimulatedLoop, Timing
@@ -19,6 +18,7 @@ from aqualvs.app.follow_sim_case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.app.follow_sim_log import write_log
 from aqualvs.app.follow_sim_page import LoopPage
 from aqualvs.app.follow_sim_watch import RunWatch
+from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.follow_log import FollowLog
 from aqualvs.control.gains_file import load_gains
@@ -173,7 +173,7 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
         if request.dashboard is not None:
             holder = SetpointHolder(rig.working_range)
             holder.put(setpoint)
-            served = serve_page(request.dashboard, request.token, rig, holder, tell)
+            served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
             page = LoopPage(served, rig, loop, holder)
             undo.callback(page.close)
         _run(loop, request, page, tell)

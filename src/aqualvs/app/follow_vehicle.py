@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TextIO
 
 from aqualvs.app.follow import FOLLOW_CSV, Aim
-from aqualvs.app.follow_page import serve_page
 from aqualvs.app.follow_vehicle_log import FollowLogOutput
 from aqualvs.app.live import SWITCH_S, FeedRequest
 from aqualvs.app.live_console import Console
+from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.autopilot import NetPilot
@@ -97,7 +97,7 @@ def follow_and_tell(
         undo.callback(outputs[1].close)
         outputs.append(Console())
         if request.dashboard is not None:
-            outputs.append(serve_page(request.dashboard, request.token, rig, holder, tell))
+            outputs.append(serve_page(request.dashboard, request.token, rig, holder, None, tell))
         runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
         undo.pop_all()
     tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")

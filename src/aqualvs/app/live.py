@@ -8,15 +8,15 @@ from pathlib import Path
 
 from aqualvs.app.live_console import Console
 from aqualvs.app.live_outputs import (
-    DASHBOARD_PORT,
     OutputRequest,
-    host_and_port,
     make_outputs,
 )
 from aqualvs.app.live_water import WaterFollower
+from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.run_water import WaterFollowingScanner
 from aqualvs.app.stopping import StopSignals
+from aqualvs.control.setpoint import SetpointHolder
 from aqualvs.errors import OptionError
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.recorder import PictureFormat, RecorderOptions, RecorderSwitch
@@ -168,7 +168,10 @@ def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> l
         for output in outputs[2:]:
             made.callback(output.close)
         if request.dashboard is not None:
-            outputs.append(_dashboard(request.dashboard, request.token, rig, recorder, tell))
+            holder = SetpointHolder(rig.working_range)
+            outputs.append(
+                serve_page(request.dashboard, request.token, rig, holder, recorder, tell)
+            )
         made.pop_all()
     return outputs
 
@@ -176,23 +179,6 @@ def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> l
 def _recorder_options(request: LiveRequest) -> RecorderOptions:
     pictures = PictureFormat.JPEG if request.record_video else None
     return RecorderOptions(pictures=pictures, scanner=request.scanner)
-
-
-def _dashboard(
-    address: str,
-    token: str | None,
-    rig: Rig,
-    recorder: RecorderSwitch,
-    tell: Callable[[str], object],
-) -> Output:
-    try:
-        from aqualvs.app.dashboard.start import start_dashboard
-    except ImportError as fault:
-        raise OptionError(
-            f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
-        ) from fault
-    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    return start_dashboard(host, port, token, rig, recorder, tell)
 
 
 def _supply(request: LiveRequest, rig: Rig) -> ScannerSupply:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from aqualvs.app.dashboard.access import make_access, token_fault
-from aqualvs.app.dashboard.commands import Controls
+from aqualvs.app.dashboard.commands import Controls, NoRecorder
 from aqualvs.app.dashboard.output import Dashboard
 from aqualvs.app.dashboard.server import DashboardServer
 from aqualvs.control.setpoint import SetpointHolder
@@ -45,10 +45,11 @@ def start_dashboard(
     port: int,
     token: str | None,
     rig: Rig,
-    recorder: RecorderSwitch,
+    holder: SetpointHolder,
+    recorder: RecorderSwitch | None,
     tell: Callable[[str], object],
 ) -> Dashboard:
-    """Serve the page and tell its address.
+    """Serve the page and tell its address; without a recorder, its button refuses.
 
     Raises
     ------
@@ -59,7 +60,7 @@ def start_dashboard(
     if fault:
         raise OptionError(fault)
     access = make_access(host, token)
-    controls = Controls(SetpointHolder(rig.working_range), SwitchButton(recorder))
+    controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
     server = DashboardServer(host, port, access, rig, controls)
     shown = f"[{host}]" if ":" in host else host
     tell(f"dashboard: http://{shown}:{server.port}/#token={access.token}")

@@ -1,7 +1,6 @@
 """Frames from a video file or stream, decoded by FFmpeg through PyAV."""
 
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -15,6 +14,7 @@ from av.video.stream import VideoStream
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.ledger import Ledger
 from aqualvs.live.sources.planes import planes_of
+from aqualvs.live.sources.spans import promised_duration
 from aqualvs.scanning.scan import Frame
 
 _STALL_S = 10.0
@@ -66,7 +66,7 @@ class VideoSource:
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.fps = float(rate) if rate else None
         self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
-        self._promised_s = _promised_duration(self._stream)
+        self._promised_s = promised_duration(self._stream)
         self.n_frames = self._stream.frames or self._estimated_frames()
         self._ledger = Ledger(counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS)
 
@@ -199,14 +199,3 @@ def _not_a_video(where: str) -> str:
         f"{where}: not a video, or cut short before its index was written; "
         "check the file or copy it again from the recorder"
     )
-
-
-def _promised_duration(stream: VideoStream) -> float | None:
-    """Return the duration in seconds that the container states for the video alone."""
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * Fraction(stream.time_base))
-    clock = stream.metadata.get("DURATION", "").split(":")
-    if len(clock) != 3:
-        return None
-    hours, minutes, seconds = (float(part) for part in clock)
-    return 3600 * hours + 60 * minutes + seconds

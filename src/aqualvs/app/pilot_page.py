@@ -1,4 +1,4 @@
-"""The pilot's page of `aqualvs follow`: its setpoint is what a mission holds."""
+"""The pilot's page of `aqualvs live` and `follow`, where its packages are installed."""
 
 from collections.abc import Callable
 
@@ -6,6 +6,7 @@ from aqualvs.app.live_outputs import DASHBOARD_PORT, host_and_port
 from aqualvs.control.setpoint import SetpointHolder
 from aqualvs.errors import OptionError
 from aqualvs.live.outputs.base import Output
+from aqualvs.live.recorder import RecorderSwitch
 from aqualvs.optics.rig import Rig
 
 
@@ -14,6 +15,7 @@ def serve_page(
     token: str | None,
     rig: Rig,
     holder: SetpointHolder,
+    recorder: RecorderSwitch | None,
     tell: Callable[[str], object],
 ) -> Output:
     """Serve the page and tell its address.
@@ -27,6 +29,8 @@ def serve_page(
     rig : Rig
     holder : SetpointHolder
         Where the page puts what is to be held.
+    recorder : RecorderSwitch or None
+        What its record button moves; None where nothing can be recorded.
     tell : callable
         Takes one line.
 
@@ -36,20 +40,10 @@ def serve_page(
         If a part is not installed, the token is too short, or the address cannot be used.
     """
     try:
-        from aqualvs.app.dashboard.access import make_access, token_fault
-        from aqualvs.app.dashboard.commands import Controls, NoRecorder
-        from aqualvs.app.dashboard.output import Dashboard
-        from aqualvs.app.dashboard.server import DashboardServer
+        from aqualvs.app.dashboard.start import start_dashboard
     except ImportError as fault:
         raise OptionError(
             f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
         ) from fault
     host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    wrong = token_fault(token)
-    if wrong:
-        raise OptionError(wrong)
-    access, controls = make_access(host, token), Controls(holder, NoRecorder())
-    server = DashboardServer(host, port, access, rig, controls)
-    shown = f"[{host}]" if ":" in host else host
-    tell(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
-    return Dashboard(server, controls)
+    return start_dashboard(host, port, token, rig, holder, recorder, tell)
