@@ -5,6 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+
+from aqualvs.geometry.compiled import inline_kernel, kernel
+
 CALLEE = """
 from aqualvs.geometry.compiled import inline_kernel
 
@@ -54,6 +58,28 @@ print(middle(x), doubled(x), said, *hits, "numba.np.arraymath" in sys.modules)
 """
 
 
+TERMS = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 1001))
+
+
+@kernel
+def _dot(a, b):
+    total = 0.0
+    for i in range(a.shape[0]):
+        total += a[i] * b[i]
+    return total
+
+
+@inline_kernel
+def _quotient(a, b):
+    return a / b
+
+
+@kernel
+def _quotients(a, out):
+    for i in range(a.shape[0]):
+        out[i] = 1.0 - _quotient(a[i], 3.0) * a[i]
+
+
 def run_caller(folder: Path, name: str = "caller.py") -> list[str]:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
     command = [sys.executable, name]
@@ -61,6 +87,17 @@ def run_caller(folder: Path, name: str = "caller.py") -> list[str]:
         command, cwd=folder, env=environment, capture_output=True, text=True, check=True
     )
     return done.stdout.split()
+
+
+def test_kernels_round_as_python_does() -> None:
+    """Neither sums in another order, nor fused products, nor reciprocals: the bits are the same."""
+    a, b = TERMS
+    assert _dot(a, b) == _dot.py_func(a, b)
+    compiled, plain = np.empty(len(a)), np.empty(len(a))
+    _quotients(a, compiled)
+    for i, one in enumerate(a.tolist()):
+        plain[i] = 1.0 - one / 3.0 * one
+    np.testing.assert_array_equal(compiled, plain)
 
 
 def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:

@@ -23,10 +23,7 @@ def bits(scan):
 
 
 def test_the_same_frames_give_the_same_bits():
-    """LLVM asks whether arrays lie close to each other before it sums into memory eight at a time.
-
-    Sums then differ in the last bit from scan to scan: with one such loop, in every round.
-    """
+    """Loops whose path depends on where arrays lie must not sum in another order on the other."""
     folder = bundled_dive()
     rig = load_rig(folder / "rig.yaml")
     with open_source(str(folder / "dive.mp4")) as source:

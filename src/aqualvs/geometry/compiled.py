@@ -1,4 +1,10 @@
-"""A typed door to Numba: every compiled kernel of the project goes through `kernel`."""
+"""A typed door to Numba: every compiled kernel of the project goes through `kernel`.
+
+Kernels round after every operation, in the order in which it is written, as Python does. Were LLVM
+free to fuse and to reorder, the last bits of a result would depend on the processor, on where
+arrays lie in memory, and on which of its callers a kernel was compiled for: a dive measured on
+several machines, or by several processes, would not equal the same dive measured by one.
+"""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -11,10 +17,6 @@ if _LOADS_LIGHTLY:
     from aqualvs.geometry.kernel_loading import load_lightly
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-# Contraction to fused multiply-add and reassociation let LLVM vectorise the sums; NaN and
-# infinity keep their meaning, because validity masks rely on them.
-_FAST_BUT_NAN_SAFE = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def kernel(function: F) -> F:
@@ -41,31 +43,17 @@ def inline_borrowing_kernel(function: F) -> F:
     return _compiled(function, forceinline=True, _nrt=False)
 
 
-def exact_borrowing_kernel(function: F) -> F:
-    """Compile a borrowing kernel whose sums are taken in the order in which they are written."""
-    return _compiled(function, fastmath=False, _nrt=False)
-
-
-def inline_exact_borrowing_kernel(function: F) -> F:
-    """Compile a scalar function that exact kernels call; always inlined by LLVM."""
-    return _compiled(function, forceinline=True, fastmath=False, _nrt=False)
-
-
 def _compiled(function: F, **options: object) -> F:
-    compiled = numba.njit(
-        cache=True,
-        error_model="numpy",
-        nogil=True,
-        **{"fastmath": _FAST_BUT_NAN_SAFE, **options},
-    )(function)
-    _depend_on_callees(compiled, function)
+    options = {"error_model": "numpy", "nogil": True, "fastmath": False, **options}
+    compiled = numba.njit(cache=True, **options)(function)
+    _depend_on_callees(compiled, function, repr(sorted(options.items())))
     if _LOADS_LIGHTLY:
         load_lightly(compiled)
     return cast(F, compiled)
 
 
-def _depend_on_callees(compiled: Any, function: Callable[..., Any]) -> None:
-    """Make the machine code on disk depend on the files of the kernels that it may call as well.
+def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str) -> None:
+    """Make machine code on disk depend on its options and the files of kernels that it may call.
 
     Numba compares only the stamp of the function's own file, so a change in an inlined kernel of
     another module would leave stale machine code in use. Counted are all kernels that the module
@@ -76,7 +64,7 @@ def _depend_on_callees(compiled: Any, function: Callable[..., Any]) -> None:
         return
     files = (_cache_file(value) for value in function.__globals__.values())
     stamps = {stamp for file in files if file is not None for stamp in file._source_stamp}
-    own._source_stamp = tuple(sorted(stamps | {own._source_stamp}))
+    own._source_stamp = tuple(sorted(stamps | {own._source_stamp, options}, key=repr))
 
 
 def _cache_file(compiled: Any) -> Any:

@@ -7,11 +7,7 @@ read from the marks of 64 pixels at once, without a loop whose end no processor 
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import (
-    exact_borrowing_kernel,
-    inline_borrowing_kernel,
-    inline_exact_borrowing_kernel,
-)
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.scanning.lanes import (
     LANES,
     U8Array,
@@ -210,7 +206,7 @@ def _append(
     return n + ((a >= 0) & (b >= 0))
 
 
-@inline_exact_borrowing_kernel
+@inline_borrowing_kernel
 def _width(line: U8Array, a: int, b: int, level: np.int64) -> float:
     """Return the full width at half height."""
     below, above = 2 * np.int64(line[a]) - level, 2 * np.int64(line[a + 1]) - level
@@ -220,7 +216,7 @@ def _width(line: U8Array, a: int, b: int, level: np.int64) -> float:
     return b - ((a + rise) + fall)
 
 
-@inline_exact_borrowing_kernel
+@inline_borrowing_kernel
 def _green_fall(green: U8Array, last: int, peak: int, width: float) -> float:
     """Fall of U against both flanks, where it is deepest: a saturated core is white, not green."""
     edge = int(0.5 * width) + 1
@@ -235,7 +231,7 @@ def _green_fall(green: U8Array, last: int, peak: int, width: float) -> float:
     return np.int64(here) - 0.5 * (before + after)
 
 
-@inline_exact_borrowing_kernel
+@inline_borrowing_kernel
 def _centre(line: U8Array, peak: int, a: int, b: int, level: np.int64) -> float:
     """Return the centroid of what stands above half height, between the feet."""
     light, moment = _moments(line, a, b)
@@ -245,7 +241,7 @@ def _centre(line: U8Array, peak: int, a: int, b: int, level: np.int64) -> float:
     return peak + (moment - (peak - a) * total) / total
 
 
-@exact_borrowing_kernel
+@borrowing_kernel
 def measure_runs(
     lines: U8Array,
     length: int,

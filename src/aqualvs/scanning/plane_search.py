@@ -6,7 +6,8 @@ voice more likely lie on any surface than specks. Hypotheses are scored
 by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), the promising ones refined.
 
 Chunks come as a table, one column a chunk and one row a quantity, so that scoring a hypothesis
-runs along memory and becomes vector instructions.
+runs along memory and becomes vector instructions; what is then summed is kept chunk by chunk,
+because a sum has its order.
 """
 
 import numpy as np
@@ -27,6 +28,8 @@ N_ROWS = 7
 _MAX_HYPOTHESES = 6000
 # Chunks looked at in all: a frame full of noise must not hold up a live run.
 _MAX_WORK = 10_000_000
+# So many chunks are scored before it is asked whether the rest can matter.
+_STEP = 32
 # A neighbour for sampling lies at most this many chunks away in the same laser's list.
 _NEIGHBOURHOOD = 8
 # Chunks with a smaller share of the typical voice are not sampled.
@@ -51,50 +54,91 @@ def squared_gate(per_px: float, offset: float) -> float:
     return by_range * by_range + by_pixel * by_pixel
 
 
-@kernel
-def _score(table: FloatArray, laser_start: IntArray, plane: FloatArray, stretch: float) -> float:
-    """Return the MSAC score of a plane (normal, offset) with a gate `stretch` times as wide."""
-    x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
-    jx, jy, jz = table[JX], table[JY], table[JZ]
-    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
+@borrowing_kernel
+def _score(
+    table: FloatArray,
+    laser_start: IntArray,
+    plane: FloatArray,
+    stretch: float,
+    voice_after: FloatArray,
+    enough: float,
+    lanes: FloatArray,
+) -> float:
+    """Return the MSAC score of a plane (normal, offset) with a gate `stretch` times as wide.
+
+    It is 0 where, some way on, it is plain that the score comes to no more than `enough`.
+    `voice_after` has the voice of each chunk and all after it, `lanes` is overwritten.
+    """
     first = 0.0
     second = 0.0
     total = 0.0
     for i_laser in range(laser_start.shape[0] - 1):
         value = 0.0
-        for k in range(laser_start[i_laser], laser_start[i_laser + 1]):
-            residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
-            gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
-            near = 1.0 - residual * residual / (stretch * stretch * gate)
-            value += weight[k] * max(near, 0.0)
+        at, end = laser_start[i_laser], laser_start[i_laser + 1]
+        while at < end:
+            stop = min(at + _STEP, end)
+            value += _near(table, at, stop, plane, stretch * stretch, lanes)
+            if total + value + voice_after[stop] <= enough:
+                return 0.0
+            at = stop
         total += value
         second = max(second, min(first, value))
         first = max(first, value)
     return min(total, total - first + MOST_TO_SECOND * second)
 
 
+@inline_borrowing_kernel
+def _near(
+    table: FloatArray, at: int, stop: int, plane: FloatArray, stretch_2: float, lanes: FloatArray
+) -> float:
+    """Sum the voice of some chunks, each by how near it is to a plane."""
+    x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
+    jx, jy, jz = table[JX], table[JY], table[JZ]
+    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
+    for k in range(at, stop):
+        residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
+        gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
+        near = 1.0 - residual * residual / (stretch_2 * gate)
+        lanes[k - at] = weight[k] * max(near, 0.0)
+    value = 0.0
+    for k in range(stop - at):
+        value += lanes[k]
+    return value
+
+
 @kernel
 def _refine(
-    table: FloatArray, plane: FloatArray, stretch: float, normal: FloatArray, scratch: FloatArray
+    table: FloatArray,
+    plane: FloatArray,
+    stretch: float,
+    normal: FloatArray,
+    scratch: FloatArray,
+    lanes: FloatArray,
 ) -> bool:
     """Refit the plane to what lies in the stretched gate, X·m = 1 (paper, Eq. 24), in place."""
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
-    xx = yy = zz = xy = yz = zx = sx = sy = sz = 0.0
-    for k in range(x.shape[0]):
+    n = x.shape[0]
+    for k in range(n):
         residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
         gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
-        w = weight[k] / gate if residual * residual < stretch * stretch * gate else 0.0
-        xx += w * x[k] * x[k]
-        yy += w * y[k] * y[k]
-        zz += w * z[k] * z[k]
-        xy += w * x[k] * y[k]
-        yz += w * y[k] * z[k]
-        zx += w * z[k] * x[k]
-        sx += w * x[k]
-        sy += w * y[k]
-        sz += w * z[k]
+        lanes[k] = weight[k] / gate if residual * residual < stretch * stretch * gate else 0.0
+    xx = yy = zz = xy = yz = zx = sx = sy = sz = 0.0
+    for k in range(n):
+        w = lanes[k]
+        if w == 0.0:
+            continue
+        wx, wy, wz = w * x[k], w * y[k], w * z[k]
+        sx += wx
+        sy += wy
+        sz += wz
+        xx += wx * x[k]
+        yy += wy * y[k]
+        zz += wz * z[k]
+        xy += wx * y[k]
+        yz += wy * z[k]
+        zx += wz * x[k]
     normal[0, 0], normal[1, 1], normal[2, 2] = xx, yy, zz
     normal[1, 0], normal[2, 1], normal[2, 0] = xy, yz, zx
     right, m = scratch[3], scratch[4]
@@ -237,7 +281,11 @@ def search_plane(
     voice_up_to = np.cumsum(table[WEIGHT][loud])
     guide = np.empty(n_loud, np.int64)
     _guide(voice_up_to, guide)
-    total = np.sum(table[WEIGHT])
+    voice_after = np.zeros(n + 1)
+    for c in range(n - 1, -1, -1):
+        voice_after[c] = voice_after[c + 1] + table[WEIGHT, c]
+    lanes = np.empty(max(n, _STEP))
+    total = voice_after[0]
     most = min(_MAX_HYPOTHESES, _MAX_WORK // n)
     needed = most
     trial = 0
@@ -258,13 +306,15 @@ def search_plane(
         if plane[3] < nearest or plane[3] > farthest or plane[1] < _MIN_FACING:
             continue
         # A plane through neighbours is rough: judged by a wide gate, drawn in by narrower ones.
-        score = _score(table, laser_start, plane, _WIDE_GATE)
+        score = _score(
+            table, laser_start, plane, _WIDE_GATE, voice_after, _WORTH_REFINING * best_rough, lanes
+        )
         if score <= _WORTH_REFINING * best_rough:
             continue
         best_rough = max(best_rough, score)
         for stretch in (_WIDE_GATE, 0.5 * (1.0 + _WIDE_GATE), 1.0):
-            _refine(table, plane, stretch, normal, scratch)
-        score = _score(table, laser_start, plane, 1.0)
+            _refine(table, plane, stretch, normal, scratch, lanes)
+        score = _score(table, laser_start, plane, 1.0, voice_after, best, lanes)
         if score <= best:
             continue
         best = score
@@ -276,5 +326,5 @@ def search_plane(
         needed = min(most, int(25.0 / (share * share)) + 20)
     for _ in range(3):
         if best > 0.0:
-            _refine(table, best_plane, 1.0, normal, scratch)
+            _refine(table, best_plane, 1.0, normal, scratch, lanes)
     return best > 0.0
