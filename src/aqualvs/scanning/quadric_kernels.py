@@ -1,11 +1,9 @@
-"""The arithmetic of `quadric`: weighted least squares in six coefficients, without LAPACK.
-
-Systems of six unknowns are solved in less time than it takes to hand them to a library.
-"""
+"""The arithmetic of `quadric`: weighted least squares in six coefficients."""
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.cholesky import factorise, inverse_of, substitute
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.patch_kernels import COEFFICIENTS, NORMAL, OFFSET, RIGHT, UP
 
@@ -29,8 +27,6 @@ _MORE_LIGHT = 1.10
 _LESS_SCATTER = 0.6
 # ... and the curvature is no chance.
 _SIGNIFICANT = 6.0
-# A pivot below this share of its diagonal is rounding, not information.
-_SINGULAR = 1e-13
 
 
 @kernel
@@ -214,47 +210,11 @@ def _solve(
             right[j] += part * height[i]
             for k in range(j + 1):
                 factor[j, k] += part * terms[i, k]
-    for j in range(N):
-        own = factor[j, j]
-        for k in range(j):
-            rest = factor[j, k]
-            for a in range(k):
-                rest -= factor[j, a] * factor[k, a]
-            factor[j, k] = rest / factor[k, k]
-        pivot = own
-        for a in range(j):
-            pivot -= factor[j, a] * factor[j, a]
-        if not pivot > _SINGULAR * own:
-            return False
-        factor[j, j] = np.sqrt(pivot)
-    _substitute(factor, right)
+    if not factorise(factor):
+        return False
+    substitute(factor, right)
     coefficients[:] = right
     return True
-
-
-@kernel
-def _substitute(factor: FloatArray, right: FloatArray) -> None:
-    """Solve the system whose Cholesky factor is known, in place."""
-    for j in range(N):
-        rest = right[j]
-        for k in range(j):
-            rest -= factor[j, k] * right[k]
-        right[j] = rest / factor[j, j]
-    for j in range(N - 1, -1, -1):
-        rest = right[j]
-        for k in range(j + 1, N):
-            rest -= factor[k, j] * right[k]
-        right[j] = rest / factor[j, j]
-
-
-@kernel
-def _inverse(factor: FloatArray) -> FloatArray:
-    """Return the inverse of the matrix whose Cholesky factor is known."""
-    inverse = np.zeros((N, N))
-    for k in range(N):
-        inverse[k, k] = 1.0
-        _substitute(factor, inverse[k])
-    return inverse
 
 
 @kernel
@@ -275,7 +235,7 @@ def curvature_in_sigmas(
             off -= terms[i, k] * coefficients[k]
         square += weight[i] * off * off
     scale = max(np.sqrt(square / (n - N)), 1.0)
-    inverse = _inverse(factor)
+    inverse = inverse_of(factor)
     most = 0.0
     for k in range(3, N):
         most = max(most, abs(coefficients[k]) / (np.sqrt(inverse[k, k]) * scale))
@@ -349,7 +309,7 @@ def reweight(
             break
         coefficients[:] = better
         known[:] = factor
-    covariance[:] = _inverse(known)
+    covariance[:] = inverse_of(known)
     square, total = 0.0, 0.0
     for i in range(n):
         off = height[i]
