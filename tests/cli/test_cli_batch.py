@@ -62,19 +62,16 @@ def begun(season, out):
 
 
 def workers_of(process):
-    """Processes that a batch has started, by what the system says of its children."""
-    found = []
-    for entry in os.listdir("/proc"):
+    """Processes that work for a batch: copies of the one it has begun for that."""
+    parents = {}
+    for entry in filter(str.isdigit, os.listdir("/proc")):
         try:
             with open(f"/proc/{entry}/stat", encoding="ascii", errors="replace") as file:
-                parent = int(file.read().rpartition(")")[2].split()[1])
-            with open(f"/proc/{entry}/cmdline", "rb") as file:
-                is_worker = b"spawn_main" in file.read()
+                parents[int(entry)] = int(file.read().rpartition(")")[2].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-        if parent == process.pid and is_worker:
-            found.append(int(entry))
-    return found
+    servers = {pid for pid, parent in parents.items() if parent == process.pid}
+    return [pid for pid, parent in parents.items() if parent in servers]
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc"), reason="looks for processes in /proc")

@@ -16,6 +16,7 @@ from aqualvs.app.cli_options import (
     WaterIndex,
     given,
 )
+from aqualvs.app.importing import importing
 
 
 def batch(
@@ -76,8 +77,13 @@ def batch(
     report: Annotated[bool, typer.Option(help="Write report.html for each dive.")] = True,
 ) -> None:
     """Measure many dives."""
-    from aqualvs.app.batch import command as body
-    from aqualvs.app.run_inputs import Water, scanner_options
+    from aqualvs.app import crew_start
+
+    if scheduler is None:
+        crew_start.prepare(crew_start.FOR_BATCHES)
+    with importing():
+        from aqualvs.app.batch import command as body
+        from aqualvs.app.run_inputs import Water, scanner_options
 
     request = body.BatchRequest(
         dives=tuple(dives),

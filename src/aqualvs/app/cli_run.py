@@ -73,7 +73,7 @@ def run(
 
     n_processes = workers or crew_start.n_cores()
     if n_processes > 1:
-        crew_start.prepare()
+        crew_start.prepare(crew_start.FOR_RUNS)
     with importing():
         from aqualvs.app import run as body
         from aqualvs.app.net_pass import NetRequest

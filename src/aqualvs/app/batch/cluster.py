@@ -4,18 +4,17 @@ Dask brings tasks to processes, starts a process again that died, and gives its 
 is imported here and nowhere else.
 """
 
-import contextlib
 import logging
 import queue
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from aqualvs.app import crew_start
+from aqualvs.app.crew_start import deaf_to_interrupts
 from aqualvs.app.runfile import versions
 from aqualvs.errors import AqualvsError, OptionError
 
@@ -216,8 +215,14 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
     from distributed.system import MEMORY_LIMIT
 
     n_workers = n_workers or CPU_COUNT
+    settings = dict(_SETTINGS)
+    if crew_start.has_server():
+        crew_start.prepare(crew_start.FOR_BATCHES)
+        settings["distributed.worker.multiprocessing-method"] = "forkserver"
+        # It would import whatever it can find, to have it in the server, which is there already.
+        distributed.utils._forkserver_preload_set = True
     # What Dask says of dying processes helps nobody: the task is done by another.
-    with dask.config.set(_SETTINGS), _deaf_to_interrupts():
+    with dask.config.set(settings), deaf_to_interrupts():
         for _ in range(_STARTS):
             try:
                 return distributed.LocalCluster(
@@ -236,24 +241,6 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
             f"--workers {n_workers}: the processes do not start ({trouble}); "
             "take fewer, and see whether there is memory left"
         ) from trouble
-
-
-@contextlib.contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Let no thread or process that is begun here, or by one of these, hear Ctrl-C.
-
-    A terminal sends it to all processes; this one decides what becomes of the others.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    # Begun later, it would have the thread that begins it hear again.
-    resource_tracker.ensure_running()
-    heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, heard)
 
 
 def _sight(path: str) -> tuple[bool, dict[str, str]]:
