@@ -16,7 +16,7 @@ from aqualvs.app.append_file import AppendFile
 from aqualvs.app.disk import explain
 from aqualvs.app.journal import POINTS_SCHEMA, PointsJournal, points_batch, read_journal
 from aqualvs.app.outputs import RunOutputs, prepare_folder, recover
-from aqualvs.app.points_export import export_points
+from aqualvs.app.points_export import PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv, posture_row
 from aqualvs.app.runfile import Status
 from aqualvs.app.tally import tally_of
@@ -330,19 +330,41 @@ def test_a_full_disk_leaves_what_was_written_for_later(tmp_path, monkeypatch):
     assert parquet.read_table(tmp_path / "points.parquet").num_rows == 60
 
 
-def test_a_disk_that_fills_up_during_the_export_is_said(tmp_path, monkeypatch):
-    def full(*paths):
-        raise OSError(28, "No space left on device")
+def full_disk(*_):
+    raise OSError(28, "No space left on device")
 
+
+def test_a_disk_that_fills_up_during_the_export_is_said(tmp_path, monkeypatch):
     def run():
         with outputs(tmp_path) as out:
             out.write(scan(0))
 
-    monkeypatch.setattr("aqualvs.app.outputs.export_points", full)
+    monkeypatch.setattr(PointsExport, "finish", full_disk)
     with pytest.raises(OutputError, match="disk is full"):
         run()
     assert run_file(tmp_path)["status"] == "failed"
-    assert (tmp_path / "points.arrows").exists()
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "points.arrows",
+        "posture.csv",
+        "run.yaml",
+    ]
+
+
+def test_an_export_that_fails_on_the_way_is_done_at_the_end(tmp_path, monkeypatch):
+    with outputs(tmp_path) as out:
+        out.write(scan(0))
+        with monkeypatch.context() as patched:
+            patched.setattr(PointsExport, "add", full_disk)
+            out.write(scan(1))
+        assert not (tmp_path / "points.parquet.part").exists()
+        out.write(scan(2))
+    assert parquet.read_table(tmp_path / "points.parquet").num_rows == 180
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "points.parquet",
+        "points.ply",
+        "posture.csv",
+        "run.yaml",
+    ]
 
 
 def test_recover_completes_a_killed_run_once(tmp_path):
@@ -352,9 +374,12 @@ def test_recover_completes_a_killed_run_once(tmp_path):
     # A killed process closes its files and nothing else; its last row may be cut short.
     out._points.abandon()
     out._posture.close()
+    out._export._open_files.close()
+    assert (tmp_path / "points.parquet.part").exists()
     with (tmp_path / "posture.csv").open("a") as rows:
         rows.write("3,0.12,1,,0.5")
     assert recover(tmp_path)
+    assert not list(tmp_path.glob("*.part"))
     assert parquet.read_table(tmp_path / "points.parquet").num_rows == 180
     assert len(read_ply(tmp_path / "points.ply")) > 0
     content = run_file(tmp_path)

@@ -60,11 +60,20 @@ class PointsJournal:
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._waiting, "w"), POINTS_SCHEMA)
         self._closed = False
 
-    def write(self, *scans: Scan) -> None:
-        """Append the points of frames, all or none; those without points leave no trace."""
-        if any(len(scan.points) for scan in scans):
-            self._writer.write_batch(points_batch(*scans))
-            self._append()
+    def write(self, *scans: Scan) -> Any:
+        """Append the points of frames, all or none; those without points leave no trace.
+
+        Returns
+        -------
+        batch : pyarrow.RecordBatch or None
+            What was appended.
+        """
+        if not any(len(scan.points) for scan in scans):
+            return None
+        batch = points_batch(*scans)
+        self._writer.write_batch(batch)
+        self._append()
+        return batch
 
     def close(self) -> None:
         """Finish the stream; further calls do nothing."""

@@ -3,9 +3,9 @@
 ==================  ========================================================================
 `posture.csv`       one row for every frame, on disk when the frame is done
 `posture_bare.csv`  the same without the dome model, for comparison
-`points.arrows`     the points while the run is under way; becomes the next two at its end
+`points.arrows`     the points while the run is under way; the next two stand for it at its end
 `points.parquet`    every stripe point
-`points.ply`        the points on the target
+`points.ply`        the points on the target; both are `.part` until the run ends
 `run.yaml`          source, options, versions, rig, status and summary
 ==================  ========================================================================
 
@@ -22,7 +22,7 @@ import yaml
 
 from aqualvs.app.disk import explain, writing
 from aqualvs.app.journal import PointsJournal, check_idle
-from aqualvs.app.points_export import export_points
+from aqualvs.app.points_export import DRAFT, PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv
 from aqualvs.app.runfile import RunFile, Status, now, write_yaml
 from aqualvs.app.tally import Tally, tally_of
@@ -51,6 +51,8 @@ RUN_FILES = (
     JOURNAL,
     POINTS_PARQUET,
     POINTS_PLY,
+    POINTS_PARQUET + DRAFT,
+    POINTS_PLY + DRAFT,
     OVERLAY_MP4,
     REPORT_HTML,
     *NET_FILES,
@@ -99,14 +101,23 @@ class RunOutputs:
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
             self._points = stack.enter_context(PointsJournal(folder / JOURNAL))
+            self._export: PointsExport | None = PointsExport(
+                folder / POINTS_PARQUET, folder / POINTS_PLY
+            )
             self._open_files = stack.pop_all()
 
     def write(self, *scans: Scan) -> None:
         """Write frames; when this returns, they outlive the process."""
         with writing(self.folder):
             # Points first: a frame that has its row in posture.csv has its points too.
-            self._points.write(*scans)
+            batch = self._points.write(*scans)
             self._posture.write(*scans)
+        if batch is not None and self._export is not None:
+            try:
+                self._export.add(batch)
+            except OSError:
+                # The journal has it all: the next attempt, at the end, tells what is wrong.
+                self._discard_export()
         for scan in scans:
             self.tally.add(scan)
 
@@ -120,13 +131,17 @@ class RunOutputs:
         fault: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Complete the folder: the journal becomes `points.parquet` and `points.ply`."""
+        """Complete the folder: `points.parquet` and `points.ply` stand for the journal."""
         if isinstance(fault, OutputError):
             self._leave_as_it_is(fault)
             return
         try:
             self._open_files.close()
-            _finish_points(self.folder)
+            if self._export is None:
+                _export_journal(self.folder)
+            else:
+                self._export.finish()
+            (self.folder / JOURNAL).unlink()
             self._run_file.write(self._final(fault), error=_words(fault), summary=self._summary())
         except OSError as full:
             refusal = OutputError(explain(self.folder, full))
@@ -135,10 +150,16 @@ class RunOutputs:
 
     def _leave_as_it_is(self, fault: OutputError) -> None:
         """Close what is open without writing more than a disk in need can take."""
+        self._discard_export()
         self._points.abandon()
         self._posture.close()
         with contextlib.suppress(OSError):
             self._run_file.write(Status.FAILED, error=str(fault), summary=self._summary())
+
+    def _discard_export(self) -> None:
+        if self._export is not None:
+            self._export.discard()
+            self._export = None
 
     def _final(self, fault: BaseException | None) -> Status:
         if fault is None:
@@ -198,14 +219,14 @@ def recover(folder: Path) -> bool:
     if not journal.exists():
         return False
     with writing(folder):
-        _finish_points(folder)
+        _export_journal(folder)
+        journal.unlink()
         _mend_run_file(folder)
     return True
 
 
-def _finish_points(folder: Path) -> None:
+def _export_journal(folder: Path) -> None:
     export_points(folder / JOURNAL, folder / POINTS_PARQUET, folder / POINTS_PLY)
-    (folder / JOURNAL).unlink()
 
 
 def _mend_run_file(folder: Path) -> None:

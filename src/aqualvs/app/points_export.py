@@ -1,8 +1,8 @@
-"""From the journal of a run to `points.parquet` and `points.ply`, batch by batch."""
+"""`points.parquet` and `points.ply`, batch by batch."""
 
+import contextlib
 import itertools
 import os
-from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,9 @@ from pyarrow import parquet
 
 from aqualvs.app.journal import POINTS_SCHEMA, read_journal
 from aqualvs.app.report_words import bgr, laser_colour
+
+DRAFT = ".part"
+"""What is added to the names of files that are not finished."""
 
 _ROWS_PER_GROUP = 1 << 17
 _N_LASERS = 128
@@ -27,19 +30,105 @@ _VERTEX = np.dtype(
 )
 
 
-def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
-    """Write the points of a journal as Parquet, and those that entered a posture as PLY.
+class PointsExport:
+    """Writes `points.parquet` and `points.ply`; both appear whole, at the end, or not at all.
 
-    Both files appear whole or not at all; memory does not grow with the journal.
+    Rows are gathered to groups of always the same size, which a thread of its own writes: the files
+    do not depend on how the points come, and memory does not grow with their number.
+
+    Parameters
+    ----------
+    points_parquet : Path
+    points_ply : Path
+        Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser; of the points that
+        entered a posture.
+    schema : pyarrow.Schema
+        Columns of what will be added: `POINTS_SCHEMA`, or those of an older journal.
+
+    Raises
+    ------
+    OSError
+        From every method, as the system says it, a full disk for example; `discard` is to be called
+        then.
+    """
+
+    def __init__(
+        self, points_parquet: Path, points_ply: Path, schema: pa.Schema = POINTS_SCHEMA
+    ) -> None:
+        self._paths = points_parquet, points_ply
+        self._drafts = [path.with_name(path.name + DRAFT) for path in self._paths]
+        self._waiting: list[Any] = []
+        self._n_waiting, self._n_points, self._n_vertices = 0, 0, 0
+        self._written: Future[None] | None = None
+        with contextlib.ExitStack() as stack:
+            self._thread = stack.enter_context(ThreadPoolExecutor(1))
+            self._ply = stack.enter_context(self._drafts[1].open("wb"))
+            self._ply.write(_ply_header(0))
+            self._table_file = stack.enter_context(
+                parquet.ParquetWriter(
+                    self._drafts[0],
+                    schema,
+                    compression="lz4",
+                    use_dictionary=[name for name in _NAMES if name in schema.names],
+                    use_byte_stream_split=[f.name for f in schema if f.type == pa.float32()],
+                )
+            )
+            self._open_files = stack.pop_all()
+
+    def add(self, batch: Any) -> None:
+        """Add a record batch; it must not be changed afterwards."""
+        self._waiting.append(batch)
+        self._n_waiting += batch.num_rows
+        while self._n_waiting >= _ROWS_PER_GROUP:
+            table = pa.Table.from_batches(self._waiting)
+            self._begin_group(table.slice(0, _ROWS_PER_GROUP))
+            self._waiting = table.slice(_ROWS_PER_GROUP).to_batches()
+            self._n_waiting -= _ROWS_PER_GROUP
+
+    def finish(self) -> int:
+        """Complete both files; returns the number of points in `points.parquet`."""
+        if self._n_waiting:
+            self._begin_group(pa.Table.from_batches(self._waiting))
+        self._await_group()
+        self._ply.seek(0)
+        self._ply.write(_ply_header(self._n_vertices))
+        self._open_files.close()
+        for draft, path in zip(self._drafts, self._paths, strict=True):
+            os.replace(draft, path)
+        return self._n_points
+
+    def discard(self) -> None:
+        """Remove what has been written of files that will not be finished."""
+        with contextlib.suppress(OSError):
+            self._open_files.close()
+        for draft in self._drafts:
+            draft.unlink(missing_ok=True)
+
+    def _begin_group(self, table: Any) -> None:
+        self._await_group()
+        self._written = self._thread.submit(self._write_group, table)
+
+    def _await_group(self) -> None:
+        if self._written is not None:
+            self._written.result()
+
+    def _write_group(self, table: Any) -> None:
+        group = table.combine_chunks()
+        self._table_file.write_table(group)
+        vertices = _vertices(group)
+        vertices.tofile(self._ply)
+        self._n_points += group.num_rows
+        self._n_vertices += len(vertices)
+
+
+def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
+    """Write the points of a journal as `PointsExport` does it.
 
     Parameters
     ----------
     journal : Path
         May lack its end; what follows the last whole batch is left out.
-    points_parquet : Path
-        Columns as `POINTS_SCHEMA`, or those that an older journal has.
-    points_ply : Path
-        Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser.
+    points_parquet, points_ply : Path
 
     Returns
     -------
@@ -51,65 +140,17 @@ def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
     OSError
         As the system says it, a full disk for example; the journal is left as it is.
     """
-    drafts = [path.with_name(path.name + ".part") for path in (points_parquet, points_ply)]
-    try:
-        n_points = _write_drafts(journal, *drafts)
-        os.replace(drafts[0], points_parquet)
-        os.replace(drafts[1], points_ply)
-    finally:
-        for draft in drafts:
-            draft.unlink(missing_ok=True)
-    return n_points
-
-
-def _write_drafts(journal: Path, parquet_draft: Path, ply_draft: Path) -> int:
-    n_points, n_vertices = 0, 0
     batches = read_journal(journal)
     first = next(batches, None)
     schema = POINTS_SCHEMA if first is None else first.schema
-    head = [] if first is None else [first]
-    with (
-        parquet.ParquetWriter(
-            parquet_draft,
-            schema,
-            compression="lz4",
-            use_dictionary=[name for name in _NAMES if name in schema.names],
-            use_byte_stream_split=[field.name for field in schema if field.type == pa.float32()],
-        ) as table_file,
-        ply_draft.open("wb") as ply,
-        ThreadPoolExecutor(1) as beside,
-    ):
-        ply.write(_ply_header(0))
-        written: Future[None] | None = None
-        for table in _row_groups(itertools.chain(head, batches)):
-            if written is not None:
-                written.result()
-            written = beside.submit(table_file.write_table, table)
-            vertices = _vertices(table)
-            vertices.tofile(ply)
-            n_points += table.num_rows
-            n_vertices += len(vertices)
-        if written is not None:
-            written.result()
-        ply.seek(0)
-        ply.write(_ply_header(n_vertices))
-    return n_points
-
-
-def _row_groups(batches: Iterable[Any]) -> Iterator[Any]:
-    """Join batches into tables of `_ROWS_PER_GROUP` rows, whatever the batches' borders are."""
-    waiting: list[Any] = []
-    n_rows = 0
-    for batch in batches:
-        waiting.append(batch)
-        n_rows += batch.num_rows
-        while n_rows >= _ROWS_PER_GROUP:
-            table = pa.Table.from_batches(waiting)
-            yield table.slice(0, _ROWS_PER_GROUP).combine_chunks()
-            n_rows -= _ROWS_PER_GROUP
-            waiting = table.slice(_ROWS_PER_GROUP).to_batches()
-    if n_rows:
-        yield pa.Table.from_batches(waiting).combine_chunks()
+    export = PointsExport(points_parquet, points_ply, schema)
+    try:
+        for batch in itertools.chain([] if first is None else [first], batches):
+            export.add(batch)
+        return export.finish()
+    except BaseException:
+        export.discard()
+        raise
 
 
 def _vertices(table: Any) -> NDArray[np.void]:
