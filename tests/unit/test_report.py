@@ -28,6 +28,7 @@ from aqualvs.errors import OutputError, SourceError
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
 from report_cases import COLUMNS, FPS, LASERS, NASTY, NASTY_LASER, Dive, make_dive, write_truth
+from shell_cases import write_video
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -215,6 +216,30 @@ def test_pictures_show_refusals_and_the_worst_posture(dive: Dive) -> None:
     assert 30 in rows
     assert set(rows) <= set(choose_samples(track, rows))
     assert len(choose_samples(track, rows)) == 24
+
+
+@pytest.mark.parametrize("options", [{"bf": "0"}, {"bf": "2"}])
+def test_pictures_of_the_spread_are_at_key_frames(
+    dive: Dive, tmp_path: Path, options: dict[str, str]
+) -> None:
+    track = read_track(dive.folder / "posture.csv")
+    track = replaced(track, time_s=track.frame / 25.0)
+    spread = set(choose_pictures(track))
+    gop = {"g": "5", "keyint_min": "5", "sc_threshold": "0"}
+    path = write_video(tmp_path / "dive.mp4", 40, options=gop | options)
+    rows = set(choose_pictures(track, path))
+    assert len(rows) == 6
+    assert rows != spread
+    moved = rows - spread
+    assert {row % 5 for row in moved} == {0}
+    # What is special about a frame is not special about its key frame.
+    assert {15, 30} <= rows
+    assert sorted(decode_frames(path, track, sorted(rows))) == sorted(rows)
+    # With one key frame for all, the spread stays as it is.
+    path = write_video(tmp_path / "long.mp4", 40, options={"g": "250", **options})
+    assert set(choose_pictures(track, path)) == spread
+    path.write_bytes(path.read_bytes()[:100])
+    assert set(choose_pictures(track, path)) == spread
 
 
 def replaced(track: Track, **changes: Any) -> Track:

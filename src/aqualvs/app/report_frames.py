@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -24,6 +25,7 @@ from aqualvs.scanning.scan import ImagePlane
 N_PICTURES = 6
 N_SAMPLES = 24
 _WIDTH_PX = 800
+_DECODERS = 2
 # Colour at full resolution, else the lasers' colours bleed into the green stripes below.
 _JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
@@ -52,16 +54,32 @@ class Picture:
     saturated: float
 
 
-def choose_pictures(track: Track) -> list[int]:
-    """Return rows of the frames worth a picture: refusals, the worst posture, an even spread."""
+def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
+    """Return rows of the frames worth a picture: refusals, the worst posture, an even spread.
+
+    Parameters
+    ----------
+    track : Track
+    source : Path or None
+        Of a video, those of the spread are at key frames where one is near: others can only be
+        decoded with all frames from there on.
+    """
     chosen = _refused_rows(track)
     valid = np.flatnonzero(track.valid)
     if len(valid):
         relative = track.sigma[valid, 0] / track.posture[valid, 0]
         chosen.append(int(valid[np.nan_to_num(relative).argmax()]))
     spread = valid if len(valid) else np.arange(len(track))
+    special = set(chosen)
     while len(set(chosen)) < min(N_PICTURES, len(set(chosen) | set(spread.tolist()))):
         chosen.append(_farthest(spread, chosen))
+    rows = sorted(set(chosen))
+    if source is None or not source.is_file():
+        return rows
+    ordinary = [row for row in rows if row not in special]
+    for row, moved in zip(ordinary, _rows_at_key_frames(source, track, ordinary), strict=False):
+        if moved not in chosen and moved in spread and row - moved <= len(track) / N_PICTURES:
+            chosen[chosen.index(row)] = moved
     return sorted(set(chosen))
 
 
@@ -85,15 +103,10 @@ def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, Imag
         return _from_images(images_in(source), track, rows)
     if source.suffix.lower() in IMAGE_SUFFIXES:
         return _from_images([source], track, rows)
-    pictures = {}
-    try:
-        with av.open(str(source)) as container:
-            for row, picture in _from_video(container, track, rows):
-                pictures[row] = picture
-    except (av.error.FFmpegError, OSError, IndexError):
-        # A broken file gives what came before the fault.
-        return pictures
-    return pictures
+    with ThreadPoolExecutor(_DECODERS) as pool:
+        parts = [rows[i::_DECODERS] for i in range(_DECODERS)]
+        found = pool.map(lambda part: _from_video(source, track, part), parts)
+        return {row: picture for pictures in found for row, picture in pictures.items()}
 
 
 def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
@@ -163,20 +176,60 @@ def _from_images(files: list[Path], track: Track, rows: list[int]) -> dict[int, 
     return pictures
 
 
-def _from_video(
+def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    """Return pictures by row; a broken file gives what came before the fault."""
+    pictures: dict[int, ImagePlane] = {}
+    try:
+        with av.open(str(source)) as container:
+            for row, picture in _decoded_rows(container, track, rows):
+                pictures[row] = picture
+    except (av.error.FFmpegError, OSError, IndexError):
+        return pictures
+    return pictures
+
+
+def _decoded_rows(
     container: InputContainer, track: Track, rows: list[int]
 ) -> Iterator[tuple[int, ImagePlane]]:
     """Yield row and picture; jumps to the key frame before each frame that is wanted."""
     stream = container.streams.video[0]
-    stream.thread_type = "AUTO"
+    stream.codec_context.thread_count = 1
     start = next(container.decode(stream)).time or 0.0
-    half, base = 0.5 * _step_s(track), stream.time_base or Fraction(1, 90_000)
+    half = 0.5 * _step_s(track)
     for row in rows:
         wanted = start + float(track.time_s[row])
-        container.seek(round(wanted / base), stream=stream, backward=True)
+        _seek(container, wanted)
         found = _frame_at(container, wanted - half)
         if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
             yield row, np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+
+
+def _rows_at_key_frames(source: Path, track: Track, rows: list[int]) -> list[int]:
+    """Return the row of the last key frame up to each row, as far as the file tells."""
+    found: list[int] = []
+    try:
+        with av.open(str(source)) as container:
+            start = _next_time(container)
+            for row in rows:
+                _seek(container, start + float(track.time_s[row]))
+                time_s = _next_time(container) - start
+                at = np.searchsorted(track.time_s, time_s - 0.5 * _step_s(track))
+                found.append(min(int(at), row))
+    except (av.error.FFmpegError, OSError, IndexError, StopIteration):
+        return found
+    return found
+
+
+def _next_time(container: InputContainer) -> float:
+    """Return the time at which the next packet's picture is shown."""
+    packet = next(container.demux(video=0))
+    return float(packet.pts or 0) * float(packet.time_base or 0.0)
+
+
+def _seek(container: InputContainer, time_s: float) -> None:
+    stream = container.streams.video[0]
+    base = stream.time_base or Fraction(1, 90_000)
+    container.seek(round(time_s / base), stream=stream, backward=True)
 
 
 def _frame_at(container: InputContainer, earliest: float) -> VideoFrame | None:

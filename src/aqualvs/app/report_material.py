@@ -85,10 +85,10 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     """
     run, trouble = read_run_file(run_dir)
     track = read_track(run_dir / "posture.csv")
-    picture_rows = choose_pictures(track)
+    source = _source(run_dir, run)
+    picture_rows = choose_pictures(track, None if isinstance(source, str) else source)
     sample_rows = choose_samples(track, picture_rows)
     frames = track.frame[sample_rows].tolist()
-    source = _source(run_dir, run)
     with ThreadPoolExecutor(1) as beside:
         # FFmpeg works on the pictures while this thread counts points.
         images = beside.submit(_decoded, source, track, picture_rows)
