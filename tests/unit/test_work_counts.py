@@ -172,7 +172,9 @@ def test_decoded_pictures_are_not_copied() -> None:
     assert peak_kib(decode) < 100.0
 
 
-def test_memory_of_a_run_is_flat(tmp_path: Path) -> None:
+def test_memory_of_a_run_is_flat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Points wait for a row group of Parquet to be full: of a hundred frames, and here of three.
+    monkeypatch.setattr("aqualvs.app.points_export._ROWS_PER_GROUP", 1 << 12)
     # Tables are written as they come: a run of twice the frames holds no more, once all that
     # is read ahead is there. The 80 more frames would bring 4 MiB if only their points were kept.
     measure(tmp_path / "out", 10)
