@@ -61,7 +61,6 @@ class PointsExport:
         self._n_waiting, self._n_points, self._n_vertices = 0, 0, 0
         self._written: Future[None] | None = None
         with contextlib.ExitStack() as stack:
-            self._thread = stack.enter_context(ThreadPoolExecutor(1))
             self._ply = stack.enter_context(self._drafts[1].open("wb"))
             self._ply.write(_ply_header(0))
             self._table_file = stack.enter_context(
@@ -73,6 +72,8 @@ class PointsExport:
                     use_byte_stream_split=[f.name for f in schema if f.type == pa.float32()],
                 )
             )
+            # It ends before the files are closed that it writes to.
+            self._thread = stack.enter_context(ThreadPoolExecutor(1))
             self._open_files = stack.pop_all()
 
     def add(self, batch: Any) -> None:
