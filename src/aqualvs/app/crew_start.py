@@ -48,8 +48,11 @@ def n_cores() -> int:
 
 
 def has_server() -> bool:
-    """Return whether the system can copy a process."""
-    return sys.platform != "win32"
+    """Return whether the system copies a process that has imported much.
+
+    Libraries of macOS do not bear it once they are loaded, and Windows cannot.
+    """
+    return sys.platform == "linux"
 
 
 @contextlib.contextmanager
