@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import os
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,11 @@ def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
     OSError
         As the system says it, a full disk for example; the journal is left as it is.
     """
-    batches = read_journal(journal)
+    return export_batches(read_journal(journal), points_parquet, points_ply)
+
+
+def export_batches(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:
+    """Write record batches with the columns of the first, as `export_points` does it."""
     first = next(batches, None)
     schema = POINTS_SCHEMA if first is None else first.schema
     export = PointsExport(points_parquet, points_ply, schema)

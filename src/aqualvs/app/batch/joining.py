@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from aqualvs.app.batch.dataset import holds_dive, put_dive
 from aqualvs.app.batch.joined_tally import joined_ranges, joined_tally
 from aqualvs.app.batch.ledger import clear, seal, sealed
@@ -19,7 +17,7 @@ from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.thumbnail import range_steps
 from aqualvs.app.batch.work import DiveWork, open_dive, option_facts
 from aqualvs.app.disk import writing
-from aqualvs.app.journal import POINTS_SCHEMA, read_journal
+from aqualvs.app.journal import read_journal
 from aqualvs.app.outputs import (
     JOURNAL,
     POINTS_PARQUET,
@@ -30,7 +28,7 @@ from aqualvs.app.outputs import (
     RUN_FILES,
     RUN_YAML,
 )
-from aqualvs.app.points_export import export_points
+from aqualvs.app.points_export import export_batches
 from aqualvs.app.report import write_report
 from aqualvs.app.runfile import RunFile, Status
 from aqualvs.optics.rigfile import rig_to_mapping
@@ -141,16 +139,11 @@ def _join_files(pieces: Sequence[Path], folder: Path) -> None:
         parts = [piece / name for piece in pieces if (piece / name).exists()]
         if parts:
             _join_rows(parts, folder / name)
-    journal = folder / JOURNAL
-    with (
-        pa.OSFile(str(journal), "wb") as file,
-        pa.ipc.new_stream(file, POINTS_SCHEMA) as stream,
-    ):
-        for piece in pieces:
-            for batch in read_journal(piece / JOURNAL):
-                stream.write_batch(batch)
-    export_points(journal, folder / POINTS_PARQUET, folder / POINTS_PLY)
-    journal.unlink()
+    export_batches(
+        (batch for piece in pieces for batch in read_journal(piece / JOURNAL)),
+        folder / POINTS_PARQUET,
+        folder / POINTS_PLY,
+    )
 
 
 def _join_rows(parts: Sequence[Path], path: Path) -> None:
