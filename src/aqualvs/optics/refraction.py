@@ -55,8 +55,10 @@ def leave_sphere(
     reach = math.sqrt(along * along + radius * radius - (px * px + py * py + pz * pz))
     step = reach - along
     qx, qy, qz = px + step * dx, py + step * dy, pz + step * dz
-    k, radicand = snell_weight(reach / radius, ratio)
-    k = k / radius
+    # One quotient for all rays of a loop.
+    inverse = 1.0 / radius
+    k, radicand = snell_weight(reach * inverse, ratio)
+    k = k * inverse
     ex, ey, ez = ratio * dx - k * qx, ratio * dy - k * qy, ratio * dz - k * qz
     return radicand, qx, qy, qz, ex, ey, ez
 
