@@ -10,8 +10,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.calibration.pixel_fit import blurred_edge, factorise, solve_factorised
+from aqualvs.calibration.pixel_fit import LEAST_PIVOT, blurred_edge
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.cholesky import factorise, solve_factorised
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 
 U8Array = NDArray[np.uint8]
@@ -108,7 +109,7 @@ def _fit(
             return 0.0, 1.0
         if max(abs(best[0] - window[_X]), abs(best[1] - window[_Y])) < _RECENTRE_PX:
             break
-    if not best[6] > 0.0 or not factorise(matrices[0], 0.0, matrices[2]):
+    if not best[6] > 0.0 or not factorise(matrices[0], 0.0, LEAST_PIVOT, matrices[2]):
         return 0.0, 1.0
     variance = rss / (count - _N)
     spread = 0.0
@@ -150,7 +151,7 @@ def _descend(
     rss, count = _sums(image, window, best, matrices[0], gradient, vectors[5])
     damping = 1e-3
     for _ in range(_MAX_ITERATIONS):
-        if count < 2 * _N or not factorise(matrices[0], damping, matrices[2]):
+        if count < 2 * _N or not factorise(matrices[0], damping, LEAST_PIVOT, matrices[2]):
             return np.inf, 0
         solve_factorised(matrices[2], gradient, step)
         _advance(best, step, tried)

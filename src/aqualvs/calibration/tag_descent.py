@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 
-from aqualvs.calibration.pixel_fit import factorise, solve_factorised
+from aqualvs.calibration.pixel_fit import LEAST_PIVOT
 from aqualvs.calibration.tag_model import BLUR, GAMMA, N_UNKNOWNS, U8Array, tag_sums
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.cholesky import factorise, inverse_of, solve_factorised
 from aqualvs.geometry.compiled import kernel
 
 _SETTLED_PX = 5e-3
@@ -60,7 +61,7 @@ def descend(
     ) + _add_prior(prior, unknowns, normal, gradient)
     damping = 1e-3
     for _ in range(n_steps):
-        if not factorise(normal, damping, lower):
+        if not factorise(normal, damping, LEAST_PIVOT, lower):
             return False
         solve_factorised(lower, gradient, step)
         _shorten(step, unknowns)
@@ -89,12 +90,9 @@ def descend(
         residuals[:, :] = new_residuals
         if np.max(np.abs(step[:6])) < _SETTLED_PX and abs(step[BLUR]) < _SETTLED_LOG_BLUR:
             break
-    if not factorise(normal, 0.0, lower):
+    if not factorise(normal, 0.0, LEAST_PIVOT, lower):
         return False
-    for i in range(N_UNKNOWNS):
-        step[:] = 0.0
-        step[i] = 1.0
-        solve_factorised(lower, step, covariance[i])
+    covariance[:, :] = inverse_of(lower)
     return True
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.cholesky import factorise, inverse_of, substitute
+from aqualvs.geometry.cholesky import factorise, inverse_of, solve_factorised
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.patch_kernels import COEFFICIENTS, NORMAL, OFFSET, RIGHT, UP
 
@@ -27,6 +27,8 @@ _MORE_LIGHT = 1.10
 _LESS_SCATTER = 0.6
 # ... and the curvature is no chance.
 _SIGNIFICANT = 6.0
+# A pivot below this share of its diagonal is rounding, not information.
+_LEAST_PIVOT = 1e-13
 
 
 @kernel
@@ -210,10 +212,9 @@ def _solve(
             right[j] += part * height[i]
             for k in range(j + 1):
                 factor[j, k] += part * terms[i, k]
-    if not factorise(factor):
+    if not factorise(factor, 0.0, _LEAST_PIVOT, factor):
         return False
-    substitute(factor, right)
-    coefficients[:] = right
+    solve_factorised(factor, right, coefficients)
     return True
 
 
