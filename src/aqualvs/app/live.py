@@ -7,10 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from aqualvs.app.live_console import Console
-from aqualvs.app.live_outputs import (
-    OutputRequest,
-    make_outputs,
-)
+from aqualvs.app.live_outputs import OutputRequest, make_outputs
 from aqualvs.app.live_water import WaterFollower
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.run_inputs import Water, prepared_rig

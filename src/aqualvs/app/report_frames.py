@@ -1,7 +1,7 @@
 """Which frames the report shows, and their pictures decoded again from the source."""
 
 import base64
-from collections.abc import Iterator
+import contextlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
@@ -26,6 +26,8 @@ N_PICTURES = 6
 N_SAMPLES = 24
 _WIDTH_PX = 800
 _DECODERS = 2
+# What a file raises that is no video, has no picture, or breaks off.
+_BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
 # Colour at full resolution, else the lasers' colours bleed into the green stripes below.
 _JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
@@ -177,46 +179,35 @@ def _from_images(files: list[Path], track: Track, rows: list[int]) -> dict[int, 
 
 
 def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
-    """Return pictures by row; a broken file gives what came before the fault."""
+    """Return pictures by row; a broken file gives what came before the fault.
+
+    Jumps to the key frame before each frame that is wanted.
+    """
     pictures: dict[int, ImagePlane] = {}
-    try:
-        with av.open(str(source)) as container:
-            for row, picture in _decoded_rows(container, track, rows):
-                pictures[row] = picture
-    except (av.error.FFmpegError, OSError, IndexError):
-        return pictures
-    return pictures
-
-
-def _decoded_rows(
-    container: InputContainer, track: Track, rows: list[int]
-) -> Iterator[tuple[int, ImagePlane]]:
-    """Yield row and picture; jumps to the key frame before each frame that is wanted."""
-    stream = container.streams.video[0]
-    stream.codec_context.thread_count = 1
-    start = next(container.decode(stream)).time or 0.0
     half = 0.5 * _step_s(track)
-    for row in rows:
-        wanted = start + float(track.time_s[row])
-        _seek(container, wanted)
-        found = _frame_at(container, wanted - half)
-        if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
-            yield row, np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+    with contextlib.suppress(*_BROKEN), av.open(str(source)) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.thread_count = 1
+        start = next(container.decode(stream)).time or 0.0
+        for row in rows:
+            wanted = start + float(track.time_s[row])
+            _seek(container, wanted)
+            found = _frame_at(container, wanted - half)
+            if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
+                pictures[row] = np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+    return pictures
 
 
 def _rows_at_key_frames(source: Path, track: Track, rows: list[int]) -> list[int]:
     """Return the row of the last key frame up to each row, as far as the file tells."""
     found: list[int] = []
-    try:
-        with av.open(str(source)) as container:
-            start = _next_time(container)
-            for row in rows:
-                _seek(container, start + float(track.time_s[row]))
-                time_s = _next_time(container) - start
-                at = np.searchsorted(track.time_s, time_s - 0.5 * _step_s(track))
-                found.append(min(int(at), row))
-    except (av.error.FFmpegError, OSError, IndexError, StopIteration):
-        return found
+    half = 0.5 * _step_s(track)
+    with contextlib.suppress(*_BROKEN), av.open(str(source)) as container:
+        start = _next_time(container)
+        for row in rows:
+            _seek(container, start + float(track.time_s[row]))
+            time_s = _next_time(container) - start
+            found.append(min(int(np.searchsorted(track.time_s, time_s - half)), row))
     return found
 
 

@@ -70,8 +70,6 @@ def chunk_readings(
             index[i] = c
         facts[0, c], facts[1, c], facts[2, c] = end - begin, line[begin], line[end - 1]
         facts[3, c] = laser[begin]
-        # Summed in a variable: what is summed in memory, LLVM may sum in another order where arrays
-        # happen to lie close to each other.
         total = 0.0
         for i in range(begin, end):
             total += trust[i]

@@ -14,7 +14,6 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from aqualvs.app import crew_start
-from aqualvs.app.crew_start import deaf_to_interrupts
 from aqualvs.app.runfile import versions
 from aqualvs.errors import AqualvsError, OptionError
 
@@ -222,7 +221,7 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
         # It would import whatever it can find, to have it in the server, which is there already.
         distributed.utils._forkserver_preload_set = True
     # What Dask says of dying processes helps nobody: the task is done by another.
-    with dask.config.set(settings), deaf_to_interrupts():
+    with dask.config.set(settings), crew_start.deaf_to_interrupts():
         for _ in range(_STARTS):
             try:
                 return distributed.LocalCluster(
