@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 
@@ -16,19 +17,21 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app import crew_plan
+from aqualvs.app import crew_plan, crew_post
 from aqualvs.app.blocks import block_length, in_blocks, read_ahead
 from aqualvs.app.crew import Crew
-from aqualvs.app.crew_messages import Ended, packed, unpacked
+from aqualvs.app.crew_messages import Ended
 from aqualvs.app.crew_plan import crew_work
-from aqualvs.app.measuring import Meter
+from aqualvs.app.crew_post import Receiver, Sender
+from aqualvs.app.measuring import Measured, Meter
 from aqualvs.app.run import RunRequest, run
 from aqualvs.app.run_inputs import FrameWindow
 from aqualvs.errors import SourceError
 from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
-from aqualvs.scanning.scan import ScanPoints
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.scan import Scan, ScanPoints
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 from shell_cases import destroy_frame
 
@@ -181,23 +184,80 @@ def test_the_command_shares_a_dive_by_default(tmp_path):
     assert all(without_times(outs[0] / n) == without_times(outs[1] / n) for n in RESULTS)
 
 
-def test_messages_arrive_as_they_were(dive):
+@pytest.fixture(scope="module")
+def block(dive):
     rig = load_rig(RIG)
     with open_source(dive) as source:
         frames = [frame for _, frame in zip(range(3), source, strict=False)]
-    block = Meter(rig, Scanner(rig)).measure(frames)
-    found = unpacked(packed(block))
-    assert [m.frame for m in found] == [None] * 3
+    return Meter(rig, Scanner(rig)).measure(frames)
+
+
+@pytest.fixture
+def ends():
+    """Both ends of what messages pass through, and a thread that ends when they are closed."""
+    mine, theirs = multiprocessing.Pipe()
+    memory = crew_post.shared_memory(multiprocessing.get_context("spawn"))
+    with theirs, ThreadPoolExecutor(1) as thread, mine:
+        yield Sender(theirs, memory), Receiver(mine, memory), thread
+
+
+def assert_like(block, found):
+    assert [m.frame for m in found] == [None] * len(block)
     for one, other in zip(block, found, strict=True):
         assert (one.scan.index, one.scan.time_s) == (other.scan.index, other.scan.time_s)
-        assert one.scan.posture.range == other.scan.posture.range
-        assert one.bare.range == other.bare.range
-        assert np.array_equal(one.scan.posture.covariance, other.scan.posture.covariance)
+        assert one.scan.n_water == other.scan.n_water
+        for mine, theirs in [(one.scan.posture, other.scan.posture), (one.bare, other.bare)]:
+            assert type(mine) is type(theirs)
+            assert repr(mine) == repr(theirs)
+            if isinstance(mine, Posture):
+                # What is printed is rounded.
+                assert np.array_equal(mine.covariance, theirs.covariance)
+                assert np.array_equal(mine.normal_in_dome, theirs.normal_in_dome)
         for field in fields(ScanPoints):
             mine, theirs = (getattr(m.scan.points, field.name) for m in (one, other))
             assert mine.dtype == theirs.dtype
             assert np.array_equal(mine, theirs)
-    assert [unpacked(packed(end)) for end in Ended] == list(Ended)
+
+
+def test_messages_arrive_as_they_were(block, ends):
+    sender, receiver, _ = ends
+    refused = Scan(7, 0.5, Refusal(Reason.NO_STRIPES, "dark"), ScanPoints.none(), 1.34)
+    dark = [Measured(refused, refused.posture), Measured(refused, None)]
+    for message in (block, dark, [*dark, *block], block[:1], block, dark):
+        sender.send(message)
+        assert_like(message, receiver.receive())
+    for message in Ended:
+        sender.send(message)
+        assert receiver.receive() is message
+
+
+def test_so_do_those_that_are_too_large_for_their_place(block, ends, monkeypatch):
+    sender, receiver, thread = ends
+    monkeypatch.setattr(crew_post, "_SLOT_BYTES", 4096)
+    sent = thread.submit(sender.send, block)
+    assert_like(block, receiver.receive())
+    sent.result(timeout=10)
+
+
+def test_a_sender_waits_until_there_is_a_place(block, ends):
+    """Nothing is written over that has not been taken out, and parts come in between."""
+    sender, receiver, thread = ends
+    messages = [[one] * n for n in range(1, 5) for one in block]
+
+    def send():
+        for message in messages:
+            sender.send(message)
+        sender.send(Ended.WHOLE)
+        return sender.next_part()
+
+    sent = thread.submit(send)
+    time.sleep(0.2)
+    assert not sent.done()
+    for message in messages:
+        assert_like(message, receiver.receive())
+    assert receiver.receive() is Ended.WHOLE
+    receiver.give_part(5)
+    assert sent.result(timeout=10) == 5
 
 
 def breaking_off(n):

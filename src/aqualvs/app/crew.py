@@ -9,7 +9,8 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Self, cast
 
-from aqualvs.app.crew_messages import Ended, Message, unpacked
+from aqualvs.app.crew_messages import Ended, Message
+from aqualvs.app.crew_post import Receiver, shared_memory
 from aqualvs.app.crew_start import context
 from aqualvs.app.crew_work import CrewWork, serve
 from aqualvs.app.measuring import Measured
@@ -26,6 +27,7 @@ class _Hand:
 
     process: BaseProcess
     pipe: Connection
+    receiver: Receiver
     number: int = -1
 
 
@@ -93,7 +95,7 @@ class Crew:
         }
         for pipe in wait(list(hands)):
             hand = hands[cast("Connection", pipe)]
-            message = unpacked(hand.pipe.recv_bytes())
+            message = hand.receiver.receive()
             self._found[hand.number].append(message)
             if isinstance(message, Ended):
                 self._give(hand)
@@ -103,7 +105,7 @@ class Crew:
         hand.number = self._n_given if self._n_given < len(self._work.parts) else -1
         if hand.number >= 0:
             self._n_given += 1
-            hand.pipe.send(hand.number)
+            hand.receiver.give_part(hand.number)
 
     def __enter__(self) -> Self:
         """Start the processes."""
@@ -116,10 +118,11 @@ class Crew:
     def _start(self) -> _Hand:
         how = context()
         mine, theirs = how.Pipe()
-        process = how.Process(target=serve, args=(self._work, theirs), daemon=True)
+        memory = shared_memory(how)
+        process = how.Process(target=serve, args=(self._work, theirs, memory), daemon=True)
         process.start()
         theirs.close()
-        return _Hand(process, mine)
+        return _Hand(process, mine, Receiver(mine, memory))
 
     def __exit__(
         self,

@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import cv2
 
 from aqualvs.app.blocks import in_blocks
-from aqualvs.app.crew_messages import Ended, Message, packed
+from aqualvs.app.crew_messages import Ended, Message
+from aqualvs.app.crew_post import Sender
 from aqualvs.app.measuring import Meter
 from aqualvs.live.sources.span_frames import UnlikeSurveyError, VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind
@@ -59,7 +61,7 @@ class CrewWork:
     fps: float
 
 
-def serve(work: CrewWork, pipe: Connection) -> None:
+def serve(work: CrewWork, pipe: Connection, memory: Any) -> None:
     """Measure the parts whose numbers come through a pipe, until its other end is closed.
 
     What is found goes back block by block, and an `Ended` after each part.
@@ -68,13 +70,14 @@ def serve(work: CrewWork, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
+    sender = Sender(pipe, memory)
     try:
         meter = Meter(work.rig, Scanner(work.rig, work.options))
         with VideoParts(work.path, work.rig.size_px) as video:
             while True:
-                part = work.parts[pipe.recv()]
+                part = work.parts[sender.next_part()]
                 for message in _messages(part, _frames(work, part, video), meter):
-                    pipe.send_bytes(packed(message))
+                    sender.send(message)
     except (EOFError, ConnectionError):
         # The other end has gone; whatever is buffered for it goes too.
         os._exit(1)
