@@ -12,6 +12,7 @@ import yaml
 
 from aqualvs.app.cli import main
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
+from processes import children_of, on_proc
 
 pytest.importorskip("distributed")
 
@@ -63,18 +64,10 @@ def begun(season, out):
 
 def workers_of(process):
     """Processes that work for a batch: copies of the one it has begun for that."""
-    parents = {}
-    for entry in filter(str.isdigit, os.listdir("/proc")):
-        try:
-            with open(f"/proc/{entry}/stat", encoding="ascii", errors="replace") as file:
-                parents[int(entry)] = int(file.read().rpartition(")")[2].split()[1])
-        except (OSError, ValueError, IndexError):
-            continue
-    servers = {pid for pid, parent in parents.items() if parent == process.pid}
-    return [pid for pid, parent in parents.items() if parent in servers]
+    return children_of(*children_of(process.pid))
 
 
-@pytest.mark.skipif(not os.path.isdir("/proc"), reason="looks for processes in /proc")
+@on_proc
 def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_path, season):
     out = tmp_path / "out"
     with begun(season, out) as first:

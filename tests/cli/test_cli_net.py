@@ -13,7 +13,8 @@ from pyarrow import parquet
 from aqualvs.app import net as body
 from aqualvs.app.cli import main
 from aqualvs.app.journal import PointsJournal
-from aqualvs.app.net_pass import NetPass, NetRequest
+from aqualvs.app.net_pass import NetPass
+from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import NET_FILES, RunOutputs
 from aqualvs.app.stored_scans import stored_scans
 from aqualvs.optics.rigfile import rig_to_mapping

@@ -17,7 +17,9 @@ import yaml
 from pyarrow import parquet
 
 from aqualvs.app.cli import main
+from aqualvs.app.crew_start import n_cores
 from aqualvs.simulation.example_rigs import example_rig
+from processes import children_of, on_proc, still_there
 from shell_cases import (
     all_key_frames,
     cut_after,
@@ -285,6 +287,34 @@ def test_a_killed_run_can_be_read_and_completed(long_dive, rig, tmp_path, capsys
     assert (out / "points.ply").stat().st_size > 1000
     assert (out / "report.html").is_file()
     assert not (out / "points.arrows").exists()
+
+
+@on_proc
+@pytest.mark.skipif(n_cores() < 2, reason="one core is one process")
+def test_the_processes_of_a_killed_run_end_with_it(long_dive, rig, tmp_path):
+    with under_way(long_dive, rig, tmp_path / "out") as process:
+        others = children_of(process.pid)
+        process.kill()
+        process.wait()
+        left = still_there(others, 20.0)
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+    assert len(others) >= 2
+    assert left == []
+
+
+@on_proc
+@pytest.mark.skipif(n_cores() < 2, reason="one core is one process")
+def test_ctrl_c_reaches_the_processes_of_a_run_and_does_nothing_there(long_dive, rig, tmp_path):
+    """A terminal sends it to all of them; what they have measured is written."""
+    out = tmp_path / "out"
+    with under_way(long_dive, rig, out) as process:
+        for pid in [*children_of(process.pid), process.pid]:
+            os.kill(pid, signal.SIGINT)
+        _, complaint = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert complaint == ""
+    assert run_file(out)["status"] == "interrupted"
 
 
 def test_a_run_under_way_is_left_alone(long_dive, rig, tmp_path, refused):

@@ -26,6 +26,7 @@ from aqualvs.live.outputs.ros1_node import advertised_host, master_host
 from aqualvs.live.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from live_cases import demo_samples
+from processes import children_of
 from ros_listener import (
     Listener,
     expected_points,
@@ -107,16 +108,6 @@ class Roscore:
                     os.kill(pid, signal.SIGKILL)
             self._process.wait(3.0)
         self._process = None
-
-
-def children_of(pid: int) -> list[int]:
-    """Processes that a process has started."""
-    found: list[int] = []
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        # Threads come and go meanwhile.
-        with contextlib.suppress(FileNotFoundError):
-            found += map(int, (task / "children").read_text().split())
-    return found
 
 
 Listen = Callable[[], Listener]

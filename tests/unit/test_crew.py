@@ -1,6 +1,7 @@
 """A dive that several processes measure is, byte for byte, the one that one process measures."""
 
 import contextlib
+import errno
 import multiprocessing
 import os
 import signal
@@ -22,7 +23,7 @@ from aqualvs.app.blocks import block_length, in_blocks, read_ahead
 from aqualvs.app.crew import Crew
 from aqualvs.app.crew_messages import Ended
 from aqualvs.app.crew_plan import crew_work
-from aqualvs.app.crew_post import Receiver, Sender
+from aqualvs.app.crew_post import Receiver, Sender, SharedMemory
 from aqualvs.app.measuring import Measured, Meter
 from aqualvs.app.run import RunRequest, run
 from aqualvs.app.run_inputs import FrameWindow
@@ -156,6 +157,33 @@ def test_what_needs_this_process_is_done_by_it(tmp_path, dive, crews, more):
     assert not crews
 
 
+def test_without_memory_to_share_all_goes_through_the_pipe(tmp_path, dive, crews, monkeypatch):
+    def refused(_):
+        raise OSError(errno.EMFILE, "none")
+
+    monkeypatch.setattr(os, "memfd_create", refused, raising=False)
+    assert SharedMemory.new() is None
+    assert_same(dive, tmp_path, crews)
+    assert crews[0].is_done
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are copied on Linux")
+@pytest.mark.parametrize(("threads", "how"), [(0, "fork"), (1, "forkserver")])
+def test_a_process_is_copied_only_while_it_has_no_threads(threads, how):
+    program = f"""
+import threading
+from aqualvs.app.crew_start import context
+held = threading.Event()
+for _ in range({threads}):
+    threading.Thread(target=held.wait, daemon=True).start()
+print(context().get_start_method())
+"""
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert said.stdout.strip() == how
+
+
 def test_a_video_without_key_frames_inside_is_not_shared(tmp_path):
     assert work_of(demo_dive(tmp_path / "one.mp4", 12, 100)) is None
 
@@ -196,7 +224,10 @@ def block(dive):
 def ends():
     """Both ends of what messages pass through, and a thread that ends when they are closed."""
     mine, theirs = multiprocessing.Pipe()
-    memory = crew_post.shared_memory(multiprocessing.get_context("spawn"))
+    memory = SharedMemory.new()
+    if memory is None:
+        pytest.skip("the system has no memory to share")
+    memory.seal()
     with theirs, ThreadPoolExecutor(1) as thread, mine:
         yield Sender(theirs, memory), Receiver(mine, memory), thread
 

@@ -229,6 +229,12 @@ def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch)
     assert n_points == 300
     file = parquet.ParquetFile(tmp_path / "p.parquet")
     assert file.num_row_groups == 3
+    for i in range(file.num_row_groups):
+        group = file.metadata.row_group(i)
+        told = {
+            c.path_in_schema for c in map(group.column, range(group.num_columns)) if c.statistics
+        }
+        assert told == {"frame", "time_s"}
     expected = pa.Table.from_batches([points_batch(made) for made in scans])
     assert file.read().equals(expected)
 

@@ -69,14 +69,10 @@ def run(
     ] = None,
 ) -> None:
     """Measure a dive."""
-    from aqualvs.app import crew_start
-
-    n_processes = workers or crew_start.n_cores()
-    if n_processes > 1:
-        crew_start.prepare(crew_start.FOR_RUNS)
     with importing():
         from aqualvs.app import run as body
-        from aqualvs.app.net_pass import NetRequest
+        from aqualvs.app.crew_start import n_cores
+        from aqualvs.app.net_request import NetRequest
         from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
 
     request = body.RunRequest(
@@ -97,7 +93,7 @@ def run(
         truth=truth,
         index_target=index_target,
         net=NetRequest() if net else None,
-        n_processes=n_processes,
+        n_processes=workers or n_cores(),
     )
     raise typer.Exit(body.run_and_tell(request, typer.echo))
 
@@ -146,7 +142,7 @@ def net(
 ) -> None:
     """Tell the state of a net."""
     from aqualvs.app import net as body
-    from aqualvs.app.net_pass import NetRequest
+    from aqualvs.app.net_request import NetRequest
 
     request = NetRequest(twine_mm=twine_mm, stretch_m=stretch_m, log=log, log_offset_s=log_offset_s)
     place = body.NetSource(source=source, rig=rig, out=out, target=target, overwrite=overwrite)

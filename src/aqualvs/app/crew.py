@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Self, cast
 
 from aqualvs.app.crew_messages import Ended, Message
-from aqualvs.app.crew_post import Receiver, shared_memory
-from aqualvs.app.crew_start import context
+from aqualvs.app.crew_post import Receiver, SharedMemory
+from aqualvs.app.crew_start import context, interrupts_blocked
 from aqualvs.app.crew_work import CrewWork, serve
 from aqualvs.app.measuring import Measured
 
@@ -116,12 +116,17 @@ class Crew:
         return self
 
     def _start(self) -> _Hand:
-        how = context()
+        how, memory = context(), SharedMemory.new()
         mine, theirs = how.Pipe()
-        memory = shared_memory(how)
-        process = how.Process(target=serve, args=(self._work, theirs, memory), daemon=True)
-        process.start()
+        is_copy = how.get_start_method() == "fork"
+        # A copy has these too; they count as closed when no process has them any more.
+        mines = [*(hand.pipe for hand in self._hands), mine] if is_copy else []
+        process = how.Process(target=serve, args=(self._work, theirs, memory, mines), daemon=True)
+        with interrupts_blocked() if is_copy else contextlib.nullcontext():
+            process.start()
         theirs.close()
+        if memory is not None:
+            memory.seal()
         return _Hand(process, mine, Receiver(mine, memory))
 
     def __exit__(

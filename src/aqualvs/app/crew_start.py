@@ -1,4 +1,4 @@
-"""How processes that measure begin; to be imported before anything heavy."""
+"""How processes that measure begin; light to import."""
 
 import contextlib
 import multiprocessing
@@ -9,11 +9,10 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext, SpawnContext
+    from multiprocessing.context import ForkContext, ForkServerContext, SpawnContext
 
-FOR_RUNS = ("aqualvs.app.crew_work",)
 FOR_BATCHES = ("distributed.nanny", "aqualvs.app.batch.season")
-"""What the processes of a run, and those of a batch, import first."""
+"""What the processes of a batch import first."""
 
 
 def prepare(modules: tuple[str, ...]) -> None:
@@ -24,20 +23,30 @@ def prepare(modules: tuple[str, ...]) -> None:
     if has_server():
         from multiprocessing import forkserver
 
-        context().set_forkserver_preload(list(modules))
+        multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
         with deaf_to_interrupts():
             forkserver.ensure_running()
 
 
-def context() -> "ForkServerContext | SpawnContext":
-    """Return how processes begin: as copies of one that has done nothing but import.
+def context() -> "ForkContext | ForkServerContext | SpawnContext":
+    """Return how processes begin: where it can be, as copies of this one with all it has imported.
 
-    A copy of this process would begin faster still, but with the locks of threads that it lacks:
-    of OpenCV's, for example.
+    It cannot where this process has threads, of libraries too: a copy would have their locks, and
+    not the threads that open them.
     """
-    if has_server():
-        return multiprocessing.get_context("forkserver")
-    return multiprocessing.get_context("spawn")
+    if not has_server():
+        return multiprocessing.get_context("spawn")
+    if n_threads() == 1:
+        return multiprocessing.get_context("fork")
+    return multiprocessing.get_context("forkserver")
+
+
+def n_threads() -> int | None:
+    """Return how many threads this process has, those of libraries included; None if unknown."""
+    try:
+        return len(os.listdir("/proc/self/task"))
+    except OSError:
+        return None
 
 
 def n_cores() -> int:
@@ -68,6 +77,13 @@ def deaf_to_interrupts() -> Iterator[None]:
 
     # Begun later, it would have the thread that begins it hear again.
     resource_tracker.ensure_running()
+    with interrupts_blocked():
+        yield
+
+
+@contextlib.contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Have Ctrl-C wait; a copy of this process that is begun here never hears it."""
     heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

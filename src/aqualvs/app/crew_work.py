@@ -3,17 +3,16 @@
 import itertools
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import cv2
 
 from aqualvs.app.blocks import in_blocks
 from aqualvs.app.crew_messages import Ended, Message
-from aqualvs.app.crew_post import Sender
+from aqualvs.app.crew_post import Sender, SharedMemory
 from aqualvs.app.measuring import Meter
 from aqualvs.live.sources.span_frames import UnlikeSurveyError, VideoParts, image_frames
 from aqualvs.live.sources.spans import Span, SpanKind
@@ -61,11 +60,19 @@ class CrewWork:
     fps: float
 
 
-def serve(work: CrewWork, pipe: Connection, memory: Any) -> None:
+def serve(
+    work: CrewWork,
+    pipe: Connection,
+    memory: SharedMemory | None,
+    others: Sequence[Connection],
+) -> None:
     """Measure the parts whose numbers come through a pipe, until its other end is closed.
 
-    What is found goes back block by block, and an `Ended` after each part.
+    What is found goes back block by block, and an `Ended` after each part. `others` are pipes that
+    this process has inherited and that are not its own.
     """
+    for other in others:
+        other.close()
     # A terminal sends Ctrl-C to all processes; the one that has begun this one decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -8,7 +8,8 @@ from typing import Any
 import yaml
 
 from aqualvs.app.disk import writing
-from aqualvs.app.net_pass import NetPass, NetRequest
+from aqualvs.app.net_pass import NetPass
+from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import (
     NET_FILES,
     NET_MAP_PNG,

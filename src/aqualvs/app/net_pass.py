@@ -12,8 +12,8 @@ import numpy as np
 
 from aqualvs import __version__
 from aqualvs.app.disk import writing
+from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG, NET_MAP_SVG
-from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
@@ -21,51 +21,9 @@ from aqualvs.scanning.scan import Label, Scan
 if TYPE_CHECKING:
     from aqualvs.app.net_log import LaidLog
     from aqualvs.app.net_wall import NetWall
-    from aqualvs.scanning.net_condition import NetConditionOptions
 
 # The posture is that of a net if so much of what it rests on is net.
 _NET_SHARE = 0.5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NetRequest:
-    """What to find out about a net.
-
-    Attributes
-    ----------
-    twine_mm : float or None
-        Diameter of the bare twine, where it is known.
-    stretch_m : float
-        Length of a stretch of net.
-    log : Path or None
-        The vehicle's log.
-    log_offset_s : float or None
-        Its clock minus the dive's, where it is known.
-    """
-
-    twine_mm: float | None = None
-    stretch_m: float = 0.5
-    log: Path | None = None
-    log_offset_s: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot be."""
-        for option, value in (("twine-mm", self.twine_mm), ("stretch-m", self.stretch_m)):
-            if value is not None and not 0.0 < value < np.inf:
-                raise OptionError(f"--{option} {value:g}: must be positive; correct it")
-        if self.log_offset_s is not None and not np.isfinite(self.log_offset_s):
-            raise OptionError(f"--log-offset-s {self.log_offset_s:g}: give a number of seconds")
-
-    def options(self) -> "NetConditionOptions":
-        """Return the options of the evaluation."""
-        from aqualvs.scanning.net_condition import NetConditionOptions
-
-        twine = None if self.twine_mm is None else 1e-3 * self.twine_mm
-        return NetConditionOptions(stretch=self.stretch_m, twine=twine)
-
-    def facts(self) -> dict[str, Any]:
-        """Return them for the files that are written."""
-        return {"twine_mm": self.twine_mm, "stretch_m": self.stretch_m}
 
 
 @dataclass(frozen=True, slots=True)

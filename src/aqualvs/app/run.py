@@ -1,44 +1,29 @@
 """`aqualvs run`: from a dive to posture, points and report."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from aqualvs.app.crew_plan import crew_work
 from aqualvs.app.crew_work import CrewWork
-from aqualvs.app.measuring import Measured, ScansFrames
+from aqualvs.app.measuring import ScansFrames
 from aqualvs.app.net_check import net_check
-from aqualvs.app.net_pass import NetRequest
-from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
-from aqualvs.app.progress import Tick, progress
-from aqualvs.app.report import write_report
+from aqualvs.app.net_request import NetRequest
+from aqualvs.app.progress import progress
 from aqualvs.app.run_agreement import agreement_of
-from aqualvs.app.run_bare_lens import RunBareLens
-from aqualvs.app.run_inputs import (
-    FrameWindow,
-    Water,
-    check_fits,
-    prepared_rig,
-    scanner_facts,
-    source_facts,
-)
-from aqualvs.app.run_mcap import RunMcap, prepare_mcap
+from aqualvs.app.run_inputs import FrameWindow, Water, check_fits, prepared_rig, scanner_facts
 from aqualvs.app.run_measuring import RunMeasuring
-from aqualvs.app.run_net import RunNet
-from aqualvs.app.run_overlay import RunOverlay
 from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
 from aqualvs.app.run_water import WaterFollowingScanner
-from aqualvs.app.run_writers import RunWriters
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.tally import Tally
-from aqualvs.app.truth import TruthComparison, compare_with_truth, read_truth
+from aqualvs.app.truth import TruthComparison, read_truth
 from aqualvs.errors import AqualvsError, OptionError, SourceError
 from aqualvs.live.sources import FrameSource, open_source
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 
@@ -103,6 +88,15 @@ class RunRequest:
     target: str = "auto"
     n_processes: int = 1
 
+    def facts(self) -> dict[str, Any]:
+        """Return the options as `run.yaml` holds them."""
+        rig_file = None if self.rig is None else str(self.rig)
+        found: dict[str, Any] = {"rig_file": rig_file, "no_dome": self.no_dome}
+        found |= asdict(self.water)
+        found |= {"first_frame": self.frames.first, "stop_frame": self.frames.stop}
+        found["index_target"] = None if self.index_target is None else str(self.index_target)
+        return found | {"scanner": scanner_facts(self.scanner)}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunResult:
@@ -166,26 +160,29 @@ def run(
     fault: AqualvsError | None = None
     with replay or open_source(request.source, fps=request.fps) as source:
         check_fits(source, rig)
-        following = _following(request, rig)
-        scanner = following or replay or scanner_for(rig, request.scanner)
-        net, agreement = RunNet(rig, request.net), _agreement(request, rig)
-        work = _crew_work(request, source, rig, scanner)
-        measuring = RunMeasuring(source, rig, request.frames, work, request.n_processes)
-        with measuring:
-            prepare_mcap(request.out, request.source, overwrite=request.overwrite)
-            prepare_folder(request.out, overwrite=request.overwrite)
+        alone = replay is not None or scanner_for is not Scanner
+        work = None if alone else _crew_work(request, source, rig)
+        with RunMeasuring(source, rig, request.frames, work, request.n_processes) as measuring:
+            # While other processes measure the first frames, this one gets ready to write.
+            from aqualvs.app import run_folder as folder
+
+            following = _following(request, rig)
+            scanner = following or replay or scanner_for(rig, request.scanner)
+            net, agreement = folder.net_of(request, rig), _agreement(request, rig)
+            check = net_check(request.target, rig)
+            measuring.await_first()
+            folder.prepare(request)
             started = time.perf_counter()
             try:
                 with (
-                    _writers(request, rig, source, net) as writers,
+                    folder.writers(request, rig, source, net) as writers,
                     StopSignals() as stop,
                     progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
                 ):
-                    writers.tally.agreement = agreement
-                    writers.tally.net_check = net_check(request.target, rig)
+                    writers.tally.agreement, writers.tally.net_check = agreement, check
                     scanner = writers.recorded(scanner)
                     with closing(measuring.blocks(scanner, one_by_one=request.mcap)) as blocks:
-                        _write_all(blocks, writers, stop, tick)
+                        folder.write_all(blocks, writers, stop, tick)
             except SourceError as broken_off:
                 fault = broken_off
     return RunResult(
@@ -196,22 +193,10 @@ def run(
         water_lines=following.lines() if following else [],
         net_lines=writers.net_lines(request.out, request.source),
         elapsed_s=time.perf_counter() - started,
-        report=_report(request),
-        comparison=_comparison(request),
+        report=folder.report(request),
+        comparison=folder.comparison(request),
         fault=fault,
     )
-
-
-def _write_all(
-    blocks: Iterable[list[Measured]], writers: RunWriters, stop: StopSignals, tick: Tick
-) -> None:
-    """Write what is found until it ends, or a signal stops it."""
-    for block in blocks:
-        writers.write(*block)
-        tick(len(block))
-        if stop.caught:
-            writers.interrupt()
-            return
 
 
 def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
@@ -274,11 +259,9 @@ def _following(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
     return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
 
 
-def _crew_work(
-    request: RunRequest, source: FrameSource, rig: Rig, scanner: ScansFrames
-) -> CrewWork | None:
+def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork | None:
     """Return how processes can share the dive; None where one alone can do what is asked."""
-    alone = request.overlay or request.mcap or type(scanner) is not Scanner
+    alone = request.overlay or request.mcap or request.index_target is not None
     if alone or request.n_processes < 2:
         return None
     return crew_work(source, request.frames, rig, request.scanner)
@@ -288,38 +271,3 @@ def _agreement(request: RunRequest, rig: Rig) -> LaserAgreement | None:
     if request.no_dome:
         return None
     return agreement_of(rig, request.rig or Path(request.source))
-
-
-@contextmanager
-def _writers(
-    request: RunRequest, rig: Rig, source: FrameSource, net: RunNet
-) -> Iterator[RunWriters]:
-    """Open everything that the run writes; it is completed however the run ends."""
-    facts, options = source_facts(source), _options(request)
-    with (
-        RunOutputs(request.out, source=facts, rig=rig_to_mapping(rig), options=options) as outputs,
-        RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
-        RunBareLens(request.out, rig) as bare_lens,
-        RunMcap(request.out, rig, request.scanner, wanted=request.mcap) as mcap,
-    ):
-        yield RunWriters(outputs, overlay, bare_lens, mcap, net)
-
-
-def _options(request: RunRequest) -> dict[str, Any]:
-    """Return the options as `run.yaml` holds them."""
-    rig_file = None if request.rig is None else str(request.rig)
-    found: dict[str, Any] = {"rig_file": rig_file, "no_dome": request.no_dome}
-    found |= asdict(request.water)
-    found |= {"first_frame": request.frames.first, "stop_frame": request.frames.stop}
-    found["index_target"] = None if request.index_target is None else str(request.index_target)
-    return found | {"scanner": scanner_facts(request.scanner)}
-
-
-def _report(request: RunRequest) -> Path | None:
-    return write_report(request.out, truth=request.truth) if request.report else None
-
-
-def _comparison(request: RunRequest) -> TruthComparison | None:
-    if request.truth is None:
-        return None
-    return compare_with_truth(request.out / POSTURE_CSV, request.truth)

@@ -20,9 +20,7 @@ from aqualvs.scanning.scan import Frame
 
 
 class RunMeasuring:
-    """Measures the frames of a dive; a context manager.
-
-    Entered, it has seen a first frame.
+    """Measures the frames of a dive; a context manager, within which processes are at work.
 
     Parameters
     ----------
@@ -34,11 +32,6 @@ class RunMeasuring:
     work : CrewWork or None
         How processes may share the dive; None has this process measure it.
     n_processes : int
-
-    Raises
-    ------
-    SourceError, OptionError
-        If there is no frame.
     """
 
     def __init__(
@@ -89,16 +82,23 @@ class RunMeasuring:
         frames = in_blocks(pairs, meter.block_length if ahead else 1)
         yield from measured_blocks(read_ahead(frames) if ahead else frames, meter)
 
+    def await_first(self) -> None:
+        """Wait for the first frame; to be called before `blocks`.
+
+        Raises
+        ------
+        SourceError, OptionError
+            If there is none.
+        """
+        self._head = next(self._shared, None)
+        if self._head is None:
+            frames = window_of(self._source, self._window)
+            self._frames = ready(frames, self._source, self._window)
+
     def __enter__(self) -> Self:
-        """Wait for the first frame."""
-        with self._stack as stack:
-            if self._crew is not None:
-                self._shared = stack.enter_context(self._crew).blocks()
-                self._head = next(self._shared, None)
-            if self._head is None:
-                frames = window_of(self._source, self._window)
-                self._frames = ready(frames, self._source, self._window)
-            self._stack = stack.pop_all()
+        """Start the processes."""
+        if self._crew is not None:
+            self._shared = self._stack.enter_context(self._crew).blocks()
         return self
 
     def __exit__(

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from aqualvs.app.net_pass import NetPass, NetRequest
+from aqualvs.app.net_pass import NetPass
+from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import NET_MAP_PNG
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan

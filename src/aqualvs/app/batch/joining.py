@@ -15,7 +15,7 @@ from aqualvs.app.batch.ledger import clear, seal, sealed
 from aqualvs.app.batch.pieces import PieceResult, peak_bytes, piece_folder, piece_key
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.thumbnail import range_steps
-from aqualvs.app.batch.work import DiveWork, open_dive, option_facts
+from aqualvs.app.batch.work import DiveWork, open_dive
 from aqualvs.app.disk import writing
 from aqualvs.app.journal import read_journal
 from aqualvs.app.outputs import (
@@ -115,7 +115,7 @@ def _write_run_file(
     with dive.source:
         tally = joined_tally(dive, pieces)
     fault, summary, rig = results[-1].fault, tally.facts(), rig_to_mapping(dive.rig)
-    run_file = RunFile(folder / RUN_YAML, survey.source, rig, option_facts(dive.request))
+    run_file = RunFile(folder / RUN_YAML, survey.source, rig, dive.request.facts())
     run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=summary)
     return {
         "n_frames": tally.n_frames,

@@ -10,7 +10,7 @@ from typing import Any
 from aqualvs.app.measuring import ScansFrames
 from aqualvs.app.run import RunRequest
 from aqualvs.app.run_agreement import agreement_of
-from aqualvs.app.run_inputs import check_fits, prepared_rig, scanner_facts
+from aqualvs.app.run_inputs import check_fits, prepared_rig
 from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
 from aqualvs.app.run_water import WaterFollowingScanner
 from aqualvs.app.runfile import versions
@@ -135,25 +135,13 @@ def agreement_for(dive: OpenDive) -> LaserAgreement | None:
     return None if request.no_dome else agreement_of(dive.rig, request.rig or Path(request.source))
 
 
-def option_facts(request: RunRequest) -> dict[str, Any]:
-    """Return the options as `run.yaml` holds them."""
-    found: dict[str, Any] = {
-        "rig_file": None if request.rig is None else str(request.rig),
-        "no_dome": request.no_dome,
-    }
-    found |= asdict(request.water)
-    found |= {"first_frame": request.frames.first, "stop_frame": request.frames.stop}
-    found["index_target"] = None if request.index_target is None else str(request.index_target)
-    return found | {"scanner": scanner_facts(request.scanner)}
-
-
 def result_key(dive: OpenDive) -> str:
     """Return what a dive's numbers depend on besides its pictures, as a short text.
 
     Content counts, not the place: a rig file that says the same under another name changes nothing.
     """
     request = dive.request
-    facts = option_facts(request) | {"rig_file": None, "index_target": _content(request)}
+    facts = request.facts() | {"rig_file": None, "index_target": _content(request)}
     target = asdict(target_facts(request.target))
     found = {
         "format": _FORMAT,
