@@ -139,3 +139,24 @@ def test_help_shows_an_example(capsys):
     assert main(["batch", "--help"]) == 0
     said = capsys.readouterr().out
     assert "Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026" in " ".join(said.split())
+
+
+def test_the_nets_of_a_season_and_what_changed(tmp_path, capfd):
+    """As the manual has it: two commands from videos to a comparison."""
+    for day in ("2026-05-01", "2026-05-22"):
+        demo_dive(tmp_path / f"cage3_{day}.mp4", 75)
+    (tmp_path / "rig.yaml").write_bytes((DEMO / "rig.yaml").read_bytes())
+    out = tmp_path / "out"
+    command = ["batch", str(tmp_path / "cage3*.mp4"), "-o", str(out), "--workers", "1"]
+    assert main([*command, "--net", "--no-report", "--twine-mm", "2.5"]) == 0
+    assert capfd.readouterr().out.count("fouling ") == 2
+    assert (out / "dives" / "cage3_2026-05-01" / "net_map.png").is_file()
+    assert main(["net-change", str(out), "-o", str(tmp_path / "change")]) == 0
+    assert "2 dives on 2 dates, 2026-05-01 to 2026-05-22" in capfd.readouterr().out
+
+
+def test_what_is_said_about_nets_without_net_is_refused(season, refused, tmp_path):
+    assert "add --net" in refused(season, "-o", tmp_path / "out", "--twine-mm", "2")
+    said = refused(season, "-o", tmp_path / "out", "--net", "--stretch-m", "-1")
+    assert "--stretch-m -1: must be positive" in said
+    assert not (tmp_path / "out").exists()

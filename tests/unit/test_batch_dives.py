@@ -81,6 +81,17 @@ def test_a_list_tells_rig_name_and_water_of_each_dive(season, suffix):
     assert second.water == Water(n_water=1.34)
 
 
+def test_a_list_tells_the_log_of_each_dive(season):
+    path = season / "list.csv"
+    path.write_text("dive,log,log_offset_s\nnorth/dive2.mp4,april.tlog,-3.2\nsouth/dive2.mp4,,\n")
+    with pytest.raises(SourceError, match=r"april\.tlog: no such log, which the list names for"):
+        found(path)
+    (season / "april.tlog").touch()
+    first, second = found(path)
+    assert (first.log, first.log_offset_s) == (season / "april.tlog", -3.2)
+    assert (second.log, second.log_offset_s) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -88,6 +99,7 @@ def test_a_list_tells_rig_name_and_water_of_each_dive(season, suffix):
         ("rig\nr.yaml\n", "row 1 names no dive"),
         ("dive,water_n\na.mp4,wet\n", "water_n is 'wet'"),
         ("dive\n", "lists no dive"),
+        ("dive,log_offset_s\na.mp4,late\n", "log_offset_s is 'late'"),
     ],
 )
 def test_a_list_that_is_not_understood_is_refused(tmp_path, text, words):

@@ -226,7 +226,7 @@ def test_a_fault_of_ours_fails_the_dive_alone(tmp_path, dive):
     failed_once = []
 
     def fail(name, _number):
-        if name == "join_dive" and not failed_once:
+        if name == "join" and not failed_once:
             failed_once.append(name)
             raise ZeroDivisionError("oops")
 

@@ -26,7 +26,8 @@ def batch(
         typer.Argument(
             metavar="DIVES",
             help="Videos, recordings, folders, patterns such as 'dives/**/*.mp4', or a list (CSV "
-            "or YAML) with columns dive, rig, name, water_n, temperature_c, salinity.",
+            "or YAML) with columns dive, rig, name, water_n, temperature_c, salinity, log, "
+            "log_offset_s.",
             show_default=False,
         ),
     ],
@@ -75,6 +76,26 @@ def batch(
         ),
     ] = None,
     report: Annotated[bool, typer.Option(help="Write report.html for each dive.")] = True,
+    net: Annotated[
+        bool,
+        typer.Option(
+            "--net",
+            help="Tell the state of each dive's net too, as aqualvs net does; a list may name the "
+            "vehicles' logs.",
+        ),
+    ] = False,
+    twine_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="With --net: diameter of the bare twine, where it is known.", show_default=False
+        ),
+    ] = None,
+    stretch_m: Annotated[
+        float | None,
+        typer.Option(
+            help="With --net: length of a stretch of net, 0.5 by default.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Measure many dives."""
     from aqualvs.app import crew_start
@@ -83,6 +104,7 @@ def batch(
         crew_start.prepare(crew_start.FOR_BATCHES)
     with importing():
         from aqualvs.app.batch import command as body
+        from aqualvs.app.net_request import net_request
         from aqualvs.app.run_inputs import Water, scanner_options
 
     request = body.BatchRequest(
@@ -99,5 +121,6 @@ def batch(
         target=target,
         index_target=index_target,
         report=report,
+        net=net_request(wanted=net, twine_mm=twine_mm, stretch_m=stretch_m),
     )
     raise typer.Exit(body.batch(request, typer.echo))

@@ -25,7 +25,6 @@ from aqualvs.app.run_inputs import scanner_options
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.stored_scans import check_stored, stored_scans
 from aqualvs.errors import OptionError, OutputError, SourceError
-from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_from_mapping
 
 
@@ -103,17 +102,16 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
         )
     if recover(run_folder):
         tell(f"{run_folder}: points completed from the journal of a run that was killed")
-    check_stored(run_folder)
-    content = _run_file(run_folder)
-    net = NetPass(_rig(run_folder, content), request)
+    stored = StoredDive(run_folder)
+    net = stored.net_pass(request)
     _prepare(folder, overwrite=place.overwrite)
-    with StopSignals() as stop, progress(str(run_folder), _n_frames(content)) as tick:
+    with StopSignals() as stop, progress(str(run_folder), stored.n_frames) as tick:
         for scan in stored_scans(run_folder):
             net.add(scan)
             tick(1)
             if stop.caught:
                 break
-    result = net.write(folder, _video(content))
+    result = net.write(folder, stored.video)
     for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
         tell(line)
     if stop.caught:
@@ -121,6 +119,50 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
     if folder == run_folder and (run_folder / REPORT_HTML).exists():
         tell(f"report: {write_report(run_folder)}")
     return stop.exit_code
+
+
+class StoredDive:
+    """What a run's folder tells of its dive.
+
+    Parameters
+    ----------
+    run_folder : Path
+
+    Raises
+    ------
+    SourceError
+        If `run.yaml`, postures or points cannot be read.
+    """
+
+    def __init__(self, run_folder: Path) -> None:
+        check_stored(run_folder)
+        self._folder = run_folder
+        self._content = _run_file(run_folder)
+
+    @property
+    def n_frames(self) -> int | None:
+        """How many frames the run has measured, if that is known."""
+        summary = self._content.get("summary")
+        count = summary.get("n_frames") if isinstance(summary, dict) else None
+        return count if isinstance(count, int) else None
+
+    @property
+    def video(self) -> Path | None:
+        """The dive's video, if it is still there."""
+        source = self._content.get("source")
+        path = source.get("path") if isinstance(source, dict) else None
+        return Path(path) if isinstance(path, str) and Path(path).is_file() else None
+
+    def net_pass(self, request: NetRequest) -> NetPass:
+        """Return what the dive's scans are to be given to, so that it tells the net's state.
+
+        Raises
+        ------
+        AqualvsError
+            If the rig in `run.yaml` is none, or the log cannot be read.
+        """
+        rig = rig_from_mapping(self._content["rig"], source_name=str(self._folder / RUN_YAML))
+        return NetPass(rig, request)
 
 
 def _prepare(folder: Path, *, overwrite: bool) -> None:
@@ -145,20 +187,3 @@ def _run_file(run_folder: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("rig"), dict):
         raise SourceError(f"{path}: holds no rig; run the dive again")
     return content
-
-
-def _rig(run_folder: Path, content: dict[str, Any]) -> Rig:
-    return rig_from_mapping(content["rig"], source_name=str(run_folder / RUN_YAML))
-
-
-def _n_frames(content: dict[str, Any]) -> int | None:
-    summary = content.get("summary")
-    count = summary.get("n_frames") if isinstance(summary, dict) else None
-    return count if isinstance(count, int) else None
-
-
-def _video(content: dict[str, Any]) -> Path | None:
-    """Return the dive's video, if it is still there."""
-    source = content.get("source")
-    path = source.get("path") if isinstance(source, dict) else None
-    return Path(path) if isinstance(path, str) and Path(path).is_file() else None

@@ -34,6 +34,8 @@ class NetResult:
     ----------
     wall : NetWall
         Stretches and holes on the unrolled net.
+    summary : dict
+        The same in numbers, as `net.geojson` has it.
     lines : list of str
         The summary in words.
     log : LaidLog or None
@@ -41,6 +43,7 @@ class NetResult:
     """
 
     wall: "NetWall"
+    summary: dict[str, Any]
     lines: list[str]
     log: "LaidLog | None"
 
@@ -112,18 +115,19 @@ class NetPass:
         places = place_net(stretches, holes, postures, log.places if log else None)
         wall = unroll(stretches, holes, places, self._rig)
         area = self._condition.area
+        summary = net_facts(wall, area, self._n_frames, len(postures.time_s))
         facts = {
             "version": __version__,
             "options": self._request.facts(),
             "log": None if log is None else log.facts(),
-            "summary": net_facts(wall, area, self._n_frames, len(postures.time_s)),
+            "summary": summary,
         }
         with writing(folder):
             write_net_files(folder, wall, facts)
         lines = net_lines(wall, area, self._n_frames)
         if log is not None:
             lines += [*log.log.notes, log.words()]
-        return NetResult(wall, lines, log)
+        return NetResult(wall, summary, lines, log)
 
 
 def write_net_files(folder: Path, wall: "NetWall", facts: dict[str, Any]) -> None:

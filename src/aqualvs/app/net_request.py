@@ -50,3 +50,23 @@ class NetRequest:
     def facts(self) -> dict[str, Any]:
         """Return them for the files that are written."""
         return {"twine_mm": self.twine_mm, "stretch_m": self.stretch_m}
+
+
+def net_request(
+    *, wanted: bool, twine_mm: float | None, stretch_m: float | None
+) -> NetRequest | None:
+    """Return what a user wants to know, None if nothing.
+
+    Raises
+    ------
+    OptionError
+        If something is said about it all the same, or a value cannot be.
+    """
+    given = {"twine_mm": twine_mm, "stretch_m": stretch_m}
+    known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if wanted:
+        return NetRequest(**known)
+    if known:
+        option = next(iter(known)).replace("_", "-")
+        raise OptionError(f"--{option}: is about the state of the net; add --net")
+    return None

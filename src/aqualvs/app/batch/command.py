@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from aqualvs.app.append_file import AppendFile, is_locked
@@ -15,12 +15,14 @@ from aqualvs.app.batch.dives import Dive, find_dives
 from aqualvs.app.batch.joining import JOINED
 from aqualvs.app.batch.ledger import clear, read_seal
 from aqualvs.app.batch.names import name_dives
+from aqualvs.app.batch.net_state import known_net
 from aqualvs.app.batch.records import DiveRecord, DiveState
 from aqualvs.app.batch.season import Season
 from aqualvs.app.batch.summary_page import write_summary
 from aqualvs.app.batch.survey import size_of
 from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
 from aqualvs.app.disk import writing
+from aqualvs.app.net_request import NetRequest
 from aqualvs.app.run import RunRequest
 from aqualvs.app.run_inputs import Water
 from aqualvs.app.stopping import StopSignals
@@ -61,6 +63,8 @@ class BatchRequest:
     index_target : Path or None
     report : bool
         Whether each dive gets its report.
+    net : NetRequest or None
+        What to find out about the net of each dive, if anything; logs are those of the dives.
     piece_frames : int
         Frames that a piece of a dive has at least.
     """
@@ -78,6 +82,7 @@ class BatchRequest:
     target: str = "auto"
     index_target: Path | None = None
     report: bool = True
+    net: NetRequest | None = None
     piece_frames: int = PIECE_FRAMES
 
 
@@ -174,6 +179,7 @@ def _work(request: BatchRequest, dive: Dive, name: str, out: Path) -> DiveWork:
         report=request.report,
         index_target=None if index_target is None else index_target.resolve(),
         target=request.target,
+        net=request.net and replace(request.net, log=dive.log, log_offset_s=dive.log_offset_s),
     )
     return DiveWork(
         name=name,
@@ -207,7 +213,8 @@ def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]
     for source, name in _known_names(out).items():
         seal = read_seal(out / HOME / DIVES / name / JOINED)
         if name not in records and seal is not None:
-            records[name] = DiveRecord.of(name, source, seal["facts"], reused=True)
+            facts = seal["facts"] | known_net(out / HOME / DIVES / name, seal["key"])
+            records[name] = DiveRecord.of(name, source, facts, reused=True)
     return [records[name] for name in sorted(records, key=str.casefold)]
 
 

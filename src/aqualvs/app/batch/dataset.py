@@ -4,6 +4,8 @@
 
     dataset/posture/dive=NAME/posture.parquet   one row for every frame
     dataset/points/dive=NAME/points.parquet     one row for every stripe point
+    dataset/net/dive=NAME/net.parquet           one row for every stretch of net, if told
+    dataset/holes/dive=NAME/holes.parquet       one row for every hole in it, if told
     dataset/dives.parquet                       one row for every dive
 """
 
@@ -18,7 +20,8 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from aqualvs.app.outputs import POINTS_PARQUET, POSTURE_CSV
+from aqualvs.app.net_tables import HOLE_COLUMNS, NET_COLUMNS
+from aqualvs.app.outputs import HOLES_CSV, NET_CSV, POINTS_PARQUET, POSTURE_CSV
 from aqualvs.app.posture_csv import POSTURE_COLUMNS
 
 POSTURE_PARQUET = "posture.parquet"
@@ -30,6 +33,15 @@ _TYPES = dict.fromkeys(POSTURE_COLUMNS, pa.float64()) | {
     "reason": pa.string(),
     "n_points": pa.int32(),
 }
+_COUNTS = ("stretch", "first_frame", "last_frame", "n_frames", "piece")
+_NET_TYPES = dict.fromkeys(NET_COLUMNS, pa.float64()) | {
+    **dict.fromkeys(_COUNTS, pa.int32()),
+    **dict.fromkeys(("mesh", "placed_by"), pa.string()),
+}
+_HOLE_TYPES = dict.fromkeys(HOLE_COLUMNS, pa.float64()) | {
+    **dict.fromkeys(("hole", "piece", "frame", "n_looks"), pa.int32()),
+    "placed_by": pa.string(),
+}
 DIVES_SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in ("dive", "source", "rig", "rig_file", "state", "words")),
@@ -39,9 +51,23 @@ DIVES_SCHEMA = pa.schema(
             for name in ("duration_s", "range_median_m", "range_min_m", "range_max_m", "n_water")
         ),
         ("lasers", pa.string()),
+        ("net_holes", pa.int64()),
+        *(
+            (name, pa.float64())
+            for name in (
+                "net_area_m2",
+                "net_bar_mm",
+                "net_twine_mm",
+                "net_solidity",
+                "net_fouling",
+                "net_largest_hole_mm",
+            )
+        ),
     ]
 )
-"""Columns of `dives.parquet`; `state` is finished, incomplete or failed, `words` says why."""
+"""Columns of `dives.parquet`; `state` is finished, incomplete or failed, `words` says why.
+
+Those of the net are null where its state was not told."""
 
 
 def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
@@ -72,6 +98,40 @@ def drop_dive(dataset: Path, name: str) -> None:
     """Remove the partitions of a dive, if they are there."""
     for path in (_posture_path(dataset, name), _points_path(dataset, name)):
         shutil.rmtree(path.parent, ignore_errors=True)
+    drop_net(dataset, name)
+
+
+def put_net(dataset: Path, name: str, folder: Path) -> None:
+    """Put the state of a dive's net into the data set, in place of what is there of this dive.
+
+    Parameters
+    ----------
+    dataset : Path
+    name : str
+        Of the dive.
+    folder : Path
+        With `net.csv` and `holes.csv`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    for table, types in ((NET_CSV, _NET_TYPES), (HOLES_CSV, _HOLE_TYPES)):
+        with _replacing(_net_path(dataset, name, table)) as draft:
+            found = _typed(folder / table, types, null_words=True)
+            parquet.write_table(found, draft, compression="zstd")
+
+
+def holds_net(dataset: Path, name: str) -> bool:
+    """Return whether both partitions of a dive's net are there."""
+    return all(_net_path(dataset, name, table).is_file() for table in (NET_CSV, HOLES_CSV))
+
+
+def drop_net(dataset: Path, name: str) -> None:
+    """Remove the partitions of a dive's net, if they are there."""
+    for table in (NET_CSV, HOLES_CSV):
+        shutil.rmtree(_net_path(dataset, name, table).parent, ignore_errors=True)
 
 
 def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -95,12 +155,26 @@ def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
 def posture_table(posture_csv: Path) -> Any:
     """Return `posture.csv` as a table; numbers that a frame has not are null."""
+    return _typed(posture_csv, _TYPES, null_words=False)
+
+
+def _typed(path: Path, types: Mapping[str, Any], *, null_words: bool) -> Any:
+    """Return a CSV file as a table; numbers that are not there are null, and words if wanted."""
     convert = csv.ConvertOptions(
-        column_types=_TYPES, null_values=[""], true_values=["1"], false_values=["0"]
+        column_types=types,
+        null_values=[""],
+        strings_can_be_null=null_words,
+        true_values=["1"],
+        false_values=["0"],
     )
     # One thread: the process has one core to itself.
     read = csv.ReadOptions(use_threads=False)
-    return csv.read_csv(posture_csv, read_options=read, convert_options=convert)
+    return csv.read_csv(path, read_options=read, convert_options=convert)
+
+
+def _net_path(dataset: Path, name: str, table: str) -> Path:
+    stem = Path(table).stem
+    return dataset / stem / f"dive={name}" / f"{stem}.parquet"
 
 
 def _posture_path(dataset: Path, name: str) -> Path:

@@ -2,9 +2,9 @@
 
 ::
 
-    dive,rig,name,water_n,temperature_c,salinity
-    north/0412.mp4,rig_april.yaml,north_april,,6.5,34
-    north/0610.mp4,rig_june.yaml,north_june,,9.0,33
+    dive,rig,name,water_n,temperature_c,salinity,log,log_offset_s
+    north/0412.mp4,rig_april.yaml,north_april,,6.5,34,north/0412.tlog,
+    north/0610.mp4,rig_june.yaml,north_june,,9.0,33,north/0610.BIN,-3.2
 
 or the same as a list of mappings in YAML. Only `dive` is needed; paths are relative to the list.
 """
@@ -23,7 +23,7 @@ from aqualvs.errors import OptionError
 LIST_SUFFIXES = frozenset({".csv", ".yaml", ".yml"})
 
 _NUMBERS = ("water_n", "temperature_c", "salinity")
-_KEYS = ("dive", "rig", "name", *_NUMBERS)
+_KEYS = ("dive", "rig", "name", *_NUMBERS, "log", "log_offset_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,18 @@ class ListedDive:
         Empty where the list does not say.
     water : Water
         Nothing where the list does not say.
+    log : Path or None
+        The vehicle's, where the list says it.
+    log_offset_s : float or None
+        Its clock minus the dive's, where the list says it.
     """
 
     source: Path
     rig: Path | None = None
     name: str = ""
     water: Water = field(default_factory=Water)
+    log: Path | None = None
+    log_offset_s: float | None = None
 
 
 def read_list(path: Path) -> list[ListedDive]:
@@ -88,26 +94,28 @@ def _listed(row: Mapping[str, Any], path: Path, number: int) -> ListedDive:
         raise OptionError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
     if "dive" not in row:
         raise OptionError(f"{path}: row {number} names no dive; fill in the column 'dive'")
-    rig = row.get("rig")
+    rig, log = row.get("rig"), row.get("log")
     return ListedDive(
         source=path.parent / str(row["dive"]).strip(),
         rig=None if rig is None else path.parent / str(rig).strip(),
         name=str(row.get("name", "")).strip(),
         water=_water(row, path, number),
+        log=None if log is None else path.parent / str(log).strip(),
+        log_offset_s=_number(row, "log_offset_s", path, number),
     )
 
 
 def _water(row: Mapping[str, Any], path: Path, number: int) -> Water:
-    values: dict[str, float | None] = {}
-    for key in _NUMBERS:
-        try:
-            values[key] = float(row[key]) if key in row else None
-        except (TypeError, ValueError):
-            raise OptionError(
-                f"{path}: row {number}: {key} is {row[key]!r}; give a number"
-            ) from None
+    values = {key: _number(row, key, path, number) for key in _NUMBERS}
     return Water(
         n_water=values["water_n"],
         temperature_c=values["temperature_c"],
         salinity=values["salinity"],
     )
+
+
+def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float | None:
+    try:
+        return float(row[key]) if key in row else None
+    except (TypeError, ValueError):
+        raise OptionError(f"{path}: row {number}: {key} is {row[key]!r}; give a number") from None

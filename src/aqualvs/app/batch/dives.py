@@ -51,12 +51,18 @@ class Dive:
         As the user calls it; empty if it shall be named after its file.
     water : Water
         What the user says about the water of this dive.
+    log : Path or None
+        The vehicle's; absolute.
+    log_offset_s : float or None
+        Its clock minus the dive's, where it is known.
     """
 
     source: Path
     rig: Path | None
     name: str = ""
     water: Water = field(default_factory=Water)
+    log: Path | None = None
+    log_offset_s: float | None = None
 
 
 def find_dives(
@@ -80,7 +86,7 @@ def find_dives(
     Raises
     ------
     SourceError
-        If there is no such file, or a folder holds no dive.
+        If there is no such file, a folder holds no dive, or the log of one is not there.
     RigError
         If a dive has no rig.
     OptionError
@@ -94,6 +100,8 @@ def find_dives(
             rig=_rig_of(source, listed.rig or rig),
             name=listed.name,
             water=listed.water if listed.water != Water() else water,
+            log=_log_of(source, listed.log),
+            log_offset_s=listed.log_offset_s,
         )
         if found.setdefault(source, dive) != dive:
             raise OptionError(f"{source}: given twice, with different words; name it once")
@@ -160,6 +168,14 @@ def _is_dive(path: Path) -> bool:
     if suffix == _RECORDING:
         return is_recording(path)
     return suffix in VIDEO_SUFFIXES and path.is_file()
+
+
+def _log_of(source: Path, given: Path | None) -> Path | None:
+    if given is None:
+        return None
+    if not given.is_file():
+        raise SourceError(f"{given}: no such log, which the list names for {source}; check it")
+    return given.resolve()
 
 
 def _rig_of(source: Path, given: Path | None) -> Path | None:

@@ -3,15 +3,13 @@
 import os
 import shutil
 import time
-import uuid
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from aqualvs.app.batch.dataset import holds_dive, put_dive
+from aqualvs.app.batch.dataset import drop_net, holds_dive, put_dive
 from aqualvs.app.batch.joined_tally import joined_ranges, joined_tally
-from aqualvs.app.batch.ledger import clear, seal, sealed
+from aqualvs.app.batch.ledger import clear, scratch, seal, sealed
 from aqualvs.app.batch.pieces import PieceResult, peak_bytes, piece_folder, piece_key
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.thumbnail import range_steps
@@ -86,13 +84,15 @@ def join_dive(work: DiveWork, survey: Survey, results: Sequence[PieceResult]) ->
             raise PieceLostError(f"{piece}: is not intact")
     began_s = time.process_time()
     out, home = work.request.out, work.home
-    with writing(out), _scratch(home) as draft:
+    with writing(out), scratch(home, "joining") as draft:
         _join_files(pieces, draft)
         facts = _write_run_file(work, survey, results, pieces, draft)
         if work.request.report:
             write_report(draft)
         names = _replace_run(draft, out)
         put_dive(work.dataset, work.name, out)
+        # That of an older result; its files in the dive's folder are gone already.
+        drop_net(work.dataset, work.name)
         (home / JOINED).mkdir(parents=True, exist_ok=True)
         cpu_s = sum(result.cpu_s for result in results) + time.process_time() - began_s
         peak = max(peak_bytes(), *(result.peak_bytes for result in results))
@@ -166,13 +166,3 @@ def _replace_run(draft: Path, out: Path) -> list[str]:
         else:
             (out / name).unlink(missing_ok=True)
     return [name for name in _VERIFIED if (out / name).exists()]
-
-
-@contextmanager
-def _scratch(home: Path) -> Iterator[Path]:
-    folder = home / f"joining-{uuid.uuid4().hex[:8]}.part"
-    folder.mkdir(parents=True)
-    try:
-        yield folder
-    finally:
-        clear(folder)

@@ -105,6 +105,17 @@ def drafted(folder: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def scratch(home: Path, name: str) -> Iterator[Path]:
+    """Yield a new folder below another, which is gone at the end."""
+    folder = home / f"{name}-{uuid.uuid4().hex[:8]}.part"
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        clear(folder)
+
+
 def clear(folder: Path) -> None:
     """Remove a folder and all that is in it, if it is there."""
     shutil.rmtree(folder, ignore_errors=True)

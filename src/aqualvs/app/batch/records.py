@@ -5,13 +5,15 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+_OF_NET = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole_mm")
+
 
 class DiveState(StrEnum):
     """How a dive stands; the value is what `dives.parquet` says in `state`."""
 
     FINISHED = "finished"
     INCOMPLETE = "incomplete"
-    """The source broke off; what came before is measured."""
+    """The source broke off, and what came before is measured; or its net's state is not told."""
     FAILED = "failed"
     """There is no result."""
     UNFINISHED = "unfinished"
@@ -31,7 +33,7 @@ class DiveRecord:
     words : str
         Why it is not finished; empty if it is.
     facts : mapping
-        From `join_dive`; empty without a result.
+        From `with_net`; empty without a result.
     reused : bool
         Whether an earlier batch had finished it.
     """
@@ -46,7 +48,10 @@ class DiveRecord:
     @classmethod
     def of(cls, name: str, source: str, facts: Mapping[str, Any], *, reused: bool) -> "DiveRecord":
         """Return the record of a dive with a result."""
-        fault = str(facts["fault"])
+        faults = [str(facts["fault"])]
+        if "net_fault" in facts:
+            faults.append(f"state of the net: {facts['net_fault']}")
+        fault = "; ".join(filter(None, faults))
         state = DiveState.INCOMPLETE if fault else DiveState.FINISHED
         return cls(name=name, source=source, state=state, words=fault, facts=facts, reused=reused)
 
@@ -56,6 +61,23 @@ class DiveRecord:
         found: Mapping[str, Any] = self.facts.get("summary", {})
         return found
 
+    @property
+    def net(self) -> Mapping[str, Any]:
+        """Return the state of the net as `net_facts` has it, empty where it was not told."""
+        found: Mapping[str, Any] = self.facts.get("net", {})
+        return found
+
+    def net_words(self) -> str:
+        """Return the state of the net in a few words; empty where it was not told."""
+        if not self.net:
+            return ""
+        if not self.net["n_stretches"]:
+            return "no net seen"
+        n_holes, fouling = self.net["n_holes"], self.net["fouling"]
+        holes = "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
+        # Adding zero turns a negative zero into a plain one.
+        return holes if fouling is None else f"fouling {round(fouling, 2) + 0.0:+.2f}, {holes}"
+
     def line(self) -> str:
         """Return the dive in one line."""
         if not self.facts:
@@ -64,6 +86,8 @@ class DiveRecord:
         said = f"{self.name}: {n_frames} frames, posture in {share:.1f} %"
         if "range_median_m" in self.summary:
             said += f", range {self.summary['range_median_m']:.3f} m"
+        if self.net:
+            said += f", {self.net_words()}"
         if self.words:
             said += f"; {self.state.value}: {self.words}"
         return said + (" (was finished)" if self.reused else "")
@@ -81,4 +105,6 @@ class DiveRecord:
             "lasers": agreement.get("state"),
             **{name: self.facts.get(name) for name in kept},
             **{name: self.summary.get(name) for name in ranges},
+            "net_holes": self.net.get("n_holes"),
+            **{f"net_{name}": self.net.get(name) for name in _OF_NET},
         }

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from aqualvs.app.batch.cluster import Outcome, Workers, WorkersLostError
 from aqualvs.app.batch.dataset import drop_dive
 from aqualvs.app.batch.joining import PieceLostError, finished_dive, join_dive
+from aqualvs.app.batch.net_state import with_net
 from aqualvs.app.batch.pieces import PieceResult, measure_piece
 from aqualvs.app.batch.records import DiveRecord, DiveState
 from aqualvs.app.batch.survey import Survey, survey
@@ -60,13 +61,21 @@ class _Task:
 def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
     """Look at a dive; returns its survey, and its facts if an earlier batch has finished it.
 
+    Then the state of its net is told, if it is wanted and has not been.
+
     Raises
     ------
     AqualvsError
         If the dive or its rig cannot be used.
     """
     found = survey(work)
-    return found, finished_dive(work, found)
+    facts = finished_dive(work, found)
+    return found, None if facts is None else with_net(work, found.key, facts)
+
+
+def join(work: DiveWork, found: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
+    """Do as `join_dive`, and tell the state of the dive's net, if it is wanted."""
+    return with_net(work, found.key, join_dive(work, found, results))
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +85,12 @@ class Steps:
     Attributes
     ----------
     look, measure, join : callable
-        As `look`, `measure_piece` and `join_dive`.
+        As `look`, `measure_piece` and `join`.
     """
 
     look: Callable[[DiveWork], tuple[Survey, dict[str, Any] | None]] = look
     measure: Callable[[DiveWork, Survey, int], PieceResult] = measure_piece
-    join: Callable[[DiveWork, Survey, Sequence[PieceResult]], dict[str, Any]] = join_dive
+    join: Callable[[DiveWork, Survey, Sequence[PieceResult]], dict[str, Any]] = join
 
 
 class Season:

@@ -11,7 +11,7 @@ from aqualvs import __version__
 from aqualvs.app import report_html as html
 from aqualvs.app.batch.records import DiveRecord, DiveState
 from aqualvs.app.batch.thumbnail import range_svg
-from aqualvs.app.outputs import REPORT_HTML
+from aqualvs.app.outputs import NET_MAP_PNG, REPORT_HTML
 from aqualvs.app.report_findings import Card
 from aqualvs.app.report_words import clock
 from aqualvs.app.runfile import now
@@ -20,6 +20,7 @@ from aqualvs.errors import OutputError
 SUMMARY_HTML = "summary.html"
 
 _HEAD = ("dive", "state", "duration", "frames", "posture", "range, m", "from – to, m", "over time")
+_NET = "net"
 _LOW_SHARE = 0.8
 _MOST_NOTES = 12
 # What a reader of the data set types first.
@@ -122,14 +123,23 @@ def _notes_on(record: DiveRecord) -> Iterator[str]:
         words = (record.summary.get(key) or {}).get("words")
         if words:
             yield f"{record.name}: {words}"
+    if record.net.get("n_holes"):
+        n, largest = record.net["n_holes"], record.net["largest_hole_mm"]
+        found = "1 hole" if n == 1 else f"{n} holes, the largest"
+        yield f"{record.name}: the net has {found} of {largest:.0f} mm"
 
 
 def _table(folder: Path, records: Sequence[DiveRecord], low: float, high: float) -> str:
     kinds = ["", "", *[' class="n"'] * 2, "", *[' class="n"'] * 2, ""]
-    head = "".join(f"<th{kind}>{cell}</th>" for kind, cell in zip(kinds, _HEAD, strict=True))
+    titles = list(_HEAD)
+    with_net = any(record.net for record in records)
+    if with_net:
+        kinds, titles = [*kinds, ""], [*titles, _NET]
+    head = "".join(f"<th{kind}>{cell}</th>" for kind, cell in zip(kinds, titles, strict=True))
     rows = []
     for record in records:
-        cells = zip(kinds, _cells(folder, record, low, high), strict=True)
+        found = _cells(folder, record, low, high)
+        cells = zip(kinds, [*found, _net(folder, record)] if with_net else found, strict=True)
         bad = ' class="bad"' if record.state is not DiveState.FINISHED else ""
         rows.append(f"<tr{bad}>{''.join(f'<td{kind}>{cell}</td>' for kind, cell in cells)}</tr>")
     body = "\n".join(rows)
@@ -158,9 +168,20 @@ def _cells(folder: Path, record: DiveRecord, low: float, high: float) -> list[st
 
 
 def _link(folder: Path, record: DiveRecord) -> str:
-    name = escape(record.name)
-    title = escape(record.source, quote=True)
-    place = Path("dives") / record.name / REPORT_HTML
+    return _linked(folder, record, REPORT_HTML, record.name, record.source)
+
+
+def _net(folder: Path, record: DiveRecord) -> str:
+    """Return the state of a dive's net, with the way to its map."""
+    if not record.net:
+        return ""
+    return _linked(folder, record, NET_MAP_PNG, record.net_words(), "map of the net")
+
+
+def _linked(folder: Path, record: DiveRecord, file: str, words: str, title: str) -> str:
+    """Return words that lead to a file of a dive, if it is there."""
+    words, title = escape(words), escape(title, quote=True)
+    place = Path("dives") / record.name / file
     if not (folder / place).is_file():
-        return f'<span title="{title}">{name}</span>'
-    return f'<a href="{quote(place.as_posix())}" title="{title}">{name}</a>'
+        return f'<span title="{title}">{words}</span>'
+    return f'<a href="{quote(place.as_posix())}" title="{title}">{words}</a>'
