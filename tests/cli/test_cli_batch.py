@@ -160,3 +160,13 @@ def test_what_is_said_about_nets_without_net_is_refused(season, refused, tmp_pat
     said = refused(season, "-o", tmp_path / "out", "--net", "--stretch-m", "-1")
     assert "--stretch-m -1: must be positive" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_reader_that_has_seen_enough_is_no_fault(season, tmp_path):
+    """As with `aqualvs batch ... | head -1`: what is finished is kept."""
+    with begun(season, tmp_path / "out") as process:
+        process.stdout.readline()
+        process.stdout.close()
+        errors = process.stderr.read()
+        process.wait(timeout=PATIENCE_S)
+    assert errors == ""

@@ -110,8 +110,11 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
     lock = request.out / HOME / _LOCK
     if is_locked(lock):
         raise OutputError(f"{request.out}: another batch is under way here; wait for its end")
-    with writing(lock), closing(_locked(lock)):
-        works = _works(request, dives)
+    with writing(lock):
+        held = _locked(lock)
+    with closing(held):
+        with writing(request.out):
+            works = _works(request, dives)
         with (
             StopSignals() as stop,
             DaskWorkers(request.n_workers, request.scheduler) as workers,
@@ -121,9 +124,9 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
                 workers.check_sight(lock)
             sized = [(work, size_of(Path(work.request.source))) for work in works]
             found = Season(sized, workers, progress).run(lambda: stop.caught is not None)
-        _tidy(request.out / HOME)
         records = _all_records(request.out, found)
         with writing(request.out):
+            _tidy(request.out / HOME)
             (request.out / DATASET).mkdir(exist_ok=True)
             write_dives(request.out / DATASET, [record.row() for record in records])
         for line in _summary_lines(
