@@ -164,21 +164,27 @@ class DaskWorkers:
         OptionError
             If one does not.
         """
-        mine = versions()
-        found: Mapping[str, Any] = self._client.run(_sight, str(path))
+        mine, option = versions(), f"--scheduler {self._client.scheduler.address}"
+        try:
+            found: Mapping[str, Any] = self._client.run(_sight, str(path))
+        except Exception as fault:  # Dask words what workers raise in an exception of its own
+            raise OptionError(
+                f"{option}: a worker cannot take part ({fault}); install aqualvs[batch] of this "
+                "version on its machine"
+            ) from fault
         if not found:
-            raise OptionError("--scheduler: has no workers yet; start some with 'dask worker'")
+            raise OptionError(f"{option}: has no workers yet; start some with 'dask worker'")
         for worker, (sees, theirs) in found.items():
             if not sees:
                 raise OptionError(
-                    f"--scheduler: worker {worker} does not see {path.parent}; "
+                    f"{option}: worker {worker} does not see {path.parent}; "
                     "dives and results must lie where all machines find them under one path"
                 )
             other = [name for name in mine if theirs.get(name) != mine[name]]
             if other:
                 name = other[0]
                 raise OptionError(
-                    f"--scheduler: worker {worker} has {name} {theirs.get(name)}, this process has "
+                    f"{option}: worker {worker} has {name} {theirs.get(name)}, this process has "
                     f"{mine[name]}; install the same versions"
                 )
 

@@ -1,0 +1,134 @@
+"""`aqualvs batch --scheduler` with a scheduler and workers of their own, as on other machines."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from aqualvs.app.cli import main
+from batch_cases import DEMO, RESULTS, demo_dive, without_times
+
+pytest.importorskip("distributed")
+
+PATIENCE_S = 60
+DASK = [sys.executable, "-m", "dask"]
+QUIET = ["--no-dashboard"]
+
+
+@contextlib.contextmanager
+def begun(command, folder):
+    """A process that works elsewhere than this one; it is ended at the end."""
+    with (folder / "said.txt").open("ab") as said:
+        process = subprocess.Popen(command, cwd=folder, stdout=said, stderr=said)
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    """Address of a scheduler, and what begins a worker for it."""
+    folder = tmp_path / "scheduler"
+    folder.mkdir()
+    told = folder / "scheduler.json"
+    command = [*DASK, "scheduler", "--host", "127.0.0.1", "--port", "0", *QUIET]
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(begun([*command, "--scheduler-file", str(told)], folder))
+        deadline = time.monotonic() + PATIENCE_S
+        while not told.exists() or not told.read_text().endswith("}"):
+            assert time.monotonic() < deadline, (folder / "said.txt").read_text()
+            time.sleep(0.05)
+        address = json.loads(told.read_text())["address"]
+
+        def worker(name, program=DASK):
+            place = tmp_path / name
+            place.mkdir()
+            command = [*program, "worker", address, "--nthreads", "1", "--no-nanny", *QUIET]
+            return stack.enter_context(begun([*command, "--name", name], place))
+
+        yield address, worker
+
+
+@pytest.fixture(scope="module")
+def season(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("season")
+    for name in ("north", "south"):
+        demo_dive(folder / f"{name}.mp4", 36, 6)
+    (folder / "rig.yaml").write_bytes((DEMO / "rig.yaml").read_bytes())
+    return folder
+
+
+def batch(season, out, *more):
+    return main(["batch", str(season), "-o", str(out), "--no-report", "--net", *more])
+
+
+def results(out):
+    return {
+        f"{name}/{file}": without_times(out / "dives" / name / file)
+        for name in ("north", "south")
+        for file in (*RESULTS, "net.csv")
+    }
+
+
+def test_workers_of_a_scheduler_give_what_those_of_this_machine_give(
+    scheduler, season, tmp_path, capsys
+):
+    address, worker = scheduler
+    worker("one")
+    worker("two")
+    assert batch(season, tmp_path / "far", "--scheduler", address) == 0
+    assert "2 finished" in capsys.readouterr().out
+    assert batch(season, tmp_path / "near", "--workers", "1") == 0
+    far, near = results(tmp_path / "far"), results(tmp_path / "near")
+    assert [name for name in near if far[name] != near[name]] == []
+
+
+def test_a_worker_may_go_and_another_come(scheduler, season, tmp_path, capsys):
+    address, worker = scheduler
+    first = worker("one")
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "aqualvs", "batch", str(season), "-o", str(out)]
+    with begun([*command, "--no-report", "--scheduler", address], tmp_path) as process:
+        deadline = time.monotonic() + 4 * PATIENCE_S
+        while not list((out / ".batch" / "dives").glob("*/survey")):
+            assert time.monotonic() < deadline
+            assert process.poll() is None, (tmp_path / "said.txt").read_text()
+            time.sleep(0.02)
+        os.kill(first.pid, signal.SIGKILL)
+        worker("two")
+        assert process.wait(timeout=4 * PATIENCE_S) == 0, (tmp_path / "said.txt").read_text()
+    assert "2 finished" in (tmp_path / "said.txt").read_text()
+
+
+def test_a_scheduler_without_workers_is_said(scheduler, season, tmp_path, capsys):
+    address, _ = scheduler
+    assert batch(season, tmp_path / "out", "--scheduler", address) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert address in said
+    assert "worker" in said
+
+
+def test_a_worker_without_aqualvs_is_said(scheduler, season, tmp_path, capsys):
+    address, worker = scheduler
+    lacks = "import sys; sys.modules['aqualvs'] = None; from dask.__main__ import main; main()"
+    worker("bare", [sys.executable, "-c", lacks])
+    deadline = time.monotonic() + PATIENCE_S
+    said = ""
+    while "install aqualvs" not in said and time.monotonic() < deadline:
+        # Until it has found its scheduler there is no worker.
+        assert batch(season, tmp_path / "out", "--scheduler", address) == 2
+        said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "install aqualvs[batch] of this version on its machine" in said
