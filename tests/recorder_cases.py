@@ -3,6 +3,7 @@
 import io
 from collections import Counter
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from mcap.reader import NonSeekingReader, SeekingReader
@@ -63,10 +64,20 @@ def chunk_of(n: int, *, n_messages: int = 3, n_bytes: int = 200) -> Chunk:
 
 
 def read_by_mcap(source: Path | bytes, *, linear: bool = False) -> list[tuple[str, int, bytes]]:
-    """Messages as the `mcap` library reads them: by the summary, or from front to end."""
-    data = source.read_bytes() if isinstance(source, Path) else source
+    """Messages as the `mcap` library reads them: by the summary, or from front to end.
+
+    A file is read in that order, not as a whole first: one that grows meanwhile would have an end
+    that is younger than its beginning.
+    """
+    if isinstance(source, Path):
+        with source.open("rb") as file:
+            return _messages_in(file, linear=linear)
+    return _messages_in(io.BytesIO(source), linear=linear)
+
+
+def _messages_in(file: IO[bytes], *, linear: bool) -> list[tuple[str, int, bytes]]:
     kind = NonSeekingReader if linear else SeekingReader
-    reader = kind(io.BytesIO(data), validate_crcs=True)
+    reader = kind(file, validate_crcs=True)
     found = reader.iter_messages(log_time_order=False)
     return [(channel.topic, message.log_time, message.data) for _, channel, message in found]
 
