@@ -115,7 +115,8 @@ def start_rows(rounds: int, *, with_imports: bool) -> list[dict[str, Any]]:
     imports = {
         "aqualvs.optics": "numpy, numba",
         "aqualvs.scanning.pipeline": "numpy, numba, cv2",
-        "aqualvs.app.run": "numpy, numba, cv2, av, pyarrow, pydantic, yaml, rich.progress",
+        "aqualvs.app.run": "numpy, numba, cv2, av, pydantic, yaml",
+        "aqualvs.app.run_folder": "numpy, numba, cv2, av, pydantic, yaml, pyarrow, plotly.offline",
     }
     found = [
         start_row("aqualvs --help", ["-m", "aqualvs", "--help"], ["-c", _PLAIN_HELP], rounds),
