@@ -13,7 +13,7 @@ import pytest
 from aqualvs.app.cli import main
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 
-pytest.importorskip("distributed")
+distributed = pytest.importorskip("distributed")
 
 PATIENCE_S = 60
 DASK = [sys.executable, "-m", "dask"]
@@ -36,6 +36,14 @@ def begun(command, folder):
                 process.wait()
 
 
+def await_worker(address, name, said):
+    deadline = time.monotonic() + PATIENCE_S
+    with distributed.Client(address, timeout=PATIENCE_S, set_as_default=False) as client:
+        while name not in {w["name"] for w in client.scheduler_info()["workers"].values()}:
+            assert time.monotonic() < deadline, said.read_text()
+            time.sleep(0.05)
+
+
 @pytest.fixture
 def scheduler(tmp_path):
     """Address of a scheduler, and what begins a worker for it."""
@@ -55,7 +63,9 @@ def scheduler(tmp_path):
             place = tmp_path / name
             place.mkdir()
             command = [*program, "worker", address, "--nthreads", "1", "--no-nanny", *QUIET]
-            return stack.enter_context(begun([*command, "--name", name], place))
+            process = stack.enter_context(begun([*command, "--name", name], place))
+            await_worker(address, name, place / "said.txt")
+            return process
 
         yield address, worker
 
@@ -124,11 +134,7 @@ def test_a_worker_without_aqualvs_is_said(scheduler, season, tmp_path, capsys):
     address, worker = scheduler
     lacks = "import sys; sys.modules['aqualvs'] = None; from dask.__main__ import main; main()"
     worker("bare", [sys.executable, "-c", lacks])
-    deadline = time.monotonic() + PATIENCE_S
-    said = ""
-    while "install aqualvs" not in said and time.monotonic() < deadline:
-        # Until it has found its scheduler there is no worker.
-        assert batch(season, tmp_path / "out", "--scheduler", address) == 2
-        said = capsys.readouterr().err
+    assert batch(season, tmp_path / "out", "--scheduler", address) == 2
+    said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "install aqualvs[batch] of this version on its machine" in said
