@@ -11,7 +11,7 @@ from typing import Self, cast
 
 from aqualvs.app.crew_messages import Ended, Message
 from aqualvs.app.crew_post import Receiver, SharedMemory
-from aqualvs.app.crew_start import context, interrupts_blocked
+from aqualvs.app.crew_start import context, deaf_to_interrupts, interrupts_blocked
 from aqualvs.app.crew_work import CrewWork, serve
 from aqualvs.app.measuring import Measured
 
@@ -122,7 +122,7 @@ class Crew:
         # A copy has these too; they count as closed when no process has them any more.
         mines = [*(hand.pipe for hand in self._hands), mine] if is_copy else []
         process = how.Process(target=serve, args=(self._work, theirs, memory, mines), daemon=True)
-        with interrupts_blocked() if is_copy else contextlib.nullcontext():
+        with interrupts_blocked() if is_copy else deaf_to_interrupts():
             process.start()
         theirs.close()
         if memory is not None:
