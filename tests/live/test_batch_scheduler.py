@@ -91,25 +91,33 @@ def results(out):
     }
 
 
+@pytest.fixture(scope="module")
+def near(season, tmp_path_factory):
+    """What a worker of this machine gives."""
+    out = tmp_path_factory.mktemp("near")
+    assert batch(season, out, "--workers", "1") == 0
+    return results(out)
+
+
 def test_workers_of_a_scheduler_give_what_those_of_this_machine_give(
-    scheduler, season, tmp_path, capsys
+    scheduler, season, near, tmp_path, capsys
 ):
     address, worker = scheduler
     worker("one")
     worker("two")
     assert batch(season, tmp_path / "far", "--scheduler", address) == 0
     assert "2 finished" in capsys.readouterr().out
-    assert batch(season, tmp_path / "near", "--workers", "1") == 0
-    far, near = results(tmp_path / "far"), results(tmp_path / "near")
+    far = results(tmp_path / "far")
     assert [name for name in near if far[name] != near[name]] == []
 
 
-def test_a_worker_may_go_and_another_come(scheduler, season, tmp_path, capsys):
+def test_a_worker_may_go_and_another_come(scheduler, season, near, tmp_path):
     address, worker = scheduler
     first = worker("one")
     out = tmp_path / "out"
     command = [sys.executable, "-m", "aqualvs", "batch", str(season), "-o", str(out)]
-    with begun([*command, "--no-report", "--scheduler", address], tmp_path) as process:
+    command += ["--no-report", "--net", "--scheduler", address]
+    with begun(command, tmp_path) as process:
         deadline = time.monotonic() + 4 * PATIENCE_S
         while not list((out / ".batch" / "dives").glob("*/survey")):
             assert time.monotonic() < deadline
@@ -119,6 +127,8 @@ def test_a_worker_may_go_and_another_come(scheduler, season, tmp_path, capsys):
         worker("two")
         assert process.wait(timeout=4 * PATIENCE_S) == 0, (tmp_path / "said.txt").read_text()
     assert "2 finished" in (tmp_path / "said.txt").read_text()
+    found = results(out)
+    assert [name for name in near if found[name] != near[name]] == []
 
 
 def test_a_scheduler_without_workers_is_said(scheduler, season, tmp_path, capsys):
