@@ -9,7 +9,7 @@ import numpy as np
 from aqualvs.app.net_places import NetPlace
 from aqualvs.app.net_tables import fouling_of
 from aqualvs.app.net_wall import NetWall
-from aqualvs.app.report_words import clock
+from aqualvs.app.report_words import clock, hole_count
 from aqualvs.scanning.net_condition import NetStretch
 from aqualvs.scanning.net_holes import Hole
 
@@ -106,8 +106,9 @@ def _fouling_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
 
 def _hole_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
     n = len(wall.holes)
-    count = "no hole" if not n else "1 hole" if n == 1 else f"{n} holes"
-    seen = f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {count}"
+    seen = (
+        f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {hole_count(n)}"
+    )
     order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:_MOST_LISTED]
     lines = [
         f"  {size_words(hole)}, {hole.missing_meshes:.0f} meshes: {place_words(place)}, "

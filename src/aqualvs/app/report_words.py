@@ -73,6 +73,11 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def hole_count(n_holes: int) -> str:
+    """Return how many holes there are, in words."""
+    return "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
+
+
 def signed(text: str) -> str:
     """Return text with a true minus sign before its negative numbers."""
     return text.replace("-", "−")

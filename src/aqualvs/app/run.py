@@ -165,10 +165,11 @@ def run(
         with RunMeasuring(source, rig, request.frames, work, request.n_processes) as measuring:
             # While other processes measure the first frames, this one gets ready to write.
             from aqualvs.app import run_folder as folder
+            from aqualvs.app.run_net import RunNet
 
             following = _following(request, rig)
             scanner = following or replay or scanner_for(rig, request.scanner)
-            net, agreement = folder.net_of(request, rig), _agreement(request, rig)
+            net, agreement = RunNet(rig, request.net), _agreement(request, rig)
             check = net_check(request.target, rig)
             measuring.await_first()
             folder.prepare(request)

@@ -34,17 +34,6 @@ def prepare(request: RunRequest) -> None:
     prepare_folder(request.out, overwrite=request.overwrite)
 
 
-def net_of(request: RunRequest, rig: Rig) -> RunNet:
-    """Return what finds out the state of the net, if it is wanted.
-
-    Raises
-    ------
-    AqualvsError
-        If the log that the request names cannot be read.
-    """
-    return RunNet(rig, request.net)
-
-
 @contextmanager
 def writers(
     request: RunRequest, rig: Rig, source: FrameSource, net: RunNet

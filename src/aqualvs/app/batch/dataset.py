@@ -20,28 +20,20 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from aqualvs.app.net_tables import HOLE_COLUMNS, NET_COLUMNS
 from aqualvs.app.outputs import HOLES_CSV, NET_CSV, POINTS_PARQUET, POSTURE_CSV
-from aqualvs.app.posture_csv import POSTURE_COLUMNS
 
-POSTURE_PARQUET = "posture.parquet"
 DIVES_PARQUET = "dives.parquet"
 
-_TYPES = dict.fromkeys(POSTURE_COLUMNS, pa.float64()) | {
-    "frame": pa.int32(),
+_COUNTS = (
+    *("frame", "n_points", "first_frame", "last_frame", "n_frames"),
+    *("stretch", "piece", "hole", "n_looks"),
+)
+# Of columns in CSV files; all others hold numbers.
+_TYPES = dict.fromkeys(_COUNTS, pa.int32()) | {
+    **dict.fromkeys(("reason", "mesh", "placed_by"), pa.string()),
     "valid": pa.bool_(),
-    "reason": pa.string(),
-    "n_points": pa.int32(),
 }
-_COUNTS = ("stretch", "first_frame", "last_frame", "n_frames", "piece")
-_NET_TYPES = dict.fromkeys(NET_COLUMNS, pa.float64()) | {
-    **dict.fromkeys(_COUNTS, pa.int32()),
-    **dict.fromkeys(("mesh", "placed_by"), pa.string()),
-}
-_HOLE_TYPES = dict.fromkeys(HOLE_COLUMNS, pa.float64()) | {
-    **dict.fromkeys(("hole", "piece", "frame", "n_looks"), pa.int32()),
-    "placed_by": pa.string(),
-}
+_OF_NET = (NET_CSV, HOLES_CSV)
 DIVES_SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in ("dive", "source", "rig", "rig_file", "state", "words")),
@@ -80,9 +72,8 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
     OSError
         As the system says it.
     """
-    with _replacing(_posture_path(dataset, name)) as draft:
-        parquet.write_table(posture_table(run_folder / POSTURE_CSV), draft, compression="zstd")
-    with _replacing(_points_path(dataset, name)) as draft:
+    _put_table(dataset, name, run_folder / POSTURE_CSV, null_words=False)
+    with _replacing(_partition(dataset, name, POINTS_PARQUET)) as draft:
         try:
             os.link(run_folder / POINTS_PARQUET, draft)
         except OSError:
@@ -91,14 +82,12 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
 
 def holds_dive(dataset: Path, name: str) -> bool:
     """Return whether both partitions of a dive are there."""
-    return _posture_path(dataset, name).is_file() and _points_path(dataset, name).is_file()
+    return _holds(dataset, name, (POSTURE_CSV, POINTS_PARQUET))
 
 
 def drop_dive(dataset: Path, name: str) -> None:
     """Remove the partitions of a dive, if they are there."""
-    for path in (_posture_path(dataset, name), _points_path(dataset, name)):
-        shutil.rmtree(path.parent, ignore_errors=True)
-    drop_net(dataset, name)
+    _drop(dataset, name, (POSTURE_CSV, POINTS_PARQUET, *_OF_NET))
 
 
 def put_net(dataset: Path, name: str, folder: Path) -> None:
@@ -117,21 +106,18 @@ def put_net(dataset: Path, name: str, folder: Path) -> None:
     OSError
         As the system says it.
     """
-    for table, types in ((NET_CSV, _NET_TYPES), (HOLES_CSV, _HOLE_TYPES)):
-        with _replacing(_net_path(dataset, name, table)) as draft:
-            found = _typed(folder / table, types, null_words=True)
-            parquet.write_table(found, draft, compression="zstd")
+    for table in _OF_NET:
+        _put_table(dataset, name, folder / table, null_words=True)
 
 
 def holds_net(dataset: Path, name: str) -> bool:
     """Return whether both partitions of a dive's net are there."""
-    return all(_net_path(dataset, name, table).is_file() for table in (NET_CSV, HOLES_CSV))
+    return _holds(dataset, name, _OF_NET)
 
 
 def drop_net(dataset: Path, name: str) -> None:
     """Remove the partitions of a dive's net, if they are there."""
-    for table in (NET_CSV, HOLES_CSV):
-        shutil.rmtree(_net_path(dataset, name, table).parent, ignore_errors=True)
+    _drop(dataset, name, _OF_NET)
 
 
 def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -155,13 +141,15 @@ def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
 def posture_table(posture_csv: Path) -> Any:
     """Return `posture.csv` as a table; numbers that a frame has not are null."""
-    return _typed(posture_csv, _TYPES, null_words=False)
+    return _table(posture_csv, null_words=False)
 
 
-def _typed(path: Path, types: Mapping[str, Any], *, null_words: bool) -> Any:
+def _table(path: Path, *, null_words: bool) -> Any:
     """Return a CSV file as a table; numbers that are not there are null, and words if wanted."""
+    with path.open(encoding="utf-8") as file:
+        columns = file.readline().rstrip("\n").split(",")
     convert = csv.ConvertOptions(
-        column_types=types,
+        column_types={column: _TYPES.get(column, pa.float64()) for column in columns},
         null_values=[""],
         strings_can_be_null=null_words,
         true_values=["1"],
@@ -172,17 +160,24 @@ def _typed(path: Path, types: Mapping[str, Any], *, null_words: bool) -> Any:
     return csv.read_csv(path, read_options=read, convert_options=convert)
 
 
-def _net_path(dataset: Path, name: str, table: str) -> Path:
+def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> None:
+    with _replacing(_partition(dataset, name, path.name)) as draft:
+        parquet.write_table(_table(path, null_words=null_words), draft, compression="zstd")
+
+
+def _holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:
+    return all(_partition(dataset, name, table).is_file() for table in tables)
+
+
+def _drop(dataset: Path, name: str, tables: Iterable[str]) -> None:
+    for table in tables:
+        shutil.rmtree(_partition(dataset, name, table).parent, ignore_errors=True)
+
+
+def _partition(dataset: Path, name: str, table: str) -> Path:
+    """Return where a dive's part of a table is, which is called after a file of its run."""
     stem = Path(table).stem
     return dataset / stem / f"dive={name}" / f"{stem}.parquet"
-
-
-def _posture_path(dataset: Path, name: str) -> Path:
-    return dataset / "posture" / f"dive={name}" / POSTURE_PARQUET
-
-
-def _points_path(dataset: Path, name: str) -> Path:
-    return dataset / "points" / f"dive={name}" / POINTS_PARQUET
 
 
 @contextlib.contextmanager

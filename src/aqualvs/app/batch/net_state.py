@@ -1,6 +1,5 @@
 """The state of a dive's net, told from its finished run and kept until something changes."""
 
-import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -9,14 +8,14 @@ from typing import Any
 
 from aqualvs.app.batch.dataset import holds_net, put_net
 from aqualvs.app.batch.ledger import read_seal, scratch, seal, sealed
-from aqualvs.app.batch.work import DiveWork, digest
+from aqualvs.app.batch.work import DiveWork, content_digest, digest
 from aqualvs.app.disk import writing
 from aqualvs.app.net import StoredDive
 from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import NET_FILES
 from aqualvs.app.report import write_report
 from aqualvs.app.stored_scans import stored_scans
-from aqualvs.errors import AqualvsError, SourceError
+from aqualvs.errors import AqualvsError
 
 NET = "net"
 """Folder, below a dive's home, with the seal of its net's state."""
@@ -88,12 +87,4 @@ def _state(work: DiveWork, key: str, request: NetRequest) -> dict[str, Any]:
 
 def _digest(request: NetRequest) -> str:
     """Return a short text of all that a net's state depends on besides the dive's result."""
-    return digest(asdict(request) | {"log": None if request.log is None else _content(request.log)})
-
-
-def _content(log: Path) -> str:
-    try:
-        with log.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as fault:
-        raise SourceError(f"{log}: cannot be read ({fault.strerror}); check the path") from fault
+    return digest(asdict(request) | {"log": content_digest(request.log)})

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from aqualvs.app.report_words import hole_count
+
 _OF_NET = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole_mm")
 
 
@@ -73,8 +75,7 @@ class DiveRecord:
             return ""
         if not self.net["n_stretches"]:
             return "no net seen"
-        n_holes, fouling = self.net["n_holes"], self.net["fouling"]
-        holes = "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
+        holes, fouling = hole_count(self.net["n_holes"]), self.net["fouling"]
         # Adding zero turns a negative zero into a plain one.
         return holes if fouling is None else f"fouling {round(fouling, 2) + 0.0:+.2f}, {holes}"
 

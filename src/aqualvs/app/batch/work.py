@@ -141,7 +141,8 @@ def result_key(dive: OpenDive) -> str:
     Content counts, not the place: a rig file that says the same under another name changes nothing.
     """
     request = dive.request
-    facts = request.facts() | {"rig_file": None, "index_target": _content(request)}
+    target_content = content_digest(request.index_target)
+    facts = request.facts() | {"rig_file": None, "index_target": target_content}
     target = asdict(target_facts(request.target))
     found = {
         "format": _FORMAT,
@@ -160,12 +161,18 @@ def digest(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _content(request: RunRequest) -> str | None:
-    if request.index_target is None:
+def content_digest(path: Path | None) -> str | None:
+    """Return a text that differs for files of different content; None for no file.
+
+    Raises
+    ------
+    OptionError
+        If the file cannot be read.
+    """
+    if path is None:
         return None
     try:
-        return hashlib.sha256(request.index_target.read_bytes()).hexdigest()
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as fault:
-        raise OptionError(
-            f"{request.index_target}: cannot be read ({fault.strerror}); check the path"
-        ) from fault
+        raise OptionError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
