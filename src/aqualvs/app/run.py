@@ -167,9 +167,9 @@ def run(
             from aqualvs.app import run_folder as folder
             from aqualvs.app.run_net import RunNet
 
-            following = _following(request, rig)
+            following = following_for(request, rig)
             scanner = following or replay or scanner_for(rig, request.scanner)
-            net, agreement = RunNet(rig, request.net), _agreement(request, rig)
+            net, agreement = RunNet(rig, request.net), agreement_for(request, rig)
             check = net_check(request.target, rig)
             measuring.await_first()
             folder.prepare(request)
@@ -252,7 +252,14 @@ def _replay(request: RunRequest) -> Replay | None:
     return replay
 
 
-def _following(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
+def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
+    """Return what measures and follows the water, None where nobody asked for that.
+
+    Raises
+    ------
+    AqualvsError
+        If the target that tells the water's index cannot be used.
+    """
     if request.index_target is None:
         return None
     if rig.dome is None:
@@ -268,7 +275,14 @@ def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork |
     return crew_work(source, request.frames, rig, request.scanner)
 
 
-def _agreement(request: RunRequest, rig: Rig) -> LaserAgreement | None:
+def agreement_for(request: RunRequest, rig: Rig) -> LaserAgreement | None:
+    """Return what watches over the lasers of a dive, None where a run watches nothing.
+
+    Raises
+    ------
+    RigError
+        If what the rig says about its uncertainty cannot be understood.
+    """
     if request.no_dome:
         return None
     return agreement_of(rig, request.rig or Path(request.source))

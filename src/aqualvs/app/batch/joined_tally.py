@@ -6,8 +6,9 @@ from pathlib import Path
 
 from aqualvs.app.batch.pieces import NOTES
 from aqualvs.app.batch.watchers import stand_ins, stored_bars, stored_ranges
-from aqualvs.app.batch.work import OpenDive, agreement_for
+from aqualvs.app.batch.work import OpenDive
 from aqualvs.app.net_check import net_check
+from aqualvs.app.run import agreement_for
 from aqualvs.app.tally import Tally
 
 
@@ -25,7 +26,7 @@ def joined_tally(dive: OpenDive, pieces: Sequence[Path]) -> Tally:
     UnlikeSurveyError
         If a watcher asks for what the pieces did not keep.
     """
-    tally = Tally(agreement=agreement_for(dive))
+    tally = Tally(agreement=agreement_for(dive.request, dive.rig))
     for piece in pieces:
         for scan in stand_ins(piece / NOTES):
             tally.add(scan)

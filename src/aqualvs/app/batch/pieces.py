@@ -13,7 +13,7 @@ import cv2
 from aqualvs.app.batch.ledger import drafted, seal, sealed
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.watchers import NoteTaker, write_notes
-from aqualvs.app.batch.work import DiveWork, OpenDive, agreement_for, digest, open_dive
+from aqualvs.app.batch.work import DiveWork, OpenDive, digest, open_dive
 from aqualvs.app.blocks import in_blocks
 from aqualvs.app.disk import writing
 from aqualvs.app.journal import PointsJournal
@@ -21,6 +21,7 @@ from aqualvs.app.measuring import Measured, Meter, ScansFrames, measured_blocks
 from aqualvs.app.net_check import net_check
 from aqualvs.app.outputs import JOURNAL, POSTURE_BARE_CSV, POSTURE_CSV
 from aqualvs.app.posture_csv import PostureCsv
+from aqualvs.app.run import agreement_for
 from aqualvs.app.run_bare_lens import RunBareLens
 from aqualvs.app.run_frames import ready, with_losses
 from aqualvs.app.run_inputs import FrameWindow
@@ -121,7 +122,9 @@ def _write_piece(
     fault, n_valid, last_s = "", 0, 0.0
     frames = _frames(dive, span)
     meter = Meter(dive.rig, scanner)
-    taker = NoteTaker(span.first, agreement_for(dive), net_check(dive.request.target, dive.rig))
+    taker = NoteTaker(
+        span.first, agreement_for(dive.request, dive.rig), net_check(dive.request.target, dive.rig)
+    )
     with ExitStack() as files:
         posture = files.enter_context(PostureCsv(folder / POSTURE_CSV))
         points = files.enter_context(PointsJournal(folder / JOURNAL))

@@ -8,18 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from aqualvs.app.measuring import ScansFrames
-from aqualvs.app.run import RunRequest
-from aqualvs.app.run_agreement import agreement_of
+from aqualvs.app.run import RunRequest, following_for
 from aqualvs.app.run_inputs import check_fits, prepared_rig
 from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
-from aqualvs.app.run_water import WaterFollowingScanner
 from aqualvs.app.runfile import versions
 from aqualvs.app.target_file import target_facts
 from aqualvs.errors import OptionError
 from aqualvs.live.sources import FrameSource, open_source
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.pipeline import Scanner
 
 PIECE_FRAMES = 1500
@@ -82,13 +79,8 @@ class OpenDive:
         AqualvsError
             If the target that tells the water's index cannot be used.
         """
-        if self.request.index_target is None:
-            return self.replay or Scanner(self.rig, self.request.scanner)
-        if self.rig.dome is None:
-            raise OptionError("--index-target: without a dome the water's index cannot be seen")
-        return WaterFollowingScanner(
-            self.rig, self.request.scanner, self.request.index_target, self.request.water
-        )
+        following = following_for(self.request, self.rig)
+        return following or self.replay or Scanner(self.rig, self.request.scanner)
 
 
 def open_dive(request: RunRequest) -> OpenDive:
@@ -121,18 +113,6 @@ def open_dive(request: RunRequest) -> OpenDive:
         source.__exit__(None, None, None)
         raise
     return OpenDive(source, rig, request, None)
-
-
-def agreement_for(dive: OpenDive) -> LaserAgreement | None:
-    """Return what watches over the lasers of a dive, None where a run watches nothing.
-
-    Raises
-    ------
-    RigError
-        If what the rig says about its uncertainty cannot be understood.
-    """
-    request = dive.request
-    return None if request.no_dome else agreement_of(dive.rig, request.rig or Path(request.source))
 
 
 def result_key(dive: OpenDive) -> str:
