@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.live.sources.opening import open_source
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.scan import Frame, Scan

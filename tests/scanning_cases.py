@@ -76,6 +76,6 @@ def returns_of(
             position=position[order],
             height=np.full(n, 80.0),
             width=np.full(n, 5.0),
-            green_fall=np.full(n, 20.0),
+            likelihood=np.ones(n),
         )
     return found

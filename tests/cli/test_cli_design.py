@@ -12,7 +12,7 @@ from aqualvs.app.design.command import designed_rig
 from aqualvs.app.design.file import EXAMPLE, design_of_rig
 from aqualvs.app.design.predict import predict
 from aqualvs.geometry.transforms import SE3
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.scan import Frame

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aqualvs.live.sources import open_source
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.uncertainty import rig_moved_by
 from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement

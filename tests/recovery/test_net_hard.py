@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Label, Scan

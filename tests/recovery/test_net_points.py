@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.live.sources import open_source
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame, Label, Scan

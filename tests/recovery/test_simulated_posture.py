@@ -9,7 +9,7 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal

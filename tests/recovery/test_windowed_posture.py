@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.planes import Plane
-from aqualvs.live.sources.planes import planes_of_image
+from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.sheet import sheets_of

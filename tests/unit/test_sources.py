@@ -10,7 +10,8 @@ from av.video.frame import VideoFrame
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.sources import ImageSource, VideoSource, open_source
-from aqualvs.live.sources.planes import planes_of, planes_of_image
+from aqualvs.live.sources.planes import planes_of
+from aqualvs.scanning.scan import planes_of_image
 from shell_cases import (
     all_key_frames,
     cut_after,

@@ -5,11 +5,10 @@ from collections import deque
 import numpy as np
 
 from aqualvs.geometry.transforms import SE3
-from aqualvs.live.sources.planes import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Refusal
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene

@@ -52,11 +52,14 @@ class Laser:
     window : Window or None
         What bends the sheet; `aqualvs.optics.sheet` says where the light is then. None where the
         sheet in the water is the plane.
+    wavelength_nm : float or None
+        Of the light, in nanometres; None where nobody has said: green, 520 to 532.
     """
 
     name: str
     plane: Plane
     window: Window | None = None
+    wavelength_nm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -195,13 +195,13 @@ def _water_index(water: WaterPart, n_air: float) -> float:
 def _laser(place: str, part: LaserPart) -> Laser:
     plane = _plane(place, part.normal, part.offset_mm)
     if part.window is None:
-        return Laser(part.name, plane)
+        return Laser(part.name, plane, wavelength_nm=part.wavelength_nm)
     place, face = f"{place}.window", part.window
     window = Window(
         _plane(place, face.normal, face.offset_mm), np.array(face.source_mm, np.float64) / _MM
     )
     _check_window(place, face.source_mm, plane, window)
-    return Laser(part.name, plane, window)
+    return Laser(part.name, plane, window, part.wavelength_nm)
 
 
 def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Window) -> None:
@@ -290,6 +290,8 @@ def _camera_mapping(rig: Rig) -> dict[str, Any]:
 
 def _laser_mapping(laser: Laser) -> dict[str, Any]:
     content = {"name": laser.name, **_plane_mapping(laser.plane)}
+    if laser.wavelength_nm is not None:
+        content["wavelength_nm"] = float(laser.wavelength_nm)
     if laser.window is not None:
         face, source = laser.window.face, laser.window.source
         content["window"] = {**_plane_mapping(face), "source_mm": _all_to_mm(source)}

@@ -24,6 +24,8 @@ Pixels = Annotated[int, Field(gt=0)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 Name = Annotated[str, Field(min_length=1)]
+# What a silicon camera sees of a laser.
+LaserWavelength = Annotated[float, Field(ge=380.0, le=780.0, allow_inf_nan=False)]
 
 
 class _Part(BaseModel):
@@ -81,6 +83,7 @@ class LaserPart(_Part):
     name: Name
     normal: Triple
     offset_mm: Number
+    wavelength_nm: LaserWavelength | None = None
     window: WindowPart | None = None
 
 

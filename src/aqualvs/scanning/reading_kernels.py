@@ -63,7 +63,7 @@ def read_laser(
     position: FloatArray,
     height: FloatArray,
     width: FloatArray,
-    green_fall: FloatArray,
+    likelihood: FloatArray,
     lowest: IntArray,
     highest: IntArray,
     slope_low: FloatArray,
@@ -72,7 +72,6 @@ def read_laser(
     along_x: int,
     line_px: int,
     best_height: float,
-    best_green: float,
     begin: int,
     numbers: IntArray,
     measures: FloatArray,
@@ -82,7 +81,7 @@ def read_laser(
 
     Parameters
     ----------
-    line, position, height, width, green_fall
+    line, position, height, width, likelihood
         As in `Returns`, of the laser's search direction.
     lowest, highest, slope_low, slope_high, line_px
         As in the laser's `StripeSearch`.
@@ -90,7 +89,7 @@ def read_laser(
         Its index.
     along_x : int
         1 where its search lines run along x.
-    best_height, best_green : float
+    best_height : float
         Of the frame's best returns.
     begin : int
         How many readings other lasers have.
@@ -108,7 +107,6 @@ def read_laser(
     if begin > 0:
         first_chunk = numbers[CHUNK, begin - 1] + 1
     across, along = (1, 0) if along_x else (0, 1)
-    green_share = 1.0 / best_green
     height_share = 1.0 / best_height
     for k in range(n):
         i, r = begin + k, found[0, k]
@@ -123,10 +121,7 @@ def read_laser(
         measures[WIDTH, i] = width[r]
         flank = _FLANK_NOISE * width[r] / height[r]
         measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
-        trust = min(height[r] * height_share, 1.0)
-        if green_fall[r] == green_fall[r]:
-            trust *= min(green_fall[r] * green_share, 1.0)
-        measures[TRUST, i] = np.sqrt(trust)
+        measures[TRUST, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
         # The middle of a search line that is several pixels wide.
         pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
         pixels[i, along] = position[r]

@@ -45,8 +45,8 @@ class Readings:
     sigma_px : array, shape (N,)
         Standard deviation of the position along the search line.
     trust : array, shape (N,)
-        How much the return looks like laser light: its height, and where there is colour its green
-        fall, as shares of the frame's best; 0 to 1.
+        How much the return looks like laser light: its height as a share of the frame's best, and
+        its likelihood; 0 to 1.
     points : array, shape (N, 3)
         In `dome`, metres.
     sensitivity : array, shape (N, 3)
@@ -208,7 +208,6 @@ def read_returns(
     numbers, measures = np.empty((N_NUMBERS, capacity), np.int64), np.empty((N_MEASURES, capacity))
     pixels = np.empty((capacity, 2))
     best_height = value_at(along_x.height, along_y.height, _BEST_SHARE)
-    best_green = value_at(along_x.green_fall, along_y.green_fall, _BEST_SHARE)
     n = 0
     for i, (search, found) in enumerate(zip(searches, by_search, strict=True)):
         n = read_laser(
@@ -216,7 +215,7 @@ def read_returns(
             found.position,
             found.height,
             found.width,
-            found.green_fall,
+            found.likelihood,
             search.lowest,
             search.highest,
             search.slope_low,
@@ -225,7 +224,6 @@ def read_returns(
             found is along_x,
             search.line_px,
             best_height,
-            best_green,
             n,
             numbers,
             measures,

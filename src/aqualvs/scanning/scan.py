@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +12,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanning.posture import Posture, Refusal
 
 ImagePlane: TypeAlias = NDArray[np.uint8]
+Planes: TypeAlias = tuple[ImagePlane, tuple[ImagePlane, ImagePlane] | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,28 @@ class Frame:
     time_s: float
     luma: ImagePlane
     chroma: tuple[ImagePlane, ImagePlane] | None = None
+
+
+def planes_of_image(image: ImagePlane) -> Planes:
+    """Return luma and chroma of an image, grey or BGR, as OpenCV reads it.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width) or (height, width, 3)
+
+    Returns
+    -------
+    luma, chroma
+        As in `Frame`; BT.601 limited range, as videos have it.
+    """
+    if image.ndim == 2:
+        return image, None
+    height, width = image.shape[:2]
+    padded = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    i420: ImagePlane = np.asarray(cv2.cvtColor(padded, cv2.COLOR_BGR2YUV_I420), np.uint8)
+    rows, columns = padded.shape[:2]
+    chroma = i420[rows:].reshape(2, rows // 2, columns // 2)
+    return i420[:height, :width], (chroma[0], chroma[1])
 
 
 class Label(IntEnum):

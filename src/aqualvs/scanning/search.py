@@ -14,6 +14,7 @@ from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
+from aqualvs.scanning.laser_colour import LaserColour
 
 SLOPE_CELL = 8
 """Positions, and search lines, per cell of the slope tables and of the grid bands come from."""
@@ -53,6 +54,8 @@ class StripeSearch:
     slope_low, slope_high : array, shape (ceil(length/8), ceil(n_lines/8))
         Range of d(position)/d(line) that a plane target within 45 degrees of square allows, by
         cell of 8 positions by 8 lines.
+    colour : LaserColour
+        Of the laser's light.
     """
 
     axis: SearchAxis
@@ -61,6 +64,7 @@ class StripeSearch:
     highest: IntArray
     slope_low: FloatArray
     slope_high: FloatArray
+    colour: LaserColour = LaserColour.GREEN
 
     @property
     def visible(self) -> bool:
@@ -72,6 +76,11 @@ def searched_range(working_range: tuple[float, float]) -> tuple[float, float]:
     """Widen the working range, so that a target beyond it is seen, and named as such."""
     near, far = working_range
     return 0.8 * near, 1.2 * far
+
+
+def pixels_per_line(size_px: tuple[int, int]) -> int:
+    """Return how many rows or columns of pixels make a search line: 2 in wide pictures, or 1."""
+    return 2 if size_px[0] >= _PIXELS_PER_LINE_FROM else 1
 
 
 def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
@@ -89,14 +98,19 @@ def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
     tuple of StripeSearch
         In the order of `rig.lasers`.
     """
-    return tuple(_plan_search(sheet, rig.working_range, camera) for sheet in sheets_of(rig))
+    return tuple(
+        _plan_search(sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera)
+        for sheet, laser in zip(sheets_of(rig), rig.lasers, strict=True)
+    )
 
 
-def _plan_search(sheet: Sheet, working_range: tuple[float, float], camera: Camera) -> StripeSearch:
+def _plan_search(
+    sheet: Sheet, colour: LaserColour, working_range: tuple[float, float], camera: Camera
+) -> StripeSearch:
     points, in_band = _points_on_grid(sheet, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
     rise, run = _stripe_directions(points)
     axis = _search_axis(rise[0], run[0], in_band)
-    line_px = 2 if camera.size_px[0] >= _PIXELS_PER_LINE_FROM else 1
+    line_px = pixels_per_line(camera.size_px)
     along_x = axis is SearchAxis.ALONG_X
     wide = SLOPE_CELL * line_px
     steps = (SLOPE_CELL, wide) if along_x else (wide, SLOPE_CELL)
@@ -107,7 +121,7 @@ def _plan_search(sheet: Sheet, working_range: tuple[float, float], camera: Camer
     rise, run = _stripe_directions(points)
     length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
     lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
-    return StripeSearch(axis, line_px, lowest, highest, *_slope_bounds(rise, run))
+    return StripeSearch(axis, line_px, lowest, highest, *_slope_bounds(rise, run), colour)
 
 
 def _points_on_grid(

@@ -1,22 +1,37 @@
-"""Stripe detection: sub-pixel returns along search lines."""
+"""Stripe detection: sub-pixel returns along search lines.
+
+A return is a run of pixels above the local background with one peak. The background on one side is
+the least pixel within reach; the higher of the two sides counts, so that a step edge (a box before
+a dark wall) has no contrast, and a stripe that runs along the search line has none either. The
+centre is the centroid of what stands above half height, which keeps its place when the top
+saturates.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.centroids import BATCH, measure_runs
-from aqualvs.scanning.ground import Ground
-from aqualvs.scanning.lanes import U8Array
-from aqualvs.scanning.runs import Runs
-from aqualvs.scanning.search import SearchAxis
-from aqualvs.scanning.view import SearchView
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
+
+U8Array: TypeAlias = NDArray[np.uint8]
 
 # Doubling the contrast threshold ends here.
-_HIGHEST_CONTRAST = 120
-_GREY: U8Array = np.empty((0, 0), np.uint8)
+_MAX_CONTRAST = 120
+# A valley below this many tenths of the lower of two peaks separates two returns.
+_VALLEY_TENTHS = 6
+# Noise is measured on one search line of so many. It reaches so many times the distance from the
+# median to the upper quartile in one pixel of about two thousand, were it normally distributed.
+_NOISE_EVERY, _NOISE_QUARTILES = 16, 5.0
+# Pixels are skipped eight at a time where none stands out.
+_WORD = 8
+_BRIGHT = np.uint8(255)
+POSITION, HEIGHT, WIDTH, STEP_U, STEP_V, IMBALANCE, TINT = range(7)
+"""Rows of a table of peaks."""
+N_MEASURES = 7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,24 +41,25 @@ class StripeOptions:
     Attributes
     ----------
     min_contrast : int
-        Smallest height of a return above its background, in grey levels.
+        Smallest height of a return above its background, in grey levels; more is asked for where
+        the picture is noisy.
     reach_share : float
         How far the background is looked for on each side, as a share of the image width; must
         exceed the width of the widest stripe.
-    min_green_fall : float
-        Smallest fall of the U chroma against the flanks, in grey levels: a laser line is greener
-        than what surrounds it; twine and sun glare are not. Only used where the source has colour.
+    min_likelihood : float
+        Returns whose colour is less likely a laser's are left out, 0 to 1. Only used where the
+        source has colour.
     min_share : float
         Returns lower than this share of the frame's bright returns (their 90 % quantile) are noise.
     max_returns : int
-        Runs of pixels looked at per frame and search direction; where there are more, the contrast
-        threshold is doubled until there are not.
+        Returns kept per frame and search direction; where there are more, the contrast threshold
+        is doubled until there are not.
     """
 
-    min_contrast: int = 12
+    min_contrast: int = 6
     reach_share: float = 0.045
-    min_green_fall: float = 3.0
-    min_share: float = 0.25
+    min_likelihood: float = 0.1
+    min_share: float = 0.05
     max_returns: int = 16384
 
     def __post_init__(self) -> None:
@@ -52,6 +68,8 @@ class StripeOptions:
             raise OptionError(f"min_contrast is {self.min_contrast}; use 1 to 254 grey levels")
         if not 0.0 <= self.min_share < 1.0:
             raise OptionError(f"min_share is {self.min_share}; use 0 to 1")
+        if not 0.0 <= self.min_likelihood < 1.0:
+            raise OptionError(f"min_likelihood is {self.min_likelihood}; use 0 to 1")
         if not 0.0 < self.reach_share < 0.5:
             raise OptionError(f"reach_share is {self.reach_share}; use 0 to 0.5 of the width")
 
@@ -70,117 +88,401 @@ class Returns:
         Peak above background, in grey levels.
     width : array, shape (N,)
         Full width at half height along the line, in pixels.
-    green_fall : array, shape (N,)
-        Fall of the U chroma against the flanks, in grey levels; NaN for a grey source.
+    likelihood : array, shape (N,)
+        That the return is laser light, by its colour: 0 to 1; 1 for a grey source.
     """
 
     line: IntArray
     position: FloatArray
     height: FloatArray
     width: FloatArray
-    green_fall: FloatArray
+    likelihood: FloatArray
 
     def __len__(self) -> int:
         """Return the number of returns."""
         return len(self.line)
 
 
-class StripeDetector:
-    """Finds returns along every search line of one direction; several per line.
+class SearchImage(NamedTuple):
+    """A frame as one search direction sees it, with search lines as rows.
+
+    Attributes
+    ----------
+    lines : uint8 array, shape (n_lines, length)
+        Search lines as rows.
+    u, v : uint8 array, shape (ceil(height / 2), ceil(width / 2))
+        Chroma as decoded; of shape (0, 0) for a grey source.
+    along_x : bool
+        Whether search lines are rows of the picture.
+    line_px : int
+        Pixels across one search line.
+    """
+
+    lines: U8Array
+    u: U8Array
+    v: U8Array
+    along_x: bool
+    line_px: int
+
+
+class _Scratch(NamedTuple):
+    """Buffers of one search line: its pixels with margins, sliding minima, what stands out."""
+
+    padded: U8Array
+    minima: U8Array
+    spare: U8Array
+    background: U8Array
+    above: U8Array
+    words: NDArray[np.uint64]
+
+
+class PeakFinder:
+    """Finds peaks along every search line of one direction; several per line.
 
     Parameters
     ----------
-    axis : SearchAxis
-        Direction of the search lines.
-    size_px : (int, int)
-        Image width and height.
+    length : int
+        Positions on a search line.
     lowest, highest : int array, shape (n_lines,)
         First and last position of interest on each line (an empty interval skips the line).
-    options : StripeOptions
-        Options.
-
-    Notes
-    -----
-    A return is a run of pixels above the local background with one peak. Its centre is the
-    centroid of what stands above half height, which keeps its place when the top saturates.
+    reach_px : int
+        How far the background is looked for on each side; wider stripes are left out.
+    capacity : int
+        Peaks kept; where there are more, the contrast threshold is doubled.
+    directions : array, shape (n_colours, 2)
+        The lasers' colours in the (U, V) plane.
     """
 
     def __init__(
         self,
-        axis: SearchAxis,
-        size_px: tuple[int, int],
+        length: int,
         lowest: IntArray,
         highest: IntArray,
-        options: StripeOptions,
+        reach_px: int,
+        capacity: int,
+        directions: FloatArray,
     ) -> None:
-        self._options = options
-        self._reach_px = max(8, round(options.reach_share * size_px[0]))
-        along_x = axis is SearchAxis.ALONG_X
-        length = size_px[0] if along_x else size_px[1]
-        self._length = length
-        self._finder = Runs(length, lowest, highest, options.max_returns)
-        self._ground = Ground(
-            length,
-            len(lowest),
-            self._reach_px,
-            max(1, int(options.min_green_fall)),
-            self._finder.in_band,
-        )
-        self._peaks = np.empty((BATCH + length, 5), np.int64)
-        self._line = np.empty(options.max_returns, np.int64)
-        self._measures = np.empty((4, options.max_returns))
+        self._lowest, self._highest = lowest, highest
+        self._reach_px, self._directions = reach_px, directions
+        padded, minima, spare = np.full((3, length + 2 * reach_px), 255, np.uint8)
+        # The word after the last one stays empty and ends every run.
+        background, above = np.zeros((2, (length // _WORD + 2) * _WORD), np.uint8)
+        words = above.view(np.uint64)
+        self._scratch = _Scratch(padded, minima, spare, background, above, words)
+        self._line = np.empty(capacity, np.int64)
+        self._table = np.empty((N_MEASURES, capacity))
 
-    def detect(self, view: SearchView) -> Returns:
-        """Find the returns of one frame.
+    def noise_contrast(self, image: SearchImage) -> float:
+        """Return the contrast that noise and texture hardly ever reach, in grey levels.
+
+        From the median and the upper quartile of all pixels' contrast: stripes cover few of them.
+        """
+        count = np.zeros(256, np.int64)
+        _count_contrasts(
+            image.lines, self._lowest, self._highest, self._reach_px, self._scratch, count
+        )
+        up_to = np.cumsum(count)
+        median, quartile = np.searchsorted(up_to, np.array([0.5, 0.75]) * up_to[-1])
+        return float(median + _NOISE_QUARTILES * (quartile - median))
+
+    def find(self, image: SearchImage, min_contrast: int) -> tuple[IntArray, FloatArray]:
+        """Find the peaks of one frame.
+
+        Parameters
+        ----------
+        image : SearchImage
+            Of the shape that this was made for.
+        min_contrast : int
+            Least height above the background, in grey levels; doubled where noise makes more peaks
+            than there is room for.
 
         Returns
         -------
-        found : Returns
-            Copies: they stay valid after the next call.
+        line : int array, shape (N,)
+            Search line of each peak; ascending. A view: overwritten by the next call.
+        table : array, shape (7, N)
+            Measures of each peak, rows as named above; likewise.
         """
-        background = self._ground.background(view.lines)
-        cells = self._finder.in_band if view.green is None else self._ground.near_green(view.green)
-        min_contrast = self._options.min_contrast
         while True:
-            runs = self._finder.find(view.lines, background, min_contrast, cells)
-            if len(runs) < self._finder.capacity or min_contrast > _HIGHEST_CONTRAST:
-                break
-            # So many runs are noise; stripes stand higher than noise.
+            n = _find_peaks(
+                image,
+                self._lowest,
+                self._highest,
+                min_contrast,
+                self._reach_px,
+                self._directions,
+                self._scratch,
+                self._line,
+                self._table,
+            )
+            if n < len(self._line) or min_contrast > _MAX_CONTRAST:
+                return self._line[:n], self._table[:, :n]
             min_contrast *= 2
-        n = measure_runs(
-            view.lines,
-            self._length,
-            background,
-            _GREY if view.green is None else view.green,
-            runs,
-            self._reach_px,
-            self._options.min_green_fall,
-            self._peaks,
-            self._line,
-            self._measures,
-        )
-        n = _drop_faint(self._options.min_share, self._line[:n], self._measures[:, :n])
-        position, height, width, green_fall = self._measures[:, :n].copy()
-        return Returns(self._line[:n].copy(), position, height, width, green_fall)
 
 
-@kernel
-def _drop_faint(share: float, line: IntArray, measures: FloatArray) -> int:
-    """Keep the returns of at least `share` of the 90 % quantile of heights, in place."""
-    n = line.shape[0]
-    of_height = np.zeros(257, np.int64)
-    for i in range(n):
-        of_height[int(measures[1, i])] += 1
-    bright = 256
-    seen = 0
-    while seen <= 0.1 * n and bright > 0:
-        bright -= 1
-        seen += of_height[bright]
-    kept = 0
-    for i in range(n):
-        if measures[1, i] >= share * bright:
-            line[kept] = line[i]
-            for k in range(measures.shape[0]):
-                measures[k, kept] = measures[k, i]
-            kept += 1
-    return kept
+@borrowing_kernel
+def _count_contrasts(
+    lines: U8Array,
+    lowest: IntArray,
+    highest: IntArray,
+    reach_px: int,
+    scratch: _Scratch,
+    count: IntArray,
+) -> None:
+    """Count the contrasts of the pixels within the bands, on some lines."""
+    for x in range(0, lowest.shape[0], _NOISE_EVERY):
+        if lowest[x] > highest[x]:
+            continue
+        row, first = lines[x], lowest[x]
+        end = min(highest[x] + 1, row.shape[0])
+        _mark_above(row, first, end, 255, reach_px, scratch)
+        for i in range(end - first):
+            count[np.int64(row[first + i]) - np.int64(scratch.background[i])] += 1
+
+
+@borrowing_kernel
+def _find_peaks(
+    image: SearchImage,
+    lowest: IntArray,
+    highest: IntArray,
+    min_contrast: int,
+    reach_px: int,
+    directions: FloatArray,
+    scratch: _Scratch,
+    line: IntArray,
+    table: FloatArray,
+) -> int:
+    """Write the search line and the measures of each peak; return how many."""
+    n = 0
+    for x in range(lowest.shape[0]):
+        if lowest[x] > highest[x]:
+            continue
+        row = image.lines[x]
+        # Runs reach over the band's limits.
+        first = max(lowest[x] - reach_px, 0)
+        end = min(highest[x] + reach_px + 1, row.shape[0])
+        _mark_above(row, first, end, min_contrast, reach_px, scratch)
+        start = _next_set(scratch, 0, end - first)
+        while start < end - first:
+            stop = start
+            while scratch.above[stop]:
+                stop += 1
+            if first + start <= highest[x] and first + stop > lowest[x]:
+                base = scratch.background[start]
+                run = (first + start, first + stop)
+                n = _measure_run(image, x, run, base, reach_px, directions, line, table, n)
+                if n == line.shape[0]:
+                    return n
+            start = _next_set(scratch, stop, end - first)
+    return n
+
+
+@inline_borrowing_kernel
+def _mark_above(
+    row: U8Array, first: int, end: int, min_contrast: int, reach_px: int, scratch: _Scratch
+) -> None:
+    """Mark the pixels [first, end) that stand above the background; index 0 is `first`."""
+    n = end - first
+    # Slices from 0 on, so that LLVM sees that no index is negative and uses vector instructions.
+    padded, pixels = scratch.padded[: n + 2 * reach_px], scratch.padded[reach_px : reach_px + n]
+    # Beyond the border all is bright: one flank is not visible there, so nothing can stand out.
+    before, after = min(reach_px, first), min(reach_px, row.shape[0] - end)
+    padded[: reach_px - before] = _BRIGHT
+    _copy(row[first - before : end + after], padded[reach_px - before :])
+    padded[reach_px + n + after :] = _BRIGHT
+    # Minima over windows that grow to `reach_px`: twice as wide each time.
+    here, there, other = padded, scratch.minima, scratch.spare
+    span = 1
+    while span < reach_px:
+        step = min(span, reach_px - span)
+        ahead = here[step : n + 2 * reach_px - span + 1]
+        for i in range(ahead.shape[0]):
+            one, two = here[i], ahead[i]
+            there[i] = one if one < two else two
+        here, there, other = there, other, there
+        span += step
+    left, right = here[1:], here[reach_px:]
+    background, above = scratch.background, scratch.above
+    least = np.uint8(min_contrast)
+    for i in range(pixels.shape[0]):
+        base = left[i] if left[i] > right[i] else right[i]
+        background[i] = base
+        above[i] = np.uint8(np.uint8(pixels[i] - base) >= least)
+    above[n : (n // _WORD + 2) * _WORD] = np.uint8(0)
+
+
+@inline_borrowing_kernel
+def _copy(source: U8Array, out: U8Array) -> None:
+    for i in range(source.shape[0]):
+        out[i] = source[i]
+
+
+@inline_borrowing_kernel
+def _next_set(scratch: _Scratch, at: int, end: int) -> int:
+    """Return the first marked pixel from `at` on; `end` if there is none."""
+    while at < end:
+        if at % _WORD == 0 and scratch.words[at // _WORD] == 0:
+            at += _WORD
+        elif scratch.above[at]:
+            return at
+        else:
+            at += 1
+    return end
+
+
+@inline_borrowing_kernel
+def _measure_run(
+    image: SearchImage,
+    x: int,
+    run: tuple[int, int],
+    base: np.uint8,
+    reach_px: int,
+    directions: FloatArray,
+    line: IntArray,
+    table: FloatArray,
+    n: int,
+) -> int:
+    """Append the peaks of a run [start, end) of search line `x`; return their new number."""
+    start, end = run
+    row = image.lines[x]
+    low = max(start - reach_px, 0)
+    # Beyond the run the profile may still be falling towards half height.
+    high = min(end + reach_px, row.shape[0]) - 1
+    while start < end and n < line.shape[0]:
+        peak, start = _next_peak(row, start, end, np.int64(base))
+        last = high if start >= end else start
+        # Twice the grey levels keep half a level a whole number.
+        level = np.int64(row[peak]) + np.int64(base)
+        a, b = _feet(row, peak, low, last, level)
+        low = start
+        if a < 0:
+            continue
+        width = _width(row, a, b, level)
+        if width > reach_px:
+            continue
+        line[n] = x
+        table[POSITION, n] = _centroid(row, a, b, level)
+        table[HEIGHT, n] = 2 * np.int64(row[peak]) - level
+        table[WIDTH, n] = width
+        if image.u.shape[0] > 0:
+            _measure_chroma(image, x, peak, width, directions, table[:, n])
+        n += 1
+    return n
+
+
+@inline_borrowing_kernel
+def _next_peak(row: U8Array, start: int, end: int, base: np.int64) -> tuple[int, int]:
+    """Return (peak, end) of the first peak in [start, end); the next one begins at its end."""
+    peak, valley_at = start, start
+    top = np.int64(row[start])
+    valley = top
+    for v in range(start + 1, end):
+        value = np.int64(row[v])
+        if value > top:
+            if valley_at > start and _separates(valley, top, base):
+                return peak, valley_at
+            top, peak = value, v
+            valley, valley_at = value, v
+        elif value < valley:
+            valley, valley_at = value, v
+        elif valley_at > start and _separates(valley, value, base):
+            return peak, valley_at
+    return peak, end
+
+
+@inline_borrowing_kernel
+def _separates(valley: np.int64, lower_peak: np.int64, base: np.int64) -> bool:
+    return bool(10 * (valley - base) < _VALLEY_TENTHS * (lower_peak - base))
+
+
+@inline_borrowing_kernel
+def _feet(row: U8Array, peak: int, low: int, high: int, level: np.int64) -> tuple[int, int]:
+    """Return the nearest positions in [low, high] around the peak that are below half height.
+
+    -1 for both where one is missing, or something higher than the peak lies nearer: then this is
+    the foot of another stripe.
+    """
+    top = row[peak]
+    a = peak - 1
+    while a >= low and 2 * np.int64(row[a]) > level and row[a] <= top:
+        a -= 1
+    b = peak + 1
+    while b <= high and 2 * np.int64(row[b]) > level and row[b] <= top:
+        b += 1
+    if a < low or b > high or row[a] > top or row[b] > top:
+        return -1, -1
+    return a, b
+
+
+@inline_borrowing_kernel
+def _width(row: U8Array, a: int, b: int, level: np.int64) -> float:
+    """Return the full width at half height."""
+    below, above = 2 * np.int64(row[a]) - level, 2 * np.int64(row[a + 1]) - level
+    rise = -below / (above - below)
+    below, above = 2 * np.int64(row[b]) - level, 2 * np.int64(row[b - 1]) - level
+    fall = -below / (above - below)
+    return b - ((a + rise) + fall)
+
+
+@inline_borrowing_kernel
+def _centroid(row: U8Array, a: int, b: int, level: np.int64) -> float:
+    """Return the centroid of what stands above half height, between the feet."""
+    total, moment = np.int64(0), np.int64(0)
+    for k in range(1, b - a):
+        value = 2 * np.int64(row[a + k]) - level
+        total += value
+        moment += value * k
+    return a + moment / total
+
+
+@inline_borrowing_kernel
+def _measure_chroma(
+    image: SearchImage,
+    x: int,
+    peak: int,
+    width: float,
+    directions: FloatArray,
+    measures: FloatArray,
+) -> None:
+    """Write how the peak's chroma differs from that of its flanks.
+
+    The peak's is that of its middle or of an edge, whichever is more of the laser's colour: a
+    saturated core is white.
+    """
+    edge, flank = int(0.5 * width) + 1, int(width) + 4
+    u_before, v_before = _chroma(image, x, peak - flank)
+    u_after, v_after = _chroma(image, x, peak + flank)
+    u_flank, v_flank = 0.5 * (u_before + u_after), 0.5 * (v_before + v_after)
+    row = image.lines[x]
+    luma = 0.5 * row[max(peak - flank, 0)] + 0.5 * row[min(peak + flank, row.shape[0] - 1)]
+    best = -np.inf
+    for k in range(directions.shape[0]):
+        along_u, along_v = directions[k, 0], directions[k, 1]
+        for offset in (0, -edge, edge):
+            u, v = _chroma(image, x, peak + offset)
+            u, v = u - u_flank, v - v_flank
+            along = along_u * u + along_v * v
+            if along > best:
+                best = along
+                measures[STEP_U], measures[STEP_V] = u, v
+                measures[IMBALANCE] = along_u * (u_after - u_before) + along_v * (
+                    v_after - v_before
+                )
+                tint = along_u * (u_flank - 128.0) + along_v * (v_flank - 128.0)
+                measures[TINT] = tint / max(luma, 16.0)
+
+
+@inline_borrowing_kernel
+def _chroma(image: SearchImage, x: int, position: int) -> tuple[float, float]:
+    """Return U and V at a position, the mean over three neighbours along the stripe."""
+    limit = image.u.shape[1] if image.along_x else image.u.shape[0]
+    across = image.u.shape[0] if image.along_x else image.u.shape[1]
+    p = min(max(position, 0) >> 1, limit - 1)
+    q = (x * image.line_px) >> 1
+    u, v = np.int64(0), np.int64(0)
+    for k in range(-1, 2):
+        c = min(max(q + k, 0), across - 1)
+        i, j = (c, p) if image.along_x else (p, c)
+        u += image.u[i, j]
+        v += image.v[i, j]
+    return u / 3.0, v / 3.0

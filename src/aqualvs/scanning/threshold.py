@@ -5,14 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.contrast import BLOCK
-from aqualvs.scanning.lanes import U8Array, whole_lanes
-from aqualvs.scanning.runs import Runs
+from aqualvs.geometry.arrays import IntArray
+from aqualvs.scanning.scan import ImagePlane
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.view import SearchView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,31 +58,32 @@ class ThresholdDetector:
         highest: IntArray,
         options: ThresholdOptions,
     ) -> None:
-        along_x = axis is SearchAxis.ALONG_X
-        length = size_px[0] if along_x else size_px[1]
-        self._finder = Runs(length, lowest, highest, options.max_returns)
-        # One grey level below the threshold everywhere: what stands above it by one is bright.
-        n_blocks = whole_lanes(length) // BLOCK
-        self._below: U8Array = np.full((len(lowest), n_blocks), options.level - 1, np.uint8)
+        self._options = options
+        self._lowest, self._highest = lowest[:, None], highest[:, None]
 
-    def detect(self, view: SearchView) -> Returns:
-        """Find the returns of one frame; colour is not looked at."""
-        runs = self._finder.find(view.lines, self._below, 1, self._finder.in_band)
-        n = len(runs)
+    def detect(self, lines: ImagePlane) -> Returns:
+        """Find the returns of one frame; colour is not looked at.
+
+        Parameters
+        ----------
+        lines : uint8 array, shape (n_lines, length)
+            Search lines as rows.
+        """
+        bright = np.zeros((len(lines), lines.shape[1] + 2), np.int8)
+        bright[:, 1:-1] = lines >= self._options.level
+        change = np.diff(bright, axis=1)
+        line, start = np.nonzero(change == 1)
+        last = np.nonzero(change == -1)[1] - 1
+        low, high = self._lowest[line, 0], self._highest[line, 0]
+        reaches = np.flatnonzero((start <= high) & (last >= low))[: self._options.max_returns]
+        line, start, last = line[reaches], start[reaches], last[reaches]
+        height = [
+            float(lines[x, a : b + 1].max()) for x, a, b in zip(line, start, last, strict=True)
+        ]
         return Returns(
-            line=runs[:, 0].copy(),
-            position=0.5 * (runs[:, 1] + runs[:, 2]).astype(np.float64),
-            height=_peaks(view.lines, runs),
-            width=(runs[:, 2] - runs[:, 1] + 1).astype(np.float64),
-            green_fall=np.full(n, np.nan),
+            line=line,
+            position=0.5 * (start + last),
+            height=np.array(height),
+            width=(last - start + 1).astype(np.float64),
+            likelihood=np.ones(len(line)),
         )
-
-
-@kernel
-def _peaks(lines: U8Array, runs: IntArray) -> FloatArray:
-    """Brightest value of each run (line, first, last)."""
-    peaks = np.zeros(runs.shape[0])
-    for i in range(runs.shape[0]):
-        for v in range(runs[i, 1], runs[i, 2] + 1):
-            peaks[i] = max(peaks[i], float(lines[runs[i, 0], v]))
-    return peaks

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.scan import Frame, ImagePlane
-from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch
-from aqualvs.scanning.segments import Segments, link_segments
+from aqualvs.scanning.laser_colour import LaserColour
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
+from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
+from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import Returns, StripeOptions
 
 # A stripe that runs less than 45 degrees off a search line is left to the other axis.
@@ -28,15 +29,9 @@ _SIGMA_IN_WIDTHS, _LEAST_SIGMA_PX = 0.01, 0.05
 # centre by about so many widths for each height of the stripe.
 _FLANK_AT, _FLANK_PULL = 1.3, 0.2
 _SLOPE_AT, _SLOPE_PULL = 0.5, 0.35
-# In pictures this wide a stripe can be a pixel or two thin, its centre then locked to the pixels
-# and its noise that of single pixels.
-_FINE_FROM, _FINE_BLUR_PX = 1280, 1.0
+# Returns kept for each search line: a whole picture has more that is bright than the lasers' bands.
 _RETURNS_PER_LINE = 60
 _MAP_LENGTH = 30000
-# A single return may fall short of the green that its piece must have, but not be grey.
-_LEAST_GREEN = 1.0
-# Grey levels: added to both sides of ratios of colours, for those near black; and saturation.
-_DARK, _SATURATED = 8.0, 240.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,22 +40,18 @@ class WholePictureOptions:
 
     Attributes
     ----------
-    min_contrast : int
-        Least height of a stripe above its background, in grey levels.
-    min_green : float
-        Least median excess of green along a piece of stripe over what its flanks' paint would show
-        there, in grey levels: what tells a laser's line from a printed edge. Only used where the
-        picture has colour.
+    min_likelihood : float
+        Least mean likelihood along a piece of stripe that its colour is a laser's: what tells a
+        laser's line from a printed edge. Only used where the picture has colour.
     min_length_px : int
         Shortest unbroken piece of a stripe.
-    min_share : float
-        Returns lower than this share of the picture's bright ones are left out.
+    wavelength_nm : float or None
+        Of the lasers; green if None.
     """
 
-    min_contrast: int = 6
-    min_green: float = 4.0
+    min_likelihood: float = 0.4
     min_length_px: int = 12
-    min_share: float = 0.05
+    wavelength_nm: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
@@ -103,7 +94,7 @@ class StripePixels:
 def find_stripes(
     image: ImagePlane | Frame, options: WholePictureOptions | None = None
 ) -> StripePixels:
-    """Find what is thin, long and greener than its surroundings.
+    """Find what is thin, long and of a laser's colour, with the detector of the scanner.
 
     Parameters
     ----------
@@ -117,124 +108,53 @@ def find_stripes(
         Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
     """
     options = options or WholePictureOptions()
-    picture = _as_bgr(image) if isinstance(image, Frame) else image
-    luma = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    if luma.shape[1] >= _FINE_FROM:
-        luma = cv2.GaussianBlur(luma, (0, 0), _FINE_BLUR_PX)
-    # Averaging three by three keeps colour noise of single pixels from making or hiding a line.
-    colour = None if picture.ndim == 2 else cv2.blur(picture, (3, 3)).astype(np.float64)
-    found = _joined([_along(axis, luma, colour, options) for axis in SearchAxis])
-    return replace(found, sigma_px=_sigma_px(luma, found))
-
-
-def _as_bgr(frame: Frame) -> ImagePlane:
-    """Return the frame's picture with its chroma at full size."""
-    if frame.chroma is None:
-        return frame.luma
+    frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
     height, width = frame.luma.shape
-    u, v = (cv2.resize(plane, (width, height)) for plane in frame.chroma)
-    bgr: ImagePlane = cv2.cvtColor(cv2.merge([frame.luma, v, u]), cv2.COLOR_YCrCb2BGR)
-    return bgr
+    colour = LaserColour.of(options.wavelength_nm)
+    searches = [_whole_search((width, height), axis, colour) for axis in SearchAxis]
+    most = _RETURNS_PER_LINE * max(len(search.lowest) for search in searches)
+    detector = FrameDetector((width, height), searches, StripeOptions(max_returns=most))
+    returns = detector.detect(frame)
+    found = _joined([_pieces(search, returns[search.axis], options) for search in searches])
+    return replace(found, sigma_px=_sigma_px(frame.luma, found))
 
 
-def _along(
-    axis: SearchAxis, luma: ImagePlane, colour: FloatArray | None, options: WholePictureOptions
-) -> StripePixels:
-    height, width = luma.shape
-    search = _whole_search((width, height), axis)
-    detection = StripeOptions(
-        min_contrast=options.min_contrast,
-        min_share=options.min_share,
-        max_returns=_RETURNS_PER_LINE * len(search.lowest),
-    )
-    detector = FrameDetector((width, height), [search], detection)
-    returns = detector.detect(Frame(0, 0.0, luma))[axis]
-    green = np.full(len(returns), np.inf)
-    if colour is not None:
-        across = axis is SearchAxis.ALONG_Y
-        green = _green_excess(colour.swapaxes(0, 1) if across else colour, returns)
-        not_grey = green >= _LEAST_GREEN
-        returns, green = _where(returns, not_grey), green[not_grey]
-    return _pieces(axis, returns, green, link_segments(returns, search), options)
-
-
-def _whole_search(size_px: tuple[int, int], axis: SearchAxis) -> StripeSearch:
-    n_lines, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
-    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _STEEPEST)
+def _whole_search(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> StripeSearch:
+    line_px = pixels_per_line(size_px)
+    n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
+    n_lines = n_pixels // line_px
+    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _STEEPEST * line_px)
     lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    return StripeSearch(axis, 1, lowest, highest, -slopes, slopes)
+    return StripeSearch(axis, line_px, lowest, highest, -slopes, slopes, colour)
 
 
-def _where(returns: Returns, keep: BoolArray) -> Returns:
-    return Returns(
-        returns.line[keep],
-        returns.position[keep],
-        returns.height[keep],
-        returns.width[keep],
-        returns.green_fall[keep],
-    )
-
-
-def _green_excess(colour: FloatArray, returns: Returns) -> FloatArray:
-    """Return how much greener (N,), in grey levels, a return is than its flanks' paint would be.
-
-    Lit like its flanks, lighter paint has more of every colour; a laser adds green. A saturated
-    core is white, so that its edges count.
-    """
-    last = colour.shape[1] - 1
-
-    def at(offset: FloatArray) -> FloatArray:
-        place = np.clip(np.rint(returns.position + offset), 0, last).astype(np.int64)
-        value: FloatArray = colour[returns.line, place]
-        return value
-
-    edge, flank = 0.5 * returns.width, 1.2 * returns.width + 3.0
-    flanks = at(-flank), at(flank)
-    core = _excess(at(np.zeros(len(returns))), flanks)
-    edges = np.maximum(_excess(at(-edge), flanks), _excess(at(edge), flanks))
-    saturated = at(np.zeros(len(returns)))[:, 1] >= _SATURATED
-    excess: FloatArray = np.where(saturated, np.maximum(core, edges), core)
-    return excess
-
-
-def _excess(here: FloatArray, flanks: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Return green (N,) beyond what blue and red foretell from the flanks' own colours."""
-
-    def foretold(flank: FloatArray) -> FloatArray:
-        lighter = (here + _DARK) / (flank + _DARK)
-        level: FloatArray = (flank[:, 1] + _DARK) * 0.5 * (lighter[:, 0] + lighter[:, 2]) - _DARK
-        return level
-
-    excess: FloatArray = here[:, 1] - np.maximum(foretold(flanks[0]), foretold(flanks[1]))
-    return excess
-
-
-def _pieces(
-    axis: SearchAxis,
-    returns: Returns,
-    green: FloatArray,
-    segments: Segments,
-    options: WholePictureOptions,
-) -> StripePixels:
-    """Return the pieces that are green, long enough, and cross the search lines well."""
+def _pieces(search: StripeSearch, returns: Returns, options: WholePictureOptions) -> StripePixels:
+    """Return the pieces that are of the colour, long enough, and cross the search lines well."""
+    segments = link_segments(returns, search)
     chains = np.split(segments.order, np.flatnonzero(np.diff(segments.stretch)) + 1)
-    long = [chain for chain in chains if len(chain) >= options.min_length_px]
-    kept = [chain for chain in long if np.median(green[chain]) >= options.min_green]
-    pieces = [_piece(axis, returns, chain) for chain in kept]
+    least = max(3, -(-options.min_length_px // search.line_px))
+    kept = [
+        chain
+        for chain in chains
+        if len(chain) >= least and np.mean(returns.likelihood[chain]) >= options.min_likelihood
+    ]
+    pieces = [_piece(search, returns, chain) for chain in kept]
     return _joined([piece for piece in pieces if _is_long(piece)])
 
 
-def _piece(axis: SearchAxis, returns: Returns, chain: IntArray) -> StripePixels:
+def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePixels:
+    axis = search.axis
     chain = chain[np.argsort(returns.line[chain], kind="stable")]
-    slope = _slopes(returns.line[chain].astype(np.float64), returns.position[chain])
+    line = search.line_px * (returns.line[chain].astype(np.float64) + 0.5) - 0.5
+    slope = _slopes(line, returns.position[chain])
     width = returns.width[chain]
     # At just 45 degrees one of the axes must have it.
     steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
     keep = steep_enough & (width <= _MAX_WIDTH * np.median(width))
-    chain, slope = chain[keep], slope[keep]
+    chain, line, slope = chain[keep], line[keep], slope[keep]
     along_x = axis is SearchAxis.ALONG_X
     cosine = 1.0 / np.hypot(1.0, slope)
-    pixels = np.stack([returns.line[chain].astype(np.float64), returns.position[chain]], axis=-1)
+    pixels = np.stack([line, returns.position[chain]], axis=-1)
     across = np.stack([-slope * cosine, cosine], axis=-1)
     width = returns.width[chain] * cosine
     return StripePixels(

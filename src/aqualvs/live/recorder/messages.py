@@ -63,7 +63,7 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
     for axis, found in sample.returns.items():
         to.text(axis.value)
         to.array(found.line.astype(np.uint32))
-        for column in (found.position, found.height, found.width, found.green_fall):
+        for column in (found.position, found.height, found.width, found.likelihood):
             to.array(column)
     return to.finish()
 
@@ -87,7 +87,10 @@ def stripes_of(
     for _ in range(of.number("I")):
         axis = SearchAxis(of.text())
         line = of.array("u4").astype(np.int64)
-        returns[axis] = Returns(line, *(of.array("f8") for _ in range(4)))
+        position, height, width, likelihood = (of.array("f8") for _ in range(4))
+        # Recordings of 0.1.0 hold levels here, of returns that had passed a gate; NaN if grey.
+        likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
+        returns[axis] = Returns(line, position, height, width, likelihood)
     return index, time_s, n_water, returns, Refusal(Reason(reason), detail) if reason else None
 
 

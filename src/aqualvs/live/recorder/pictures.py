@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 
 from aqualvs.live.colour import bgr_of
-from aqualvs.live.sources.planes import planes_of_image
-from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 
 # Noise leaves little to a search for what repeats: runs alone are smaller, and no slower.
 _PNG = [

@@ -67,7 +67,7 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
         n_air=numbers["n_air"],
         n_water=numbers["n_water"],
         lasers=tuple(
-            _laser(laser.name, own)
+            _with_numbers(laser, own)
             for laser, own in zip(rig.lasers, numbers["lasers"], strict=True)
         ),
         working_range=tuple(numbers["working_range"]),
@@ -93,6 +93,8 @@ def options_from_text(text: str) -> ScannerOptions:
     found = json.loads(text)
     detector = dict(found["detector"])
     kind = {"ridge": StripeOptions, "threshold": ThresholdOptions}[detector.pop("kind")]
+    # Recordings of 0.1.0 name the gate on colour that likelihoods have replaced.
+    detector.pop("min_green_fall", None)
     mesh = found["mesh_filter"]
     return ScannerOptions(
         detector=kind(**detector),
@@ -112,9 +114,9 @@ def _plane_numbers(plane: Plane) -> list[Any]:
     return [plane.normal.tolist(), float(plane.offset)]
 
 
-def _laser(name: str, numbers: list[Any]) -> Laser:
+def _with_numbers(laser: Laser, numbers: list[Any]) -> Laser:
     plane = Plane(np.array(numbers[0]), numbers[1])
     if len(numbers) == 2:
-        return Laser(name, plane)
+        return replace(laser, plane=plane, window=None)
     window = Window(Plane(np.array(numbers[2]), numbers[3]), np.array(numbers[4]))
-    return Laser(name, plane, window)
+    return replace(laser, plane=plane, window=window)

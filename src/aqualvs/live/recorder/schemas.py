@@ -94,7 +94,7 @@ uint32[] line
 float64[] position
 float64[] height
 float64[] width
-float64[] green_fall
+float64[] likelihood
 """
 
 _HEALTH = """\

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.live.sources.planes import Planes, planes_of_image
-from aqualvs.scanning.scan import ImagePlane
+from aqualvs.scanning.scan import ImagePlane, Planes, planes_of_image
 
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
 """FFmpeg's names of the codecs of `CompressedVideo`."""

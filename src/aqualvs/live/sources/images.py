@@ -9,8 +9,7 @@ from typing import Self, cast
 import cv2
 
 from aqualvs.errors import SourceError
-from aqualvs.live.sources.planes import planes_of_image
-from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 
 IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 

@@ -12,8 +12,8 @@ from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.sources.image_messages import ENCODINGS, ImageMessage, planes_of_message
 from aqualvs.live.sources.live_decoder import LiveDecoder
 from aqualvs.live.sources.packets import packet_with
-from aqualvs.live.sources.planes import Planes, planes_of
-from aqualvs.scanning.scan import Frame
+from aqualvs.live.sources.planes import planes_of
+from aqualvs.scanning.scan import Frame, Planes
 
 Logged: TypeAlias = tuple[int, ImageMessage | None]
 """Time of the log in nanoseconds, and the image; None for a message that cannot be read."""

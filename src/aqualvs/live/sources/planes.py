@@ -1,16 +1,11 @@
 """Luma and chroma of a decoded picture, without copying where its layout allows."""
 
-from typing import TypeAlias
-
-import cv2
 import numpy as np
 from av.video.frame import VideoFrame
 from av.video.plane import VideoPlane
 from av.video.reformatter import ColorRange
 
-from aqualvs.scanning.scan import ImagePlane
-
-Planes: TypeAlias = tuple[ImagePlane, tuple[ImagePlane, ImagePlane] | None]
+from aqualvs.scanning.scan import ImagePlane, Planes
 
 _PLANAR = frozenset({"yuv420p", "yuvj420p"})
 _SEMI_PLANAR = frozenset({"nv12"})
@@ -47,28 +42,6 @@ def planes_of(picture: VideoFrame) -> Planes:
     if kind in _GREY:
         return _view(picture.planes[0]), None
     return planes_of(_as_420(picture))
-
-
-def planes_of_image(image: ImagePlane) -> Planes:
-    """Return luma and chroma of an image, grey or BGR, as OpenCV reads it.
-
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width) or (height, width, 3)
-
-    Returns
-    -------
-    luma, chroma
-        As `planes_of`; BT.601 limited range, as videos have it.
-    """
-    if image.ndim == 2:
-        return _read_only(image), None
-    height, width = image.shape[:2]
-    padded = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    i420 = _read_only(cv2.cvtColor(padded, cv2.COLOR_BGR2YUV_I420))
-    rows, columns = padded.shape[:2]
-    chroma = i420[rows:].reshape(2, rows // 2, columns // 2)
-    return i420[:height, :width], (chroma[0], chroma[1])
 
 
 def _view(plane: VideoPlane, *, first: int = 0, step: int = 1) -> ImagePlane:
