@@ -1,22 +1,28 @@
 """Detection in a whole frame: one search for each direction that the lasers need."""
 
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
-import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.scanning.laser_colour import ChromaSteps, channel_image, laser_likelihood
-from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.geometry.compiled import kernel
+from aqualvs.scanning.laser_colour import (
+    LineColour,
+    channel_image,
+    element_at,
+    expected_colour,
+    laser_likelihood,
+    learn_colour,
+    useful_height,
+)
+from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
+from aqualvs.scanning.search_image import SearchLines, U8Array
+from aqualvs.scanning.segments import on_long_segments
 from aqualvs.scanning.stripe import (
     HEIGHT,
-    IMBALANCE,
     POSITION,
-    STEP_U,
-    STEP_V,
-    TINT,
-    WIDTH,
     PeakFinder,
     Returns,
     SearchImage,
@@ -25,6 +31,17 @@ from aqualvs.scanning.stripe import (
 from aqualvs.scanning.threshold import ThresholdDetector, ThresholdOptions
 
 DetectorOptions = StripeOptions | ThresholdOptions
+
+
+# One search line of so many is looked at first. In a grey picture so many peaks on a search line
+# are looked at, more of them than stripes and clutter make.
+_SAMPLE_EVERY, _PEAKS_PER_LINE = 48, 12
+# What the frame's bright returns are as high as.
+_BRIGHT_QUANTILE = 0.9
+_NO_CHROMA = np.empty((2, 0, 0), np.uint8)
+
+Peaks: TypeAlias = dict[SearchAxis, tuple[IntArray, FloatArray]]
+"""Search line and measures of the peaks of each search direction."""
 
 
 class FrameDetector:
@@ -61,9 +78,10 @@ class FrameDetector:
             if isinstance(options, StripeOptions)
             else {}
         )
-        half = (-(-size_px[1] // 2), -(-size_px[0] // 2))
-        self._chroma: ImagePlane = np.empty((2, *half), np.uint8)
-        self._no_chroma: ImagePlane = np.empty((2, 0, 0), np.uint8)
+        width, height = size_px
+        self._lines = {axis: SearchLines(size_px, axis, self._line_px) for axis in self._bands}
+        self._luma = np.empty((height, width), np.uint8)
+        self._chroma = np.empty((2, -(-height // 2), -(-width // 2)), np.uint8)
 
     def _finder(self, axis: SearchAxis, options: StripeOptions) -> PeakFinder:
         width, height = self._size_px
@@ -98,49 +116,131 @@ class FrameDetector:
         height, width = frame.luma.shape
         if (width, height) != self._size_px:
             raise ValueError(f"frame is {width} x {height} but the rig's image is {self._size_px}")
+        if not self._bands:
+            return {}
         if isinstance(self._options, ThresholdOptions):
             return {
                 axis: ThresholdDetector(axis, self._size_px, *band, self._options).detect(
-                    _search_lines(frame.luma, axis, self._line_px)
+                    self._lines[axis].of(frame.luma)
                 )
                 for axis, band in self._bands.items()
             }
         return self._find_stripes(frame, self._options)
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, Returns]:
-        chroma = self._no_chroma
+        luma = self._brightest(frame)
+        u, v = self._chroma if frame.chroma is not None else _NO_CHROMA
         if frame.chroma is not None:
-            chroma = self._chroma
-            np.copyto(chroma[0], frame.chroma[0])
-            np.copyto(chroma[1], frame.chroma[1])
-        luma = _brightest([channel_image(frame, colour) for colour in self._colours])
-        found = {}
-        for axis, finder in self._finders.items():
-            lines = _search_lines(luma, axis, self._line_px)
-            along_x = axis is SearchAxis.ALONG_X
-            image = SearchImage(lines, chroma[0], chroma[1], along_x, self._line_px)
-            contrast = max(options.min_contrast, min(round(finder.noise_contrast(image)), 14))
-            found[axis] = finder.find(image, contrast)
-        line = np.concatenate([line for line, _ in found.values()] or [np.zeros(0, np.int64)])
-        table = np.concatenate([table for _, table in found.values()] or [np.zeros((7, 0))], axis=1)
-        likelihood = self._likelihood(table, frame.chroma is not None)
-        keep = (likelihood >= options.min_likelihood) & _is_high(table[HEIGHT], options.min_share)
-        returns, start = {}, 0
-        for axis, (mine, _) in found.items():
-            rows = np.flatnonzero(keep[start : start + len(mine)]) + start
-            position, height, width = (table[k][rows] for k in (POSITION, HEIGHT, WIDTH))
-            returns[axis] = Returns(line[rows], position, height, width, likelihood[rows])
-            start += len(mine)
-        return returns
-
-    def _likelihood(self, table: FloatArray, has_colour: bool) -> FloatArray:
-        """Return how likely each peak is laser light of any of the rig's colours."""
-        if not has_colour:
-            return np.ones(table.shape[1])
-        steps = ChromaSteps(
-            table[HEIGHT], table[STEP_U : STEP_V + 1], table[IMBALANCE], table[TINT]
+            np.copyto(u, frame.chroma[0])
+            np.copyto(v, frame.chroma[1])
+        images = {
+            axis: SearchImage(
+                self._lines[axis].of(luma),
+                u,
+                v,
+                axis is SearchAxis.ALONG_X,
+                self._line_px,
+            )
+            for axis in self._finders
+        }
+        # A sample of the search lines tells from which height on it pays to look.
+        _, sample = _joined(self._find(images, options.min_contrast, _SAMPLE_EVERY))
+        contrast, colours = self._survey(sample, frame.chroma is not None)
+        found = self._find(images, max(contrast, options.min_contrast))
+        line, table = _joined(found)
+        likelihood = np.ones(len(line))
+        if frame.chroma is not None:
+            likelihood = self._likelihood(table, colours)
+        sizes = np.cumsum([0, *(len(mine) for mine, _ in found.values())])
+        keep = select_returns(
+            line, table, likelihood, sizes, options.min_likelihood, options.min_share
         )
-        return np.max([laser_likelihood(steps, colour) for colour in self._colours], axis=0)
+        return {
+            axis: Returns(
+                *(column[start:end][keep[start:end]] for column in (line, *table[:3], likelihood))
+            )
+            for axis, start, end in zip(found, sizes[:-1], sizes[1:], strict=True)
+        }
+
+    def _brightest(self, frame: Frame) -> U8Array:
+        """Return the picture in which the lasers stand out best; the next call overwrites it."""
+        np.copyto(self._luma, channel_image(frame, self._colours[0]))
+        for colour in self._colours[1:]:
+            np.maximum(self._luma, channel_image(frame, colour), out=self._luma)
+        return self._luma
+
+    def _find(
+        self, images: Mapping[SearchAxis, SearchImage], contrast: int, every: int = 1
+    ) -> Peaks:
+        return {
+            axis: self._finders[axis].find(one, contrast, every) for axis, one in images.items()
+        }
+
+    def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, list[LineColour | None]]:
+        """Return the height from which on it pays to look, and what the lines' colours are.
+
+        Where there is no colour to tell by, as many peaks are looked at as lasers may make.
+        """
+        if has_colour:
+            colours = [learn_colour(sample, colour) for colour in self._colours]
+            return useful_height(sample[HEIGHT], self._likelihood(sample, colours)), colours
+        n_lines = sum(len(lowest) for lowest, _ in self._bands.values())
+        most = _PEAKS_PER_LINE * n_lines // _SAMPLE_EVERY
+        heights = np.sort(sample[HEIGHT])[::-1]
+        return int(heights[most]) if len(heights) > most else 0, []
+
+    def _likelihood(self, table: FloatArray, known: Sequence[LineColour | None]) -> FloatArray:
+        """Return how likely each peak is laser light of any of the colours.
+
+        A colour that is not known is learned from the peaks, or that of a typical camera.
+        """
+        found = [
+            laser_likelihood(
+                table, line or learn_colour(table, colour) or expected_colour(table, colour)
+            )
+            for line, colour in zip(known, self._colours, strict=True)
+        ]
+        return np.asarray(np.max(found, axis=0), np.float64) if len(found) > 1 else found[0]
+
+
+def _joined(peaks: Peaks) -> tuple[IntArray, FloatArray]:
+    """Return the search line and the measures of the peaks of all directions, copied."""
+    line = np.concatenate([line for line, _ in peaks.values()])
+    return line, np.concatenate([table for _, table in peaks.values()], axis=1)
+
+
+@kernel
+def select_returns(
+    line: IntArray,
+    table: FloatArray,
+    likelihood: FloatArray,
+    sizes: IntArray,
+    min_likelihood: float,
+    min_share: float,
+) -> BoolArray:
+    """Mark the peaks that are likely a laser's, and bright or one of many in a row.
+
+    Parameters
+    ----------
+    line : int array, shape (N,)
+        Search line of each peak, direction after direction.
+    table : array, shape (7, N)
+        Measures of the peaks.
+    likelihood : array, shape (N,)
+        Of each peak.
+    sizes : int array, shape (n_directions + 1,)
+        Where the peaks of each direction begin, and N.
+    min_likelihood, min_share : float
+        As in `StripeOptions`.
+    """
+    keep = likelihood >= min_likelihood
+    bright = min_share * element_at(table[HEIGHT][keep], _BRIGHT_QUANTILE)
+    for k in range(sizes.shape[0] - 1):
+        rows = sizes[k] + np.flatnonzero(keep[sizes[k] : sizes[k + 1]])
+        long = on_long_segments(line[rows], table[POSITION][rows])
+        for i in range(rows.shape[0]):
+            keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
+    return keep
 
 
 def _band(searches: Sequence[StripeSearch]) -> tuple[IntArray, IntArray]:
@@ -148,36 +248,3 @@ def _band(searches: Sequence[StripeSearch]) -> tuple[IntArray, IntArray]:
     lowest: IntArray = np.min([search.lowest for search in searches], axis=0)
     highest: IntArray = np.max([search.highest for search in searches], axis=0)
     return lowest, highest
-
-
-def _brightest(channels: Sequence[ImagePlane]) -> ImagePlane:
-    image = channels[0]
-    for channel in channels[1:]:
-        image = np.maximum(image, channel)
-    return image
-
-
-def _search_lines(luma: ImagePlane, axis: SearchAxis, line_px: int) -> ImagePlane:
-    """Return the search lines of a picture as rows, shape (n_lines, length).
-
-    In wide pictures a search line is the mean of two rows or columns, and smoothed along itself: a
-    stripe can be a pixel or two thin there, its centre then locked to the pixels.
-    """
-    height, width = luma.shape
-    along_x = axis is SearchAxis.ALONG_X
-    lines = luma
-    if line_px == 2:
-        across = (width, height // 2) if along_x else (width // 2, height)
-        even = luma[: across[1] * 2] if along_x else luma[:, : across[0] * 2]
-        lines = np.asarray(cv2.resize(even, across, interpolation=cv2.INTER_AREA), np.uint8)
-    lines = np.ascontiguousarray(lines) if along_x else np.asarray(cv2.transpose(lines), np.uint8)
-    if line_px == 2:
-        lines = np.asarray(cv2.GaussianBlur(lines, (3, 1), 0.0), np.uint8)
-    return lines if lines.flags.writeable else lines.copy()
-
-
-def _is_high(height: FloatArray, share: float) -> BoolArray:
-    """Mark the peaks of at least `share` of the 90 % quantile of heights."""
-    if not len(height):
-        return np.zeros(0, np.bool_)
-    return height >= share * float(np.quantile(height, 0.9))

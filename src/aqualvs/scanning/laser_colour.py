@@ -11,15 +11,16 @@ drifts needs no tracking, and a frame's answer depends on nothing but the frame.
 """
 
 import math
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT
 
 # Wavelengths (nm) that part blue, green and red lines.
 _BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
@@ -41,6 +42,11 @@ _LEARNED_QUANTILE = 0.35
 _LEAST_SIGMA = 0.7
 # Heights that are counted as one kind, and how often the shares of lines among them are refined.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
+# Peaks below a height of which no more than this share are clearly lines are not looked at; up to
+# the height given.
+_USEFUL_SHARE, _CLEARLY, _HIGHEST_USEFUL = 0.03, 0.8, 32
+# A quarter of a normal distribution lies within this many standard deviations.
+_QUARTER_OF_NORMAL = 0.3186
 # Nothing is more certain than e to this power.
 _MAX_LOG_ODDS = 12.0
 
@@ -93,30 +99,49 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     return image
 
 
-@dataclass(frozen=True, slots=True)
-class ChromaSteps:
-    """How the chroma of peaks differs from that of their flanks, N of them.
+class LineColour(NamedTuple):
+    """What the lines of one frame do to the chroma.
 
     Attributes
     ----------
-    height : array, shape (N,)
-        Of the peaks above their background, in grey levels.
-    step : array, shape (2, N)
-        U and V of the peak, or of its edge if that is more of the laser's colour (a saturated core
-        is white), less the mean of both flanks.
-    imbalance : array, shape (N,)
-        Difference of the two flanks along the laser's colour: noise and shading.
-    tint : array, shape (N,)
-        How much the flanks have of the laser's colour, for each grey level of their luma.
+    u, v : float
+        Unit vector in the (U, V) plane.
+    ratio : float
+        Levels along it for each grey level of a line's height.
+    sigma : float
+        Standard deviation of a step that nothing but noise makes, in levels.
     """
 
-    height: FloatArray
-    step: FloatArray
-    imbalance: FloatArray
-    tint: FloatArray
+    u: float
+    v: float
+    ratio: float
+    sigma: float
 
 
-def laser_likelihood(peaks: ChromaSteps, colour: LaserColour) -> FloatArray:
+def learn_colour(table: FloatArray, colour: LaserColour) -> LineColour | None:
+    """Learn from a frame's peaks what its lines do to the chroma.
+
+    Parameters
+    ----------
+    table : array, shape (7, N)
+        Measures of peaks, rows as `stripe` names them.
+    colour : LaserColour
+
+    Returns
+    -------
+    LineColour or None
+        None where too few peaks are clearly of the laser's colour.
+    """
+    found = LineColour(*_learn(table, *colour.value))
+    return found if found.ratio > 0.0 else None
+
+
+def expected_colour(table: FloatArray, colour: LaserColour) -> LineColour:
+    """Return what lines do to the chroma of a typical camera, with the noise of these peaks."""
+    return LineColour(*colour.value, _RATIO_EXPECTED, float(_noise(table)))
+
+
+def laser_likelihood(table: FloatArray, line: LineColour) -> FloatArray:
     """Return how likely each peak of a frame is laser light, and not something else that is bright.
 
     Compares two explanations of a chroma step: a line moves the chroma in proportion to its height,
@@ -127,68 +152,117 @@ def laser_likelihood(peaks: ChromaSteps, colour: LaserColour) -> FloatArray:
 
     Parameters
     ----------
-    peaks : ChromaSteps
-        All peaks of one frame, N of them.
-    colour : LaserColour
+    table : array, shape (7, N)
+        Measures of all peaks of one frame, rows as `stripe` names them.
+    line : LineColour
+        From `learn_colour` or `expected_colour`.
 
     Returns
     -------
     array, shape (N,)
         0 to 1; 0.5 where colour says nothing.
     """
-    likelihood = np.empty(len(peaks.height))
-    if len(likelihood):
-        noise = float(np.median(np.abs(peaks.imbalance)))
-        sigma = max(1.4826 * noise / math.sqrt(2.0), _LEAST_SIGMA)
-        direction, ratio = _learn(peaks, np.array(colour.value), sigma)
-        _weigh(direction @ peaks.step, peaks.height, peaks.tint, ratio, sigma, likelihood)
+    likelihood = np.empty(table.shape[1])
+    _weigh(table, *line, likelihood)
     return likelihood
+
+
+def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
+    """Return the height up to which hardly any peak is clearly laser light, in grey levels.
+
+    Parameters
+    ----------
+    height, likelihood : array, shape (N,)
+        Of a sample of peaks.
+    """
+    return int(_useful_height(height, likelihood))
+
+
+@kernel
+def element_at(values: FloatArray, share: float) -> float:
+    """Return the value that a share of the values exceeds no more: one of them; 0 of none."""
+    n = values.shape[0]
+    return float(np.sort(values)[int(share * (n - 1))]) if n else 0.0
+
+
+@inline_kernel
+def _kind_of(height: float) -> int:
+    return min(int(_KINDS_PER_OCTAVE * math.log2(max(height, 1.0))), _N_KINDS - 1)
+
+
+@kernel
+def _noise(table: FloatArray) -> float:
+    """Return the standard deviation of a step, from how the two flanks of peaks differ.
+
+    A low quantile: beside other stripes and edges the flanks differ by more than noise.
+    """
+    noise = element_at(np.abs(table[IMBALANCE]), 0.25) / _QUARTER_OF_NORMAL
+    return max(noise / math.sqrt(2.0), _LEAST_SIGMA)
+
+
+@kernel
+def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
+    """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
+    sigma = _noise(table)
+    step = u * table[STEP_U] + v * table[STEP_V]
+    clear = step > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
+    if np.sum(clear) < _MIN_LEARNED:
+        return u, v, 0.0, sigma
+    # Chosen by chroma: the highest peaks may be edges of paper, which hardly move it.
+    best = np.flatnonzero(clear & (step >= _BEST_SHARE * element_at(step[clear], 0.9)))
+    if best.shape[0] < _MIN_LEARNED:
+        return u, v, 0.0, sigma
+    of_u, of_v = (
+        table[STEP_U][best] / table[HEIGHT][best],
+        table[STEP_V][best] / table[HEIGHT][best],
+    )
+    u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+    size = math.hypot(u, v)
+    u, v = u / size, v / size
+    ratio = element_at(u * of_u + v * of_v, _LEARNED_QUANTILE)
+    return u, v, max(ratio, _RATIO_LEAST), sigma
+
+
+@kernel
+def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
+    lines, peaks = np.zeros(_N_KINDS), np.zeros(_N_KINDS)
+    for i in range(height.shape[0]):
+        kind = _kind_of(height[i])
+        peaks[kind] += 1.0
+        lines[kind] += likelihood[i] > _CLEARLY
+    n_useless, n_lines, n_peaks = 0, 0.0, 0.0
+    for kind in range(_N_KINDS):
+        n_lines += lines[kind]
+        n_peaks += peaks[kind]
+        if n_lines <= _USEFUL_SHARE * n_peaks:
+            n_useless = kind + 1
+    return min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), _HIGHEST_USEFUL)
 
 
 @kernel
 def _weigh(
-    step: FloatArray,
-    height: FloatArray,
-    tint: FloatArray,
-    ratio: float,
-    sigma: float,
-    likelihood: FloatArray,
+    table: FloatArray, u: float, v: float, ratio: float, sigma: float, likelihood: FloatArray
 ) -> None:
     """Write the likelihood of each peak, given what a line shows for each level of height."""
-    n = step.shape[0]
+    n = table.shape[1]
     odds, kind = np.empty(n), np.empty(n, np.int64)
     for i in range(n):
-        line = ratio * height[i]
-        paint = min(max(tint[i], 0.0), _PAINT_SHARE * ratio) * height[i]
+        height = table[HEIGHT, i]
+        step, line = u * table[STEP_U, i] + v * table[STEP_V, i], ratio * height
+        paint = min(max(table[TINT, i], 0.0), _PAINT_SHARE * ratio) * height
         # More of the colour than expected is no evidence against a line, less than paint none for.
-        off_line, off_paint = min(step[i] - line, 0.0), max(step[i] - paint, 0.0)
+        off_line, off_paint = min(step - line, 0.0), max(step - paint, 0.0)
         var_line = sigma**2 + (_RATIO_SPREAD * line) ** 2
-        var_paint = sigma**2 + (_RATIO_OF_PAINT * height[i]) ** 2
+        var_paint = sigma**2 + (_RATIO_OF_PAINT * height) ** 2
         log_odds = 0.5 * (off_paint**2 / var_paint - off_line**2 / var_line)
         odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))
-        kind[i] = min(int(_KINDS_PER_OCTAVE * math.log2(max(height[i], 1.0))), _N_KINDS - 1)
+        kind[i] = _kind_of(height)
     share = np.full(_N_KINDS, 0.5)
     for _ in range(_ROUNDS):
-        lines, all_of = np.full(_N_KINDS, 1.0), np.full(_N_KINDS, 2.0)
+        lines, peaks = np.full(_N_KINDS, 1.0), np.full(_N_KINDS, 2.0)
         for i in range(n):
             prior = share[kind[i]]
             likelihood[i] = prior * odds[i] / (prior * odds[i] + 1.0 - prior)
             lines[kind[i]] += likelihood[i]
-            all_of[kind[i]] += 1.0
-        share = lines / all_of
-
-
-def _learn(peaks: ChromaSteps, expected: FloatArray, sigma: float) -> tuple[FloatArray, float]:
-    """Return the direction (2,) and the ratio of step to height of the frame's best stripes."""
-    step = expected @ peaks.step
-    clear: BoolArray = step > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
-    if np.count_nonzero(clear) < _MIN_LEARNED:
-        return expected, _RATIO_EXPECTED
-    # Chosen by chroma: the highest peaks may be edges of paper, which hardly move it.
-    best = clear & (step >= _BEST_SHARE * np.quantile(step[clear], 0.9))
-    if np.count_nonzero(best) < _MIN_LEARNED:
-        return expected, _RATIO_EXPECTED
-    mean = np.median(peaks.step[:, best] / peaks.height[best], axis=1)
-    direction: FloatArray = mean / np.linalg.norm(mean)
-    ratios = (direction @ peaks.step[:, best]) / peaks.height[best]
-    return direction, max(float(np.quantile(ratios, _LEARNED_QUANTILE)), _RATIO_LEAST)
+            peaks[kind[i]] += 1.0
+        share = lines / peaks

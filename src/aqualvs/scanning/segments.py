@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
     borrowing_kernel,
     inline_borrowing_kernel,
@@ -83,6 +83,27 @@ def link_segments(returns: Returns, search: StripeSearch) -> Segments:
 
 
 @kernel
+def on_long_segments(line: IntArray, position: FloatArray) -> BoolArray:
+    """Mark the returns (N,) that belong to long segments, wherever they run.
+
+    Parameters
+    ----------
+    line, position
+        As in `Returns`.
+    """
+    n = line.shape[0]
+    n_lines = line[n - 1] + 1 if n else 0
+    segment_of = np.empty(n, np.int64)
+    first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    anywhere = np.full(n_lines, -np.inf), np.full(n_lines, np.inf)
+    _link(line, position, anywhere[0], anywhere[1], segment_of, first, last, count)
+    long = np.empty(n, np.bool_)
+    for i in range(n):
+        long[i] = count[segment_of[i]] >= _LONG_SEGMENT
+    return long
+
+
+@kernel
 def segment_returns(
     line: IntArray,
     position: FloatArray,
@@ -134,8 +155,8 @@ def _still_due(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: Fl
 def _link(
     line: IntArray,
     position: FloatArray,
-    lowest: IntArray,
-    highest: IntArray,
+    lowest: IntArray | FloatArray,
+    highest: IntArray | FloatArray,
     segment_of: IntArray,
     first: IntArray,
     last: IntArray,

@@ -23,11 +23,9 @@ U8Array: TypeAlias = NDArray[np.uint8]
 _MAX_CONTRAST = 120
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
-# Noise is measured on one search line of so many. It reaches so many times the distance from the
-# median to the upper quartile in one pixel of about two thousand, were it normally distributed.
-_NOISE_EVERY, _NOISE_QUARTILES = 16, 5.0
 # Pixels are skipped eight at a time where none stands out.
-_WORD = 8
+_WORD, _WORD_BITS, _IN_WORD = 8, 3, 7
+_NOTHING = np.uint64(0)
 _BRIGHT = np.uint8(255)
 POSITION, HEIGHT, WIDTH, STEP_U, STEP_V, IMBALANCE, TINT = range(7)
 """Rows of a table of peaks."""
@@ -42,7 +40,7 @@ class StripeOptions:
     ----------
     min_contrast : int
         Smallest height of a return above its background, in grey levels; more is asked for where
-        the picture is noisy.
+        hardly any return of that height is a laser's.
     reach_share : float
         How far the background is looked for on each side, as a share of the image width; must
         exceed the width of the widest stripe.
@@ -50,7 +48,9 @@ class StripeOptions:
         Returns whose colour is less likely a laser's are left out, 0 to 1. Only used where the
         source has colour.
     min_share : float
-        Returns lower than this share of the frame's bright returns (their 90 % quantile) are noise.
+        Returns lower than this share of the frame's bright returns (their 90 % quantile) are kept
+        only where many follow one another, as on a distant wall or of a weak laser; others are
+        noise, or the glow beside a strand.
     max_returns : int
         Returns kept per frame and search direction; where there are more, the contrast threshold
         is doubled until there are not.
@@ -58,8 +58,8 @@ class StripeOptions:
 
     min_contrast: int = 6
     reach_share: float = 0.045
-    min_likelihood: float = 0.1
-    min_share: float = 0.05
+    min_likelihood: float = 0.3
+    min_share: float = 0.25
     max_returns: int = 16384
 
     def __post_init__(self) -> None:
@@ -165,27 +165,16 @@ class PeakFinder:
         self._lowest, self._highest = lowest, highest
         self._reach_px, self._directions = reach_px, directions
         padded, minima, spare = np.full((3, length + 2 * reach_px), 255, np.uint8)
-        # The word after the last one stays empty and ends every run.
-        background, above = np.zeros((2, (length // _WORD + 2) * _WORD), np.uint8)
+        # With room for a gap and a mark after the last pixel.
+        background, above = np.zeros((2, (length // _WORD + 3) * _WORD), np.uint8)
         words = above.view(np.uint64)
         self._scratch = _Scratch(padded, minima, spare, background, above, words)
         self._line = np.empty(capacity, np.int64)
         self._table = np.empty((N_MEASURES, capacity))
 
-    def noise_contrast(self, image: SearchImage) -> float:
-        """Return the contrast that noise and texture hardly ever reach, in grey levels.
-
-        From the median and the upper quartile of all pixels' contrast: stripes cover few of them.
-        """
-        count = np.zeros(256, np.int64)
-        _count_contrasts(
-            image.lines, self._lowest, self._highest, self._reach_px, self._scratch, count
-        )
-        up_to = np.cumsum(count)
-        median, quartile = np.searchsorted(up_to, np.array([0.5, 0.75]) * up_to[-1])
-        return float(median + _NOISE_QUARTILES * (quartile - median))
-
-    def find(self, image: SearchImage, min_contrast: int) -> tuple[IntArray, FloatArray]:
+    def find(
+        self, image: SearchImage, min_contrast: int, every: int = 1
+    ) -> tuple[IntArray, FloatArray]:
         """Find the peaks of one frame.
 
         Parameters
@@ -195,6 +184,8 @@ class PeakFinder:
         min_contrast : int
             Least height above the background, in grey levels; doubled where noise makes more peaks
             than there is room for.
+        every : int
+            Look at one search line of so many.
 
         Returns
         -------
@@ -209,6 +200,7 @@ class PeakFinder:
                 self._lowest,
                 self._highest,
                 min_contrast,
+                every,
                 self._reach_px,
                 self._directions,
                 self._scratch,
@@ -221,31 +213,12 @@ class PeakFinder:
 
 
 @borrowing_kernel
-def _count_contrasts(
-    lines: U8Array,
-    lowest: IntArray,
-    highest: IntArray,
-    reach_px: int,
-    scratch: _Scratch,
-    count: IntArray,
-) -> None:
-    """Count the contrasts of the pixels within the bands, on some lines."""
-    for x in range(0, lowest.shape[0], _NOISE_EVERY):
-        if lowest[x] > highest[x]:
-            continue
-        row, first = lines[x], lowest[x]
-        end = min(highest[x] + 1, row.shape[0])
-        _mark_above(row, first, end, 255, reach_px, scratch)
-        for i in range(end - first):
-            count[np.int64(row[first + i]) - np.int64(scratch.background[i])] += 1
-
-
-@borrowing_kernel
 def _find_peaks(
     image: SearchImage,
     lowest: IntArray,
     highest: IntArray,
     min_contrast: int,
+    every: int,
     reach_px: int,
     directions: FloatArray,
     scratch: _Scratch,
@@ -254,7 +227,7 @@ def _find_peaks(
 ) -> int:
     """Write the search line and the measures of each peak; return how many."""
     n = 0
-    for x in range(lowest.shape[0]):
+    for x in range(0, lowest.shape[0], every):
         if lowest[x] > highest[x]:
             continue
         row = image.lines[x]
@@ -262,18 +235,20 @@ def _find_peaks(
         first = max(lowest[x] - reach_px, 0)
         end = min(highest[x] + reach_px + 1, row.shape[0])
         _mark_above(row, first, end, min_contrast, reach_px, scratch)
-        start = _next_set(scratch, 0, end - first)
+        background = scratch.background
+        start = _next_set(scratch, 0)
         while start < end - first:
             stop = start
             while scratch.above[stop]:
                 stop += 1
             if first + start <= highest[x] and first + stop > lowest[x]:
-                base = scratch.background[start]
-                run = (first + start, first + stop)
-                n = _measure_run(image, x, run, base, reach_px, directions, line, table, n)
+                run = (start, stop)
+                n = _measure_run(
+                    image, x, first, run, background, reach_px, directions, line, table, n
+                )
                 if n == line.shape[0]:
                     return n
-            start = _next_set(scratch, stop, end - first)
+            start = _next_set(scratch, stop)
     return n
 
 
@@ -308,7 +283,9 @@ def _mark_above(
         base = left[i] if left[i] > right[i] else right[i]
         background[i] = base
         above[i] = np.uint8(np.uint8(pixels[i] - base) >= least)
-    above[n : (n // _WORD + 2) * _WORD] = np.uint8(0)
+    # A gap, then a mark that ends the search for the next run.
+    above[n : n + _WORD] = np.uint8(0)
+    above[n + _WORD] = np.uint8(1)
 
 
 @inline_borrowing_kernel
@@ -318,41 +295,50 @@ def _copy(source: U8Array, out: U8Array) -> None:
 
 
 @inline_borrowing_kernel
-def _next_set(scratch: _Scratch, at: int, end: int) -> int:
-    """Return the first marked pixel from `at` on; `end` if there is none."""
-    while at < end:
-        if at % _WORD == 0 and scratch.words[at // _WORD] == 0:
-            at += _WORD
-        elif scratch.above[at]:
+def _next_set(scratch: _Scratch, at: int) -> int:
+    """Return the first marked pixel from `at` on; there is one beyond the last pixel."""
+    above, words = scratch.above, scratch.words
+    while at & _IN_WORD:
+        if above[at]:
             return at
-        else:
-            at += 1
-    return end
+        at += 1
+    word = at >> _WORD_BITS
+    while words[word] == _NOTHING:
+        word += 1
+    at = word << _WORD_BITS
+    while not above[at]:
+        at += 1
+    return at
 
 
 @inline_borrowing_kernel
 def _measure_run(
     image: SearchImage,
     x: int,
+    first: int,
     run: tuple[int, int],
-    base: np.uint8,
+    background: U8Array,
     reach_px: int,
     directions: FloatArray,
     line: IntArray,
     table: FloatArray,
     n: int,
 ) -> int:
-    """Append the peaks of a run [start, end) of search line `x`; return their new number."""
-    start, end = run
+    """Append the peaks of a run of search line `x`; return their new number.
+
+    The run [start, end) and the background count from position `first` on.
+    """
     row = image.lines[x]
+    start, end = first + run[0], first + run[1]
+    base = np.int64(background[run[0]])
     low = max(start - reach_px, 0)
     # Beyond the run the profile may still be falling towards half height.
     high = min(end + reach_px, row.shape[0]) - 1
     while start < end and n < line.shape[0]:
-        peak, start = _next_peak(row, start, end, np.int64(base))
+        peak, start = _next_peak(row, start, end, base)
         last = high if start >= end else start
         # Twice the grey levels keep half a level a whole number.
-        level = np.int64(row[peak]) + np.int64(base)
+        level = np.int64(row[peak]) + np.int64(background[peak - first])
         a, b = _feet(row, peak, low, last, level)
         low = start
         if a < 0:
@@ -474,15 +460,15 @@ def _measure_chroma(
 
 @inline_borrowing_kernel
 def _chroma(image: SearchImage, x: int, position: int) -> tuple[float, float]:
-    """Return U and V at a position, the mean over three neighbours along the stripe."""
-    limit = image.u.shape[1] if image.along_x else image.u.shape[0]
-    across = image.u.shape[0] if image.along_x else image.u.shape[1]
-    p = min(max(position, 0) >> 1, limit - 1)
-    q = (x * image.line_px) >> 1
+    """Return U and V at a position of a search line, the mean over neighbours along the stripe."""
+    p, q = max(position, 0) >> 1, (x * image.line_px) >> 1
     u, v = np.int64(0), np.int64(0)
-    for k in range(-1, 2):
-        c = min(max(q + k, 0), across - 1)
-        i, j = (c, p) if image.along_x else (p, c)
-        u += image.u[i, j]
-        v += image.v[i, j]
+    if image.along_x:
+        p = min(p, image.u.shape[1] - 1)
+        for i in (max(q - 1, 0), min(q, image.u.shape[0] - 1), min(q + 1, image.u.shape[0] - 1)):
+            u, v = u + image.u[i, p], v + image.v[i, p]
+    else:
+        p = min(p, image.u.shape[0] - 1)
+        for j in (max(q - 1, 0), min(q, image.u.shape[1] - 1), min(q + 1, image.u.shape[1] - 1)):
+            u, v = u + image.u[p, j], v + image.v[p, j]
     return u / 3.0, v / 3.0
