@@ -42,9 +42,9 @@ _LEARNED_QUANTILE = 0.35
 _LEAST_SIGMA = 0.7
 # Heights that are counted as one kind, and how often the shares of lines among them are refined.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
-# Peaks below a height of which no more than this share are clearly lines are not looked at; up to
-# the height given.
-_USEFUL_SHARE, _CLEARLY, _HIGHEST_USEFUL = 0.03, 0.8, 32
+# Heights of which no more than this share of a sample's peaks are clearly lines are not looked at; of
+# fewer peaks a few chance ones may be. Up to the height given.
+_USEFUL_SHARE, _CLEARLY, _FEW_PEAKS, _HIGHEST_USEFUL = 0.05, 0.8, 100, 32
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
 # Nothing is more certain than e to this power.
@@ -230,12 +230,11 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
         kind = _kind_of(height[i])
         peaks[kind] += 1.0
         lines[kind] += likelihood[i] > _CLEARLY
-    n_useless, n_lines, n_peaks = 0, 0.0, 0.0
-    for kind in range(_N_KINDS):
-        n_lines += lines[kind]
-        n_peaks += peaks[kind]
-        if n_lines <= _USEFUL_SHARE * n_peaks:
-            n_useless = kind + 1
+    n_useless = 0
+    while n_useless < _N_KINDS and lines[n_useless] <= _USEFUL_SHARE * max(
+        peaks[n_useless], _FEW_PEAKS
+    ):
+        n_useless += 1
     return min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), _HIGHEST_USEFUL)
 
 
