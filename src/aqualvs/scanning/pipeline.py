@@ -7,6 +7,8 @@ import numpy as np
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
+from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Tested, Verdict, widened
+from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
@@ -16,7 +18,13 @@ from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
 from aqualvs.scanning.stripe import Returns, StripeOptions
-from aqualvs.scanning.surfaces import MIN_LINES_PER_LASER, Surface, find_surfaces
+from aqualvs.scanning.surfaces import (
+    MIN_LINES_PER_LASER,
+    Surface,
+    find_surfaces,
+    shares_light,
+    surface_on,
+)
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -66,6 +74,9 @@ class Scanner:
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
+        self._assignment = AssignmentTest(
+            self._searches, self._triangulator, searched_range(rig.working_range)
+        )
         self._planes = [one.best_plane(camera, rig.working_range) for one in sheets_of(rig)]
 
     def process(self, frame: Frame) -> Scan:
@@ -123,15 +134,37 @@ class Scanner:
             self.rig.focal_px,
         )
         target = choose_target(surfaces, self.options.target, self.rig.working_range)
+        tested = UNTESTED
+        if target is not None:
+            # The same peaks, read as other lasers', may make a plane that is as good or better.
+            tested = self._assignment.test(readings, chunks, chunk_index, target)
+            if tested.verdict is Verdict.RIVAL:
+                surfaces = self._with_rival(surfaces, target, tested, chunks)
+                target = choose_target(surfaces, self.options.target, self.rig.working_range)
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _no_target(readings, surfaces, self.options.target)
+        elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
+            found = _by_chance(readings)
+        elif tested.verdict is Verdict.AMBIGUOUS:
+            found = _ambiguous(readings, target, tested)
         else:
             found = self._meter.measure(readings, chunk_index, target)
+            found = widened(found, tested)
         points = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
         return Scan(index, time_s, found.posture, points, self.rig.n_water)
+
+    def _with_rival(
+        self, surfaces: list[Surface], target: Surface, tested: Tested, chunks: Chunks
+    ) -> list[Surface]:
+        """Put the rival that explains the picture better in place of a surface."""
+        rival = surface_on(tested.other, chunks, len(self.rig.lasers), self.rig.focal_px)
+        kept = [
+            one for one in surfaces if one is not target and not shares_light(one, rival, chunks)
+        ]
+        return [rival, *kept]
 
     def _filtered(self, readings: Readings) -> Readings:
         if self.options.mesh_filter is None or not len(readings):
@@ -146,6 +179,17 @@ class Scanner:
                 working_range=self.rig.working_range,
             )
         return readings.where(kept)
+
+
+def _by_chance(readings: Readings) -> Measurement:
+    detail = "the best plane is small, and lasers that should be seen on it are not"
+    return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(readings), np.bool_))
+
+
+def _ambiguous(readings: Readings, target: Surface, tested: Tested) -> Measurement:
+    one, other = target.plane.offset, tested.other.offset
+    detail = f"planes at {one:.3f} m and {other:.3f} m explain the stripes about as well"
+    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(readings), np.bool_))
 
 
 def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Measurement:
