@@ -18,10 +18,9 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.sources.planes import planes_of_image
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.random_scenes import Difficulty, random_scene
 from aqualvs.simulation.render import Renderer

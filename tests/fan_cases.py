@@ -221,7 +221,7 @@ def returns_from(parts: list[_Part]) -> Returns:
     apart = np.ones(len(line), np.bool_)
     apart[1:] = (np.diff(line) > 0) | (np.diff(place) > 4.0)
     n = int(apart.sum())
-    return Returns(line[apart], place[apart], height[apart], np.full(n, 5.0), np.full(n, 20.0))
+    return Returns(line[apart], place[apart], height[apart], np.full(n, 5.0), np.ones(n))
 
 
 def miscalibrated(

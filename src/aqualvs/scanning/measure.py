@@ -61,11 +61,12 @@ _LEAST_FOLDED = 12
 # So far, as a share of the range, strands may scatter about the mean plane of a folded net.
 _FOLDED_RMS_SHARE = 0.04
 _NEAR_SHARE = 0.005
-# Light that lies so near the plane (share of the range) may be the net's where nothing else explains
-# it. A net with less than these shares of its strands and of their light on the surface is folds.
-# Found on simulated nets: folded ones reach 0.43 and 0.51, flat ones in strong sun and those with
-# growth come down to 0.34 and 0.57, or to 0.56 and 0.29.
-_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT = 0.06, 0.45, 0.54
+# Light that lies so near the plane (share of the range) may be the net's where nothing else
+# explains it. A net with less than the first shares of its strands and of their light on the
+# surface is folds; with more than the last of light there is doubt only, as beside a single fold.
+# Found on simulated nets: folded ones reach 0.43 and 0.51, with a single fold 0.37 and 0.48; flat
+# ones in strong sun and those with growth come down to 0.34 and 0.57, or to 0.56 and 0.29.
+_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT, _DOUBTED_LIGHT = 0.06, 0.45, 0.54, 0.47
 # Independent pieces of stripe that the second best laser must show.
 _MIN_PIECES = 3
 
@@ -190,7 +191,7 @@ class PostureMeter:
             best = _doubted(flat, curved, 1.0)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         whole = self._followed(readings, best.rests_on, plane, patch)
-        folded = self._folded(readings, whole, off, plane, patch)
+        folded = self._folded(readings, whole, off, plane, patch, best)
         best = folded or self._weighed(readings, whole, plane, patch, best, best is curved)
         return replace(best, whole=whole)
 
@@ -221,6 +222,7 @@ class PostureMeter:
         off: FloatArray,
         plane: Plane,
         patch: FloatArray,
+        best: Measurement,
     ) -> Measurement | None:
         """Return the posture to the mean plane of a net most of whose light is off the surface.
 
@@ -234,11 +236,11 @@ class PostureMeter:
         near = _NEAR_SHARE * plane.offset
         if share_near(seen.pieces.points, patch, near) >= _FOLDED_STRANDS:
             return None
-        if light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near) >= (
-            _FOLDED_LIGHT
-        ):
-            return None
-        return self._mean(readings, seen, plane)
+        light = light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near)
+        mean = self._mean(readings, seen, plane) if light < _FOLDED_LIGHT else None
+        if mean is None or light < _DOUBTED_LIGHT:
+            return mean
+        return _doubted(best, mean, 1.0 - light)
 
     def _mean(self, readings: Readings, seen: "_Seen", plane: Plane) -> Measurement | None:
         """Measure the posture to the mean plane of a folded net."""

@@ -4,10 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Tested, Verdict, widened
+from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Verdict, widened
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
@@ -25,7 +26,7 @@ from aqualvs.scanning.surfaces import (
     shares_light,
     surface_on,
 )
-from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.target import TargetKind, choose_target, read_as_wanted
 from aqualvs.scanning.triangulate import Triangulator
 
 
@@ -133,21 +134,22 @@ class Scanner:
             searched_range(self.rig.working_range),
             self.rig.focal_px,
         )
+        surfaces = read_as_wanted(surfaces, self.options.target)
         target = choose_target(surfaces, self.options.target, self.rig.working_range)
         tested = UNTESTED
         if target is not None:
             # The same peaks, read as other lasers', may make a plane that is as good or better.
             tested = self._assignment.test(readings, chunks, chunk_index, target)
-            if tested.verdict is Verdict.RIVAL:
-                surfaces = self._with_rival(surfaces, target, tested, chunks)
+            if tested.verdict is Verdict.RIVAL and tested.other is not None:
+                surfaces = self._with_rival(surfaces, target, tested.other, chunks)
                 target = choose_target(surfaces, self.options.target, self.rig.working_range)
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _no_target(readings, surfaces, self.options.target)
         elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
             found = _by_chance(readings)
-        elif tested.verdict is Verdict.AMBIGUOUS:
-            found = _ambiguous(readings, target, tested)
+        elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
+            found = _ambiguous(readings, target.plane, tested.other)
         else:
             found = self._meter.measure(readings, chunk_index, target)
             found = widened(found, tested)
@@ -157,14 +159,14 @@ class Scanner:
         return Scan(index, time_s, found.posture, points, self.rig.n_water)
 
     def _with_rival(
-        self, surfaces: list[Surface], target: Surface, tested: Tested, chunks: Chunks
+        self, surfaces: list[Surface], target: Surface, other: Plane, chunks: Chunks
     ) -> list[Surface]:
         """Put the rival that explains the picture better in place of a surface."""
-        rival = surface_on(tested.other, chunks, len(self.rig.lasers), self.rig.focal_px)
+        rival = surface_on(other, chunks, len(self.rig.lasers), self.rig.focal_px)
         kept = [
             one for one in surfaces if one is not target and not shares_light(one, rival, chunks)
         ]
-        return [rival, *kept]
+        return read_as_wanted([rival, *kept], self.options.target)
 
     def _filtered(self, readings: Readings) -> Readings:
         if self.options.mesh_filter is None or not len(readings):
@@ -186,9 +188,12 @@ def _by_chance(readings: Readings) -> Measurement:
     return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(readings), np.bool_))
 
 
-def _ambiguous(readings: Readings, target: Surface, tested: Tested) -> Measurement:
-    one, other = target.plane.offset, tested.other.offset
-    detail = f"planes at {one:.3f} m and {other:.3f} m explain the stripes about as well"
+def _ambiguous(readings: Readings, one: Plane, other: Plane) -> Measurement:
+    apart = np.rad2deg(np.arccos(min(float(one.normal @ other.normal), 1.0)))
+    detail = (
+        f"planes at {one.offset:.3f} m and {other.offset:.3f} m, {apart:.1f} deg apart, explain "
+        "the stripes about as well"
+    )
     return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(readings), np.bool_))
 
 

@@ -64,6 +64,8 @@ class Surface:
         Whether its stripes are broken as those on a net are.
     is_gappy : bool
         Whether they are broken at least, as on a dense net or in a net's shadows.
+    is_unbroken : bool
+        Whether much of the light is in long stretches all the same, as on a table with gaps.
     n_pieces : int
         Planes that were joined, because a folded or bent net goes on from one to the next. `plane`
         is then that of the largest, or their mean where none of them has half of the light.
@@ -77,6 +79,7 @@ class Surface:
     extent: float
     is_mesh: bool
     is_gappy: bool = False
+    is_unbroken: bool = False
     n_pieces: int = 1
 
 
@@ -183,6 +186,7 @@ def _describe(
         extent=pattern.extent,
         is_mesh=pattern.is_mesh and on_strands,
         is_gappy=pattern.is_gappy and on_strands,
+        is_unbroken=pattern.is_unbroken,
     )
 
 
