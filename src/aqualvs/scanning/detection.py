@@ -192,7 +192,7 @@ class FrameDetector:
         """
         if has_colour:
             colours = [
-                learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY)
+                learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY, is_sample=True)
                 for colour in self._colours
             ]
             return useful_height(sample[HEIGHT], self._likelihood(sample, colours)), colours
