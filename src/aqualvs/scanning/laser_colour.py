@@ -59,7 +59,7 @@ _WHITE = 225.0
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
 # The largest of three normal numbers is so many standard deviations above their mean.
-_LARGEST_OF_THREE = 0.85
+_LARGEST_OF_THREE, _QUIET = 0.85, 1.4
 # Nothing is more certain than e to this power.
 _MAX_LOG_ODDS = 12.0
 
@@ -374,7 +374,11 @@ def _weigh(
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         size = math.hypot(step_u, step_v)
         # A step is the largest of three, so that noise alone has one.
-        left = max(1.0 - _LARGEST_OF_THREE * sigma / size, 0.0) if size > 0.0 else 0.0
+        left = (
+            max(1.0 - _LARGEST_OF_THREE * max(sigma - _QUIET, 0.0) / size, 0.0)
+            if size > 0.0
+            else 0.0
+        )
         step_u, step_v = left * step_u, left * step_v
         along, across = u * step_u + v * step_v, v * step_u - u * step_v
         # More of the colour than expected is no evidence against a line.
