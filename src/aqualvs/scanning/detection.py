@@ -8,6 +8,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_colour import (
+    HIGHEST_USEFUL,
     LineColour,
     channel_image,
     element_at,
@@ -32,9 +33,9 @@ from aqualvs.scanning.threshold import ThresholdDetector, ThresholdOptions
 
 DetectorOptions = StripeOptions | ThresholdOptions
 
-# One search line of so many is looked at first. In a grey picture so many peaks on a search line
-# are looked at, more of them than stripes and clutter make.
-_SAMPLE_EVERY, _PEAKS_PER_LINE = 48, 12
+# One search line of so many is looked at first. So many times as many peaks as the lasers can make
+# are looked at, if they are not high.
+_SAMPLE_EVERY, _MOST_PEAKS = 48, 3.0
 # What the frame's bright returns are as high as.
 _BRIGHT_QUANTILE = 0.9
 # An overexposed line is no wider than this share of the picture.
@@ -188,18 +189,19 @@ class FrameDetector:
     def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, list[LineColour | None]]:
         """Return the height from which on it pays to look, and what the lines' colours are.
 
-        Where there is no colour to tell by, as many peaks are looked at as lasers may make.
+        From that height on there are not many more peaks than the lasers can make.
         """
-        if has_colour:
-            colours = [
-                learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY, is_sample=True)
-                for colour in self._colours
-            ]
-            return useful_height(sample[HEIGHT], self._likelihood(sample, colours)), colours
-        n_lines = sum(len(lowest) for lowest, _ in self._bands.values())
-        most = _PEAKS_PER_LINE * n_lines // _SAMPLE_EVERY
+        most = _MOST_PEAKS * self._n_possible / _SAMPLE_EVERY
         heights = np.sort(sample[HEIGHT])[::-1]
-        return int(heights[most]) if len(heights) > most else 0, []
+        crowded = float(heights[int(most)]) if len(heights) > most else 0.0
+        if not has_colour:
+            return round(crowded), []
+        colours = [
+            learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY, is_sample=True)
+            for colour in self._colours
+        ]
+        useful = useful_height(sample[HEIGHT], self._likelihood(sample, colours))
+        return max(useful, round(min(crowded, HIGHEST_USEFUL))), colours
 
     def _likelihood(self, table: FloatArray, known: Sequence[LineColour | None]) -> FloatArray:
         """Return how likely each peak is laser light of any of the colours.

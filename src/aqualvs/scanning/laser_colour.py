@@ -54,8 +54,8 @@ _LEAST_SIGMA = 0.7
 # Heights that are counted as one kind, and how often the shares of lines among them are refined.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
 # Heights of which so few, or no more than this share, of a sample's peaks are clearly lines are not
-# looked at, up to the height given.
-_FEW_LINES, _USEFUL_SHARE, _CLEARLY, _HIGHEST_USEFUL = 4, 0.05, 0.8, 32
+# looked at.
+_FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
 # A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
 _WHITE = 225.0
 # A quarter of a normal distribution lies within this many standard deviations.
@@ -65,6 +65,9 @@ _QUARTER_OF_NORMAL = 0.3186
 _LARGEST_OF_THREE, _QUIET = 0.85, 1.4
 # Nothing is more certain than e to this power.
 _MAX_LOG_ODDS = 12.0
+
+HIGHEST_USEFUL = 32
+"""Peaks of so many grey levels are always looked at."""
 
 
 class LaserColour(Enum):
@@ -349,7 +352,7 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
         lines[n_useless] < _FEW_LINES or lines[n_useless] <= _USEFUL_SHARE * peaks[n_useless]
     ):
         n_useless += 1
-    return min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), _HIGHEST_USEFUL)
+    return float(min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), HIGHEST_USEFUL))
 
 
 @kernel
@@ -396,6 +399,9 @@ def _weigh(
             beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
             off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
         log_odds = 0.5 * (off_paint - off_line**2 / var_along - across**2 / var_across)
+        if size > _CLEAR_SIGMAS * sigma and along < _LEAST_COSINE * left * size:
+            # Light of another colour.
+            log_odds = -_MAX_LOG_ODDS
         odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))
         kind[i] = _kind_of(height)
     share = np.full(_N_KINDS, 0.5)

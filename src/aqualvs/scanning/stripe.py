@@ -29,6 +29,8 @@ _NOTHING = np.uint64(0)
 _BRIGHT = np.uint8(255)
 # Luma of flanks that are dark; black is 16.
 _DARK = 36.0
+# Flanks that differ by more than this share of a peak's height are not both background.
+_OTHER_STRIPE = 0.25
 POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V = range(9)
 """Rows of a table of peaks."""
 N_MEASURES = 9
@@ -437,12 +439,19 @@ def _measure_chroma(
     The peak's is that of its middle or of an edge, whichever is more of the laser's colour: a
     saturated core is white.
     """
-    edge, flank = int(0.5 * width) + 1, int(width) + 4
-    u_before, v_before = _chroma(image, x, peak - flank)
-    u_after, v_after = _chroma(image, x, peak + flank)
-    u_flank, v_flank = 0.5 * (u_before + u_after), 0.5 * (v_before + v_after)
     row = image.lines[x]
-    luma = 0.5 * row[max(peak - flank, 0)] + 0.5 * row[min(peak + flank, row.shape[0] - 1)]
+    edge, flank = int(0.5 * width) + 1, int(width) + 4
+    before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
+    u_before, v_before = _chroma(image, x, before)
+    u_after, v_after = _chroma(image, x, after)
+    # Where one flank is much brighter, another stripe lies there.
+    difference = np.int64(row[before]) - np.int64(row[after])
+    weight = 0.5
+    if abs(difference) > _OTHER_STRIPE * measures[HEIGHT]:
+        weight = 1.0 if difference < 0 else 0.0
+    u_flank = weight * u_before + (1.0 - weight) * u_after
+    v_flank = weight * v_before + (1.0 - weight) * v_after
+    luma = weight * row[before] + (1.0 - weight) * row[after]
     best = -np.inf
     for k in range(directions.shape[0]):
         along_u, along_v = directions[k, 0], directions[k, 1]
