@@ -23,6 +23,16 @@ class Detector(Protocol):
 DetectorOptions = StripeOptions | ThresholdOptions
 
 
+class _OnView:
+    """The threshold detector, given a search view without its margin."""
+
+    def __init__(self, detector: ThresholdDetector, length: int) -> None:
+        self._detector, self._length = detector, length
+
+    def detect(self, view: SearchView) -> Returns:
+        return self._detector.detect(view.lines[:, : self._length])
+
+
 class FrameDetector:
     """Detects stripes in frames of one size, within the bands of all lasers.
 
@@ -81,5 +91,6 @@ def _make_detector(
     lowest: IntArray = np.min([search.lowest for search in searches], axis=0)
     highest: IntArray = np.max([search.highest for search in searches], axis=0)
     if isinstance(options, ThresholdOptions):
-        return ThresholdDetector(axis, size_px, lowest, highest, options)
+        length = size_px[0] if axis is SearchAxis.ALONG_X else size_px[1]
+        return _OnView(ThresholdDetector(axis, size_px, lowest, highest, options), length)
     return StripeDetector(axis, size_px, lowest, highest, options)

@@ -1,18 +1,20 @@
-"""The paper's stripe detection, for comparison: pixels above one threshold (section 3.1)."""
+"""The paper's stripe detection, for comparison: every pixel above one threshold (section 3.1).
+
+Bright pixels that follow one another on a search line are one return: position and width say
+exactly which they are, and `pixels_of_returns` gives them back one by one.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.contrast import BLOCK
-from aqualvs.scanning.lanes import U8Array, whole_lanes
-from aqualvs.scanning.runs import Runs
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.view import SearchView
+
+_LEVELS = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,12 +25,15 @@ class ThresholdOptions:
     ----------
     level : int
         Pixels at least this bright are laser light, in grey levels.
-    max_returns : int
-        Returns kept per frame and search direction; what exceeds it is dropped.
+    max_returns, max_pixels : int
+        Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where
+        there are more, the lowest higher level is used at which there are not; if even white is
+        too much, the frame has no returns.
     """
 
     level: int = 140
     max_returns: int = 16384
+    max_pixels: int = 131072
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
@@ -37,10 +42,7 @@ class ThresholdOptions:
 
 
 class ThresholdDetector:
-    """Finds runs of bright pixels along every search line of one direction.
-
-    Each run gives one return at its middle, to half a pixel. The paper takes every bright pixel
-    as a point, which has the same mean.
+    """Finds the bright pixels on every search line of one direction, inside its band.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ class ThresholdDetector:
     size_px : (int, int)
         Image width and height.
     lowest, highest : int array, shape (n_lines,)
-        First and last position of interest on each line.
+        First and last position of interest on each line (an empty interval skips the line).
     options : ThresholdOptions
         Options.
     """
@@ -62,31 +64,98 @@ class ThresholdDetector:
         highest: IntArray,
         options: ThresholdOptions,
     ) -> None:
-        along_x = axis is SearchAxis.ALONG_X
-        length = size_px[0] if along_x else size_px[1]
-        self._finder = Runs(length, lowest, highest, options.max_returns)
-        # One grey level below the threshold everywhere: what stands above it by one is bright.
-        n_blocks = whole_lanes(length) // BLOCK
-        self._below: U8Array = np.full((len(lowest), n_blocks), options.level - 1, np.uint8)
+        self._options = options
+        length = size_px[0] if axis is SearchAxis.ALONG_X else size_px[1]
+        along = np.arange(length)
+        self._in_band: BoolArray = (lowest[:, None] <= along) & (along <= highest[:, None])
+        # Zero outside the band; the zeros of one more column end the runs of every line.
+        self._lines: NDArray[np.uint8] = np.zeros((len(lowest), length + 1), np.uint8)
 
-    def detect(self, view: SearchView) -> Returns:
-        """Find the returns of one frame; colour is not looked at."""
-        runs = self._finder.find(view.lines, self._below, 1, self._finder.in_band)
-        n = len(runs)
+    def detect(self, lines: NDArray[np.uint8]) -> Returns:
+        """Find the runs of bright pixels of one frame; colour is not looked at.
+
+        Parameters
+        ----------
+        lines : uint8 array, shape (n_lines, length)
+            Luma, with search lines as rows.
+
+        Returns
+        -------
+        found : Returns
+            Position is the middle of a run, width the number of its pixels, height its brightest
+            value.
+        """
+        np.multiply(lines, self._in_band, out=self._lines[:, :-1])
+        flat = self._lines.ravel()
+        first, end = _runs(flat, self._options.level)
+        if len(first) > self._options.max_returns or np.sum(end - first) > self._options.max_pixels:
+            first, end = _runs(flat, self._raised_level(flat))
+        line, start = np.divmod(first, self._lines.shape[1])
+        width = end - first
         return Returns(
-            line=runs[:, 0].copy(),
-            position=0.5 * (runs[:, 1] + runs[:, 2]).astype(np.float64),
-            height=_peaks(view.lines, runs),
-            width=(runs[:, 2] - runs[:, 1] + 1).astype(np.float64),
-            green_fall=np.full(n, np.nan),
+            line=line,
+            position=start + 0.5 * (width - 1),
+            height=_brightest(flat, first, end),
+            width=width.astype(np.float64),
+            green_fall=np.full(len(first), np.nan),
         )
 
+    def _raised_level(self, flat: NDArray[np.uint8]) -> int:
+        """Return the lowest level at which both limits hold; 256 where none is."""
+        # A run begins where a pixel reaches a level and the one before it does not.
+        inside = np.minimum(flat[1:], flat[:-1])
+        n_pixels, n_inside = _counts_from(flat), _counts_from(inside)
+        fits = n_pixels <= self._options.max_pixels
+        fits &= n_pixels - n_inside <= self._options.max_returns
+        fits[: self._options.level] = False
+        return int(np.argmax(fits)) if fits.any() else _LEVELS
 
-@kernel
-def _peaks(lines: U8Array, runs: IntArray) -> FloatArray:
-    """Brightest value of each run (line, first, last)."""
-    peaks = np.zeros(runs.shape[0])
-    for i in range(runs.shape[0]):
-        for v in range(runs[i, 1], runs[i, 2] + 1):
-            peaks[i] = max(peaks[i], float(lines[runs[i, 0], v]))
-    return peaks
+
+def pixels_of_returns(position: FloatArray, width: FloatArray) -> tuple[IntArray, FloatArray]:
+    """List the pixels that returns are made of, along their search lines.
+
+    A return of the threshold detector gives its bright pixels, each once; a sub-pixel one those
+    above half its height, at least one.
+
+    Parameters
+    ----------
+    position, width : array, shape (N,)
+        As in `Returns`.
+
+    Returns
+    -------
+    source : int array, shape (M,)
+        Row of the return that each pixel belongs to, ascending.
+    place : array, shape (M,)
+        Whole position of each pixel.
+    """
+    first, last = np.ceil(position - 0.5 * width), np.floor(position + 0.5 * width)
+    none = last < first
+    first, last = np.where(none, np.rint(position), first), np.where(none, np.rint(position), last)
+    count = (last - first).astype(np.int64) + 1
+    source = np.repeat(np.arange(len(count)), count)
+    step = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
+    return source, first[source] + step
+
+
+def _runs(flat: NDArray[np.uint8], level: int) -> tuple[IntArray, IntArray]:
+    """Return where runs of bright pixels begin and, one place later, where they end."""
+    if level >= _LEVELS:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    bright = flat >= level
+    edges = np.flatnonzero(bright[1:] != bright[:-1]) + 1
+    if bright[0]:
+        edges = np.concatenate([[0], edges])
+    return edges[::2], edges[1::2]
+
+
+def _counts_from(values: NDArray[np.uint8]) -> IntArray:
+    """Return how many values are at least 0, 1, ... 255."""
+    return np.cumsum(np.bincount(values, minlength=_LEVELS)[::-1])[::-1]
+
+
+def _brightest(flat: NDArray[np.uint8], first: IntArray, end: IntArray) -> FloatArray:
+    if not len(first):
+        return np.empty(0)
+    bounds = np.column_stack([first, end]).ravel()
+    return np.maximum.reduceat(flat, bounds)[::2].astype(np.float64)
