@@ -4,20 +4,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from aqualvs.geometry.arrays import BoolArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
-from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
+from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.scanning.paper_filter import PaperFilter
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
 from aqualvs.scanning.stripe import Returns, StripeOptions
 from aqualvs.scanning.surfaces import MIN_LINES_PER_LASER, Surface, find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.threshold import ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 
 
@@ -30,7 +32,8 @@ class ScannerOptions:
     detector : StripeOptions or ThresholdOptions
         Which stripe detector, and how.
     mesh_filter : MeshFilterOptions or None
-        The paper's mesh filter in front of the search for surfaces; off by default.
+        The paper's mesh filter; off by default. What it rejects is dropped, and the frame is
+        measured once more from the rest.
     target : TargetKind
         What the posture is measured to.
     fit : FitMethod
@@ -66,7 +69,7 @@ class Scanner:
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
-        self._planes = [one.best_plane(camera, rig.working_range) for one in sheets_of(rig)]
+        self._paper_filter = self._make_paper_filter(camera)
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -111,7 +114,24 @@ class Scanner:
             From `detect`; as they were recorded, they give what the frame gave.
         """
         # Each return read as a point of every laser that could have made it.
-        readings = self._filtered(read_returns(returns, self._searches, self._triangulator))
+        readings = read_returns(returns, self._searches, self._triangulator)
+        found, points, listed = self._measured(readings)
+        if self._paper_filter is not None:
+            # The paper's filter wants to know the laser of each return, which is known by now.
+            kept = np.zeros(len(readings), np.bool_)
+            kept[listed] = _on_mesh(self._paper_filter, points)
+            found, points, _ = self._measured(readings.where(kept))
+        return Scan(index, time_s, found.posture, points, self.rig.n_water)
+
+    def _make_paper_filter(self, camera: Camera) -> PaperFilter | None:
+        options = self.options.mesh_filter
+        if options is None:
+            return None
+        every_pixel = isinstance(self.options.detector, ThresholdOptions)
+        return PaperFilter(self.rig, camera, self._searches, options, every_pixel=every_pixel)
+
+    def _measured(self, readings: Readings) -> tuple[Measurement, ScanPoints, IntArray]:
+        """Return the posture, the labelled points, and the rows of their readings."""
         # Planes that several lasers agree on, and the one that is the target.
         chunks, chunk_index = readings.chunks()
         surfaces = find_surfaces(
@@ -128,24 +148,15 @@ class Scanner:
             found = _no_target(readings, surfaces, self.options.target)
         else:
             found = self._meter.measure(readings, chunk_index, target)
-        points = label_readings(
+        points, listed = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
-        return Scan(index, time_s, found.posture, points, self.rig.n_water)
+        return found, points, listed
 
-    def _filtered(self, readings: Readings) -> Readings:
-        if self.options.mesh_filter is None or not len(readings):
-            return readings
-        kept = np.zeros(len(readings), np.bool_)
-        for i, plane in enumerate(self._planes):
-            mine = readings.laser == i
-            kept[mine] = mesh_filter(
-                readings.points[mine],
-                plane,
-                self.options.mesh_filter,
-                working_range=self.rig.working_range,
-            )
-        return readings.where(kept)
+
+def _on_mesh(paper_filter: PaperFilter, points: ScanPoints) -> BoolArray:
+    laser = points.laser.astype(np.int64)
+    return paper_filter.apply(points.pixels, points.width, laser).returns_on_mesh(len(points))
 
 
 def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Measurement:
