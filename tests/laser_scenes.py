@@ -22,7 +22,6 @@ from aqualvs.optics.rig import Laser, Rig
 from aqualvs.simulation.example_rigs import example_rig
 
 SQUARE, SQUARES = 0.03, (12, 9)
-# How far the target's plane reaches beyond its print on every side: a wall, or hardly at all.
 _FACING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
@@ -64,24 +63,36 @@ def scene(
     clutter: Clutter,
     noise_px: float,
     margin: float = 0.1,
+    rail: bool = False,
+    shift: float = 0.0,
+    wander: float = 0.0,
 ) -> Scene:
-    """Return pictures of a board, `margin` metres larger than its print on all sides."""
+    """Return pictures of a board, `margin` metres larger than its print on all sides.
+
+    With `rail` the board only comes nearer. Lasers are moved by `shift`, and in every picture by
+    `wander` at random (metres).
+    """
     rng = np.random.default_rng(seed)
-    rig = replace(example_rig(), lasers=tuple(_lasers(rng, n_lasers)))
-    camera = rig.camera()
-    poses = [_pose(rng) for _ in range(n_views)]
-    views = [
-        _view(f"view_{i}.png", rng, rig, camera, pose, clutter, noise_px, margin)
-        for i, pose in enumerate(poses)
-    ]
+    lasers = tuple(_lasers(rng, n_lasers))
+    poses = [_on_rail(rng) if rail else _pose(rng) for _ in range(n_views)]
+    rig, views = replace(example_rig(), lasers=lasers), []
+    for i, pose in enumerate(poses):
+        moved = [_moved(laser, shift + wander * rng.standard_normal()) for laser in lasers]
+        seen = replace(rig, lasers=tuple(moved))
+        name = f"view_{i}.png"
+        views.append(_view(name, rng, seen, rig.camera(), pose, clutter, noise_px, margin))
     return Scene(rig, views)
+
+
+def _moved(laser: Laser, shift: float) -> Laser:
+    return replace(laser, plane=Plane(laser.plane.normal, laser.plane.offset + shift))
 
 
 def _lasers(rng: np.random.Generator, n: int) -> Iterator[Laser]:
     """Up to five lasers of any direction, or a pencil of near-parallel ones."""
     if n > 5:
         emitter = np.array([0.06, 0.02, rng.uniform(-0.05, 0.05)])
-        for i, angle in enumerate(np.deg2rad(np.linspace(-26.0, 12.0, n))):
+        for i, angle in enumerate(np.deg2rad(np.linspace(-18.0, 9.0, n))):
             normal = np.array([np.cos(angle), -np.sin(angle), 0.1])
             yield Laser(f"laser_{i}", Plane.from_normal(normal, float(normal @ emitter)))
         return
@@ -100,6 +111,11 @@ def _pose(rng: np.random.Generator) -> SE3:
     middle = 0.5 * SQUARE * np.array([SQUARES[0], SQUARES[1], 0.0])
     place = np.array([rng.uniform(-0.06, 0.06), rng.uniform(0.35, 0.8), rng.uniform(-0.05, 0.05)])
     return SE3(turn, place - turn @ middle)
+
+
+def _on_rail(rng: np.random.Generator) -> SE3:
+    middle = 0.5 * SQUARE * np.array([SQUARES[0], SQUARES[1], 0.0])
+    return SE3(_FACING, np.array([0.01, rng.uniform(0.35, 0.8), -0.01]) - _FACING @ middle)
 
 
 def _view(
@@ -129,7 +145,7 @@ def _view(
             chains += _sides(far, beside)
     chains += _edges(rng, pose, size, low, high, clutter.edges)
     pixels = [_seen(camera, points) for points in chains]
-    pixels += [_glint(rng, rig.size_px) for _ in range(rng.poisson(clutter.glints))]
+    pixels += [glint(rng, rig.size_px) for _ in range(rng.poisson(clutter.glints))]
     stripes = _stripes(name, rng, [p for p in pixels if len(p) >= 12], noise_px)
     x, y = np.meshgrid(np.arange(1, SQUARES[0]), np.arange(1, SQUARES[1]))
     corners = SQUARE * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
@@ -200,7 +216,7 @@ def _seen(camera: Camera, points: FloatArray) -> FloatArray:
     return found
 
 
-def _glint(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
+def glint(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
     """A chain anywhere, half of them bent."""
     angle, length = rng.uniform(0.0, np.pi), rng.uniform(30.0, 250.0)
     t = np.arange(-0.5 * length, 0.5 * length, 3.0)
@@ -224,3 +240,15 @@ def _stripes(
     chain = np.repeat(np.arange(len(chains)), [len(c) for c in chains])
     errors = noise_px * rng.standard_normal((len(pixels), 1))
     return StripePoints(name, pixels + errors * sides, sides, chain, np.full(len(pixels), 0.1))
+
+
+def joined(stripes: StripePoints, pixels: FloatArray) -> StripePoints:
+    """Return the stripes with one more chain."""
+    more = _stripes(stripes.name, np.random.default_rng(0), [pixels], 0.0)
+    return StripePoints(
+        stripes.name,
+        np.concatenate([stripes.pixels, more.pixels]),
+        np.concatenate([stripes.across, more.across]),
+        np.concatenate([stripes.chain, more.chain + stripes.chain.max(initial=-1) + 1]),
+        np.concatenate([stripes.sigma_px, more.sigma_px]),
+    )

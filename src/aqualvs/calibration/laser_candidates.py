@@ -8,7 +8,7 @@ pictures themselves. The number of points plays no part in it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln
@@ -26,8 +26,10 @@ _ALIGNED = 0.35
 # More pairs than this are sampled; so many planes are tried at a time.
 _MOST_PLANES, _AT_ONCE = 6000, 500
 # Where few accidents are seen, their rate is that of lines spread over so many pixels, with the
-# weight of so many observed planes.
+# weight of so many observed planes. By how many pixels, and how often, lines of so many pairs are
+# moved at random to see whether they meet by accident.
 _SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
+_MOVED_PX, _N_MOVES, _MOST_MOVED = 250.0, 8, 1000
 # A line nearer than this share of the tolerance is no better evidence: poses are no better.
 _NEAREST = 0.1
 # A line is met by accident as often as those of its surface that have this share of its length.
@@ -118,13 +120,13 @@ class _Hypotheses:
     worst: FloatArray
     normals: FloatArray
     offsets: FloatArray
-    n_pairs: int
+    n_expected: float
     kept_share: float
 
     @classmethod
     def of(cls, pooled: PooledStripes, table: LineTable, tolerance_px: float) -> "_Hypotheses":
         pairs = _pairs(pooled, table)
-        n_pairs = len(pairs)
+        n_expected = len(pairs) * _meeting_rate(table, pairs, tolerance_px)
         normals, offsets = _planes_of_pairs(table, pairs)
         meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
         kept = np.flatnonzero(meet)
@@ -136,7 +138,7 @@ class _Hypotheses:
         for first in range(0, len(kept), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
             worst[some] = table.worst_px(normals[some], offsets[some])
-        return cls(pairs, worst, normals, offsets, n_pairs, share)
+        return cls(pairs, worst, normals, offsets, n_expected, share)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +212,8 @@ def _accidents(
     as_long = table.length[None] >= _AS_LONG * table.length[:, None]
     rivals = (table.patch[:, None] == table.patch[None]) & as_long
     rate = np.minimum(rivals @ own_rate, 1.0)
-    n_planes = n / planes.kept_share + prior * planes.n_pairs
+    # Of pairs that meet one is the plane's own; lines elsewhere would meet as often.
+    n_planes = max(n / planes.kept_share, planes.n_expected)
     return _Accidents(rate, float(n_planes))
 
 
@@ -335,6 +338,32 @@ def _pairs_meet(
     gain = np.abs(np.einsum("pi,pski->psk", normals, table.by_across[pairs]))
     meet: BoolArray = np.all(distance <= tolerance_px * gain, axis=(1, 2))
     return meet
+
+
+def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> float:
+    """Return how often pairs (P, 2) of lines would meet if one were moved at random.
+
+    Parallel lines always meet; the farther from parallel, the less.
+    """
+    if not len(pairs):
+        return 0.0
+    rng = np.random.default_rng(1)
+    some = pairs[rng.permutation(len(pairs))[:_MOST_MOVED]]
+    met = 0
+    for _ in range(_N_MOVES):
+        moves = rng.uniform(-_MOVED_PX, _MOVED_PX, len(some))[:, None, None]
+        points = table.points[some].copy()
+        points[:, 1] += moves * table.by_across[some[:, 1]]
+        moved = replace(
+            table,
+            points=points.reshape(-1, 3, 3),
+            by_across=table.by_across[some].reshape(-1, 3, 3),
+        )
+        own = np.arange(2 * len(some)).reshape(-1, 2)
+        met += int(
+            np.count_nonzero(_pairs_meet(moved, own, *_planes_of_pairs(moved, own), tolerance_px))
+        )
+    return (met + 1.0) / (_N_MOVES * len(some) + 1.0)
 
 
 def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:

@@ -113,7 +113,8 @@ def check_count(
     if expected is None and split.undecided:
         several = "another plane" if len(split.undecided) == 1 else "further planes"
         raise CalibrationError(
-            f"{found} lasers are certain, but {several} of light may be lasers as well: "
+            f"{found} {'laser is' if found == 1 else 'lasers are'} certain, but {several} of light "
+            "may be of lasers as well: "
             f"{_planes(split.undecided, views, surfaces)}; give --lasers N, how many there are, or "
             f"{_remedy(surfaces)}"
         )
@@ -224,11 +225,12 @@ def _too_few(
     wanted = "on two places of the board that differ"
     if len(surfaces.planes) > 1:
         wanted = "on two planes of the box"
-    if split.undecided:
-        lonely += f"; undecided: {_planes(split.undecided, views, surfaces)}"
+    if split.possible:
+        lonely += f"; undecided: {_planes(split.possible, views, surfaces)}"
+    told = "give --lasers N, how many there are, or " if split.possible and not expected else ""
     return (
         f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; "
-        f"{_remedy(surfaces)}"
+        f"{told}{_remedy(surfaces)}"
     )
 
 

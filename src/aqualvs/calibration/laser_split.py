@@ -30,10 +30,12 @@ _LEAST_POINTS = 40
 _N_FITS = 5
 # A straight stripe holds this share of the chains that it is cut from, or is a chord of a curve.
 _LEAST_OF_CHAIN = 0.25
-_PERHAPS = (Verdict.WEAK, Verdict.DOUBTFUL)
 # Accidents are so many times as likely (natural logarithm) to make a plane that is clearly worse.
 _CLEARLY_WORSE = 3.0
-# In one of so many calibrations an accident makes a plane that has to be asked about.
+# Accidents that a plane which is asked for may be expected to be, at most; and one that has to be
+# asked about.
+_TOLD = float(np.log(0.2))
+_LONGER = 1.5
 _HARDLY_AN_ACCIDENT = float(np.log(0.05))
 
 
@@ -61,11 +63,18 @@ class LaserSplit:
     @property
     def undecided(self) -> tuple[JudgedPlane, ...]:
         """Planes that accidents hardly make, and that may be lasers nevertheless."""
+        return self._undecided(_HARDLY_AN_ACCIDENT)
+
+    @property
+    def possible(self) -> tuple[JudgedPlane, ...]:
+        """Planes that may be lasers if there must be more of them."""
+        return self._undecided(_TOLD)
+
+    def _undecided(self, most: float) -> tuple[JudgedPlane, ...]:
         return tuple(
             plane
             for plane in self.spare
-            if plane.verdict is not Verdict.OTHER
-            and plane.candidate.log_false_alarms <= _HARDLY_AN_ACCIDENT
+            if plane.verdict is not Verdict.OTHER and plane.candidate.log_false_alarms <= most
         )
 
     @property
@@ -102,16 +111,31 @@ def split_lasers(
     """
     lines = _all_lines(pooled)
     found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
-    n_clear = sum(plane.verdict is Verdict.LASER for plane in found)
-    n_perhaps = sum(plane.verdict in _PERHAPS for plane in found)
-    n_taken = n_clear
-    if n_lasers is not None and n_clear < n_lasers <= n_clear + n_perhaps:
-        last, after = found[n_lasers - 1], found[n_lasers : n_clear + n_perhaps]
-        if not any(_as_good(plane, last) for plane in after):
-            n_taken = n_lasers
-    planes = _refined(pooled, [p.candidate.plane for p in found[:n_taken]], tolerance_px)
+    taken = [plane for plane in found if plane.verdict is Verdict.LASER]
+    in_planes = {int(i) for plane in found for i in plane.candidate.lines}
+    lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
+    longest = max(lonely, default=0)
+    perhaps = [plane for plane in found if _may_be_laser(plane, lines, longest)]
+    missing = 0 if n_lasers is None else max(n_lasers - len(taken), 0)
+    if 0 < missing <= len(perhaps):
+        best, rest = perhaps[:missing], perhaps[missing:]
+        if not any(_as_good(plane, best[-1]) for plane in rest):
+            taken += best
+    planes = _refined(pooled, [plane.candidate.plane for plane in taken], tolerance_px)
     laser = assigned(pooled, planes, tolerance_px)
-    return LaserSplit(tuple(planes), laser, _unmatched(lines, laser), tuple(found[n_taken:]))
+    spare = tuple(plane for plane in found if plane not in taken)
+    return LaserSplit(tuple(planes), laser, _unmatched(lines, laser), spare)
+
+
+def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
+    """Return whether a plane can be a laser if there are known to be more of them.
+
+    Not if a much longer stripe, of `longest` points, is in no plane: then that may be the laser,
+    seen on one surface only.
+    """
+    perhaps = plane.verdict in (Verdict.WEAK, Verdict.DOUBTFUL)
+    own = max(len(lines[int(i)].members) for i in plane.candidate.lines)
+    return perhaps and plane.candidate.log_false_alarms <= _TOLD and longest <= _LONGER * own
 
 
 def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:

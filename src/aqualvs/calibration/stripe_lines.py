@@ -1,7 +1,6 @@
 """Straight lines among stripe points on one flat surface: where laser planes cut it."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,6 @@ _MIN_POINTS = 12
 _MIN_LENGTH_PX = 20.0
 _MAX_LINES = 40
 _N_GUESSES, _N_SAMPLED, _N_FITS = 800, 600, 3
-_SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +56,11 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     points, across = placed.points_in_dome[members], placed.by_across[members]
     along = placed.by_along[members]
     some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
-    guessed, offsets = _guesses(points, normal, pooled.chain[members], patch)
+    i, j = _pairs(pooled.chain[members], patch)
+    guessed, offsets = _guesses(points, normal, i, j)
+    # Most pairs are of two stripes, which do not run along the line through both points.
+    good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
+    guessed, offsets = guessed[good], offsets[good]
     votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
     counts = np.count_nonzero(votes, axis=0)
     lines: list[StripeLine] = []
@@ -80,24 +82,36 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     return lines
 
 
-def _guesses(
-    points: FloatArray, normal: FloatArray, chain: IntArray, seed: int
-) -> tuple[FloatArray, FloatArray]:
-    """Lines m·X = c through pairs of points, m in the surface; half of them within a chain."""
-    n = len(points)
+def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
+    """Return random pairs of points (N), half of them within a chain."""
+    n = len(chain)
     if n < 2:
-        return np.zeros((0, 3)), np.zeros(0)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     rng = np.random.default_rng(seed)
     i, j = rng.integers(0, n, (2, _N_GUESSES))
     half = slice(0, _N_GUESSES // 2)
     order = np.argsort(chain, kind="stable")
-    first, last = (np.searchsorted(chain[order], chain[i[half]], side) for side in _SIDES)
+    first = np.searchsorted(chain[order], chain[i[half]], "left")
+    last = np.searchsorted(chain[order], chain[i[half]], "right")
     j[half] = order[rng.integers(first, last)]
+    return i, j
+
+
+def _guesses(
+    points: FloatArray, normal: FloatArray, i: IntArray, j: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return lines m·X = c through pairs of points, m in the surface; NaN for equal points."""
     m = np.cross(normal, points[j] - points[i])
     length = np.linalg.norm(m, axis=1)
-    apart = length > 1e-6
-    m = m[apart] / length[apart, None]
-    return m, np.einsum("ni,ni->n", m, points[i[apart]])
+    m /= np.where(length > 1e-6, length, np.nan)[:, None]
+    return m, np.einsum("ni,ni->n", m, points[i])
+
+
+def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
+    """Return which points (N) have a stripe that runs along their line (N)."""
+    gain = np.abs(np.einsum("ni,ni->n", across, m))
+    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _ALIGNED * gain
+    return aligned
 
 
 def _near(
