@@ -221,7 +221,8 @@ def _too_few(
     lonely = ""
     if split.unmatched:
         where = sorted({_where(line.patch, views, surfaces) for line in split.unmatched[:4]})
-        lonely = f"; stripes seen on one plane only: {'; '.join(where)}"
+        what = "seen on one plane only" if len(where) == 1 else "that no certain plane explains"
+        lonely = f"; stripes {what}: {'; '.join(where)}"
     wanted = "on two places of the board that differ"
     if len(surfaces.planes) > 1:
         wanted = "on two planes of the box"
