@@ -44,7 +44,7 @@ from aqualvs.calibration.stripe_points import StripePoints
 from aqualvs.calibration.stripes_on_planes import Surfaces, board_surface, box_surfaces
 from aqualvs.calibration.target_files import load_board, load_box
 from aqualvs.calibration.view import View
-from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import load_rig
@@ -59,8 +59,6 @@ from aqualvs.scanning.whole_picture import find_stripes
 
 _DEG = 180.0 / math.pi
 _SHOTS = 6
-# More lasers than this in a box are believed only if somebody said that there are so many.
-_MOST_UNTOLD = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +114,6 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
         ),
         uncertainty=rig_uncertainty(before),
     )
-    _check_count(result, _expected(request, before) or len(before.lasers) or None, request)
     rig = _noted(before, result, request, target)
     for warning in result.warnings:
         tell(f"note: {warning}")
@@ -133,15 +130,6 @@ def _expected(request: LasersRequest, rig: Rig) -> int | None:
         return len(request.names)
     noted = rig.solved_from.get(N_LASERS)
     return noted if isinstance(noted, int) and not rig.lasers else None
-
-
-def _check_count(result: LaserCalibration, expected: int | None, request: LasersRequest) -> None:
-    n = len(result.lasers)
-    if expected is None and request.box is not None and n > _MOST_UNTOLD:
-        raise CalibrationError(
-            f"{n} lasers seem to shine in {request.images[0]}, which may be paper edges that look "
-            "like stripes; give --lasers N, how many there are"
-        )
 
 
 def _target(request: LasersRequest, rig: Rig) -> _Target:
