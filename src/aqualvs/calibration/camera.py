@@ -254,7 +254,8 @@ def _held_back(bundle: Bundle, solution: Solution[BundleState]) -> float:
     rest = [i for i in range(n) if i not in held]
     try:
         state = solve(_part(bundle, rest), _state(solution.state, rest)).state
-        return rms_px(predicted(state, [0] * len(held), [believed[i] for i in held]))
+        errors = np.concatenate(predicted(state, [0] * len(held), [believed[i] for i in held]))
+        return rms_px(errors[np.isfinite(errors).all(axis=1)])
     except CalibrationError:
         return float("nan")
 
