@@ -47,6 +47,8 @@ _WEAK_PIXEL_PX = 1.0
 _THIN_COVERAGE = 0.6
 # Variance by views over that by corners that is worth a word: sigmas half as large again.
 _SHARED_ERRORS = 2.25
+# Uncertainty of the focal length (share) that is worth a word: ranges are off by as much.
+_WEAK_FOCAL = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,7 @@ def camera(
     if bent is not None:
         bundle, solution = bent.bundle, bent.solution
     covariance = shared_covariance(bundle, solution)
-    check_camera_solution(solution, covariance.by_views, flat)
+    check_camera_solution(solution, covariance.by_corners, flat)
     result = _result(bundle, solution, covariance, left_out)
     if bent is not None:
         result = replace(result, bend_height=bent.bend.height(flat))
@@ -296,6 +298,14 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
             f"{np.sqrt(result.inflation):.1f} times larger than independent corners would make "
             "them. Usual causes: the board bends, it moves while the shutter is open, rolling "
             "shutter, autofocus"
+        )
+    sigmas, lens = result.uncertainty.sigmas, result.lens
+    focal = max(sigmas["fx"] / lens.fx, sigmas["fy"] / lens.fy)
+    if focal > _WEAK_FOCAL:
+        lines.append(
+            f"the focal length is uncertain by {100.0 * focal:.2g} %: take more views, with a "
+            "stiff board, tilted by 20 to 40 degrees to different sides, near, and in all parts of "
+            "the picture"
         )
     return lines
 

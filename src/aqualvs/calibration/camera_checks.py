@@ -60,7 +60,7 @@ def check_camera_solution(
     ----------
     solution : Solution
     covariance : array, shape (P, P)
-        Of the intrinsics: focal lengths and image centre first.
+        Of the intrinsics, by corners: focal lengths and image centre first.
     views : sequence of View
 
     Raises
