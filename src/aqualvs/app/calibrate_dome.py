@@ -87,9 +87,20 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
     shots = _all_shots(request, rig)
     result = dome(rig, [one.board_set for one in shots], _options(request))
     solved = _noted(rig, result)
-    for line in result.findings:
+    for line in (*_summary(result, shots), *result.findings):
         tell(line)
     finish(solved, _page(rig, solved, result, shots, request), request.out, "dome", tell)
+
+
+def _summary(result: DomeCalibration, shots: Sequence[_Shots]) -> list[str]:
+    """Say how many pictures were used, with what residual, and which were left out and why."""
+    n_pictures = sum(len(one.found.views) + len(one.found.missed) for one in shots)
+    used = len(result.views)
+    of = f" of {n_pictures}" if used < n_pictures else ""
+    return [
+        f"{used}{of} pictures, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
+        *(line for one in shots for line in (*one.found.remarks, *one.notes)),
+    ]
 
 
 def _with_dome(rig: Rig, request: DomeRequest) -> Rig:
@@ -187,7 +198,6 @@ def _page(
             )
         )
     missed = {name: why for one in shots for name, why in one.found.missed.items()}
-    notes = [note for one in shots for note in one.notes]
     dome_names = [name for name in DOME_PARAMETERS if name in sigmas]
     return Page(
         title="Calibration of the dome",
@@ -195,7 +205,7 @@ def _page(
         cards=tuple(cards),
         warnings=(
             *(f"{name}: {why}" for name, why in {**missed, **result.left_out}.items()),
-            *notes,
+            *(note for one in shots for note in (*one.found.notes, *one.notes)),
         ),
         words=result.findings,
         expectations=expectations(rig),
