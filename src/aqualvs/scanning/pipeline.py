@@ -1,17 +1,20 @@
 """The main path: a frame in, posture and points out."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
 from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
-from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.scanning.patch import fitted_patch
+from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
@@ -66,6 +69,7 @@ class Scanner:
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
+        self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
         self._planes = [one.best_plane(camera, rig.working_range) for one in sheets_of(rig)]
 
     def process(self, frame: Frame) -> Scan:
@@ -131,7 +135,23 @@ class Scanner:
         points = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
-        return Scan(index, time_s, found.posture, points, self.rig.n_water)
+        posture = self._with_rig_covariance(found, readings)
+        return Scan(index, time_s, posture, points, self.rig.n_water)
+
+    def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
+        """Return the posture with what the rig's own uncertainty makes of it."""
+        posture = found.posture
+        if not isinstance(posture, Posture) or found.weights is None:
+            return posture
+        m, points, weights = posture.normal_in_dome / posture.range, readings.points, found.weights
+        surface = fitted_plane(m, points)
+        if found.patch is not None:
+            # Heights over a patch are in metres, m·X is in ranges.
+            surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
+        covariance = self._rig_errors.covariance_of(
+            surface, readings.pixels, readings.laser, points, weights
+        )
+        return replace(posture, rig_covariance=covariance)
 
     def _filtered(self, readings: Readings) -> Readings:
         if self.options.mesh_filter is None or not len(readings):
