@@ -95,7 +95,7 @@ def test_the_jacobian_is_that_of_the_whole_scanner(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ("rig", "scenario"),
-    [(example_rig(), "wall_yaw"), (example_rig(), "net_diamond"), (bluerov2_rig(), "net_diamond")],
+    [(example_rig(), "wall_yaw"), (example_rig(), "net_diamond"), (bluerov2_rig(), "wall_yaw")],
     ids=["wall", "net", "wide"],
 )
 def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) -> None:
@@ -104,16 +104,18 @@ def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) ->
     times = (0.5, 1.5, 2.5)
     views = [seen(rig.name, scenario, t) for t in times]
     sigma = np.array([*uncertainty.sigmas.values()])
+    # Draws whose own second moments are exactly those of the covariance: fewer do.
+    draws = np.linalg.qr(rng.normal(size=(60, len(sigma))))[0] * np.sqrt(60)
     z = []
-    for _ in range(60):
-        moved = rig_moved_by(rig, uncertainty.names, sigma * rng.normal(size=len(sigma)))
+    for draw in draws:
+        moved = rig_moved_by(rig, uncertainty.names, sigma * draw)
         scanner = Scanner(with_uncertainty(moved, uncertainty))
         for view, truth in views:
             posture = scanner.measure(0, 0.0, view).posture
             assert isinstance(posture, Posture)
             z.append((three(posture) - truth) / np.sqrt(np.diag(posture.total_covariance)))
-    # 60 rigs give an rms to 9 %, and the noise of three views is part of it. Of stripes that
-    # disagree the robust fit drops some, so that errors are a little smaller than linear.
+    # The noise of three views is part of it, and the robust fit, which drops some of the stripes
+    # that disagree, does not answer in proportion.
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert ((rms > 0.7) & (rms < 1.3)).all(), rms
 

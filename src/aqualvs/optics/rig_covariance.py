@@ -192,7 +192,7 @@ class PostureErrors:
             np.zeros((room, k)),
             np.diag(surface.prior),
         )
-        n = _sum_up(pixels, laser, points, weights, surface.terms, self._n_lasers, each, sums)
+        n = _sum_up(pixels, laser, points, weights, surface.terms, self._n_lasers, each, *sums)
         return StripeSums(
             sums.pixels[:n], sums.points[:n], sums.laser[:n], sums.pulls[:n], sums.matrix
         )
@@ -207,9 +207,9 @@ class PostureErrors:
             surface.normal,
             surface.bend,
             surface.posture,
-            sums,
-            self._lattice,
-            self._moves,
+            *sums,
+            *self._lattice,
+            *self._moves,
             self._camera_columns,
             found,
         )
@@ -284,7 +284,11 @@ def _sum_up(
     terms: FloatArray,
     n_lasers: int,
     each: int,
-    sums: StripeSums,
+    mean_pixels: FloatArray,
+    mean_points: FloatArray,
+    owner: IntArray,
+    pulls: FloatArray,
+    matrix: FloatArray,
 ) -> int:
     """Write sums over runs of equally many points, `each` runs of a laser at most; their count.
 
@@ -300,7 +304,7 @@ def _sum_up(
         share[laser[chosen[c]]] += 1.0
     for own in range(n_lasers):
         share[own] = each / share[own] if share[own] > 0.0 else 0.0
-    done, total = np.zeros(n_lasers), np.zeros(sums.laser.shape[0])
+    done, total = np.zeros(n_lasers), np.zeros(owner.shape[0])
     for c in range(0, n_chosen, stride):
         i = chosen[c]
         own, w = laser[i], weights[i]
@@ -308,24 +312,24 @@ def _sum_up(
         done[own] += 1.0
         total[run] += w
         for j in range(2):
-            sums.pixels[run, j] += w * pixels[i, j]
+            mean_pixels[run, j] += w * pixels[i, j]
         for j in range(3):
-            sums.points[run, j] += w * points[i, j]
+            mean_points[run, j] += w * points[i, j]
         for j in range(n_terms):
             part = w * terms[i, j]
-            sums.pulls[run, j] += part
+            pulls[run, j] += part
             for k in range(j + 1):
-                sums.matrix[j, k] += part * terms[i, k]
+                matrix[j, k] += part * terms[i, k]
     n = 0
     for run in range(total.shape[0]):
         if total[run] > 0.0:
             for j in range(2):
-                sums.pixels[n, j] = sums.pixels[run, j] / total[run]
+                mean_pixels[n, j] = mean_pixels[run, j] / total[run]
             for j in range(3):
-                sums.points[n, j] = sums.points[run, j] / total[run]
+                mean_points[n, j] = mean_points[run, j] / total[run]
             for j in range(n_terms):
-                sums.pulls[n, j] = sums.pulls[run, j]
-            sums.laser[n] = run // each
+                pulls[n, j] = pulls[run, j]
+            owner[n] = run // each
             n += 1
     return n
 
@@ -348,13 +352,26 @@ def _jacobian(
     normal: FloatArray,
     bend: FloatArray,
     posture: FloatArray,
-    sums: StripeSums,
-    lattice: _Lattice,
-    moves: _SheetMoves,
+    pixels: FloatArray,
+    points: FloatArray,
+    laser: IntArray,
+    pulls: FloatArray,
+    matrix: FloatArray,
+    table: FloatArray,
+    scale: FloatArray,
+    sheets: FloatArray,
+    first: IntArray,
+    column: IntArray,
+    ahead: FloatArray,
+    behind: FloatArray,
+    step: FloatArray,
     camera_columns: IntArray,
     out: FloatArray,
 ) -> None:
     """Write the derivatives (3, P) of range, pitch and yaw by the rig's parameters."""
+    # Bundled here: every call from outside with a named tuple would keep some memory for good.
+    sums, lattice = StripeSums(pixels, points, laser, pulls, matrix), _Lattice(table, scale)
+    moves = _SheetMoves(sheets, first, column, ahead, behind, step)
     n, n_terms = out.shape[1], sums.pulls.shape[1]
     factor, gain, slopes = np.empty((n_terms, n_terms)), posture.copy(), np.empty(n)
     scratch = np.empty(15)
