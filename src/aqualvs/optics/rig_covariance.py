@@ -202,14 +202,19 @@ class PostureErrors:
 
         NaN where the points do not determine the surface.
         """
-        found = np.empty((3, len(self.names)))
+        found, moves = np.empty((3, len(self.names))), self._moves
         _jacobian(
             surface.normal,
             surface.bend,
             surface.posture,
             *sums,
             *self._lattice,
-            *self._moves,
+            moves.sheets,
+            moves.first,
+            moves.column,
+            moves.ahead,
+            moves.behind,
+            moves.step,
             self._camera_columns,
             found,
         )
