@@ -14,6 +14,7 @@ from aqualvs.calibration.view import View
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
 from panel_cases import small_rig
 
@@ -63,7 +64,7 @@ def test_everything_is_there(made):
 def test_the_truth_and_what_is_known_beforehand_are_those_of_the_rig(made):
     files, _ = made
     rig = small_rig()
-    assert rig_to_mapping(load_rig(files.rig)) == rig_to_mapping(rig)
+    assert rig_to_mapping(load_rig(files.rig)) == rig_to_mapping(with_exact_numbers(rig))
     nominal = load_nominal(files.nominal)
     assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("example", (360, 288), 3)
     assert nominal.dome == rig.dome

@@ -8,6 +8,7 @@ from aqualvs.app.disk import writing
 from aqualvs.app.progress import progress
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.example_rigs import example_rig
@@ -65,7 +66,7 @@ def simulate(
     with writing(out), progress(scenario, course.n_frames) as tick:
         _write_net_truth(course, out)
         dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1))
-        save_rig(rig, out / "rig.yaml")
+        save_rig(with_exact_numbers(rig), out / "rig.yaml")
     tell(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
     tell(
         f"next: aqualvs run {dive.video} --rig {out / 'rig.yaml'} --truth {dive.truth} "

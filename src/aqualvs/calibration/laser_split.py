@@ -32,9 +32,9 @@ _N_FITS = 5
 _LEAST_OF_CHAIN = 0.25
 # Accidents are so many times as likely (natural logarithm) to make a plane that is clearly worse.
 _CLEARLY_WORSE = 3.0
-# Accidents that a plane which is asked for may be expected to be, at most, and how many times longer
-# than it a stripe in no plane may be; tuned on 24 simulated scenes of one picture of a box with
-# glints. And accidents that one which has to be asked about may be.
+# Accidents that a plane which is asked for may be expected to be, at most, and how many times as
+# long as its own a stripe in no plane may be: tuned on 24 simulated scenes of one picture of a box
+# with glints. Accidents that a plane which has to be asked about may be expected to be.
 _TOLD = float(np.log(0.2))
 _LONGER = 1.5
 _HARDLY_AN_ACCIDENT = float(np.log(0.05))

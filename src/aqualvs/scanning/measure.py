@@ -18,6 +18,7 @@ from aqualvs.scanning.measure_kernels import (
     mark_rested_on,
     places_along,
     select_pieces,
+    weigh_readings,
 )
 from aqualvs.scanning.net_growth import follow_net
 from aqualvs.scanning.net_labels import SOME, much_beside
@@ -83,12 +84,15 @@ class Measurement:
         The curved surface, where the net is none that a plane describes.
     whole : bool array, shape (N,), or None
         Readings on the net, also where its folds leave the surface; None for what is no net.
+    weights : array, shape (N,), or None
+        What each reading weighs in the fit, as 1 over the variance of m·X; None without a posture.
     """
 
     posture: Posture | Refusal
     rests_on: BoolArray
     patch: Patch | None = None
     whole: BoolArray | None = None
+    weights: FloatArray | None = None
 
 
 class PostureMeter:
@@ -177,7 +181,7 @@ class PostureMeter:
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         whole = self._followed(readings, best.rests_on, plane, patch)
         best = self._weighed(readings, whole, plane, patch, best, best is curved)
-        return Measurement(best.posture, best.rests_on, best.patch, whole)
+        return replace(best, whole=whole)
 
     def _followed(
         self, readings: Readings, rests_on: BoolArray, plane: Plane, patch: FloatArray
@@ -252,7 +256,7 @@ class PostureMeter:
         along = fit.patch.coefficients[[3, 5]].tolist()
         sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
         bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
-        return Measurement(bent, found.rests_on, fit.patch)
+        return replace(found, posture=bent, patch=fit.patch)
 
     def _observe(
         self,
@@ -311,7 +315,14 @@ class PostureMeter:
         )
         if second < _MIN_PIECES:
             return None
-        return Measurement(posture_of(fit, nearest, n_points, self._axis_in_dome), rests_on)
+        weights, pieces = np.empty(len(readings)), seen.pieces
+        # The mean plane of folds and the pseudo-inverse do not look at the errors.
+        alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
+        weigh_readings(
+            seen.group, fit.m, pieces.sensitivity, pieces.sigma_px, fit.weights, alike, weights
+        )
+        posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
+        return Measurement(posture, rests_on, weights=weights)
 
 
 class _Seen(NamedTuple):

@@ -1,18 +1,21 @@
 """The main path: a frame in, posture and points out."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
+from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.paper_filter import PaperFilter
-from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.scanning.patch import fitted_patch
+from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
@@ -70,6 +73,7 @@ class Scanner:
         self._triangulator = Triangulator(rig, camera)
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera)
+        self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -120,8 +124,10 @@ class Scanner:
             # The paper's filter wants to know the laser of each return, which is known by now.
             kept = np.zeros(len(readings), np.bool_)
             kept[listed] = _on_mesh(self._paper_filter, points)
-            found, points, _ = self._measured(readings.where(kept))
-        return Scan(index, time_s, found.posture, points, self.rig.n_water)
+            readings = readings.where(kept)
+            found, points, _ = self._measured(readings)
+        posture = self._with_rig_covariance(found, readings)
+        return Scan(index, time_s, posture, points, self.rig.n_water)
 
     def _make_paper_filter(self, camera: Camera) -> PaperFilter | None:
         options = self.options.mesh_filter
@@ -152,6 +158,21 @@ class Scanner:
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
         return found, points, listed
+
+    def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
+        """Return the posture with what the rig's own uncertainty makes of it."""
+        posture = found.posture
+        if not isinstance(posture, Posture) or found.weights is None:
+            return posture
+        m, points, weights = posture.normal_in_dome / posture.range, readings.points, found.weights
+        surface = fitted_plane(m, points)
+        if found.patch is not None:
+            # Heights over a patch are in metres, m·X is in ranges.
+            surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
+        covariance = self._rig_errors.covariance_of(
+            surface, readings.pixels, readings.laser, points, weights
+        )
+        return replace(posture, rig_covariance=covariance)
 
 
 def _on_mesh(paper_filter: PaperFilter, points: ScanPoints) -> BoolArray:

@@ -14,6 +14,7 @@ from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation import calibration_views as views
 from aqualvs.simulation.dive import simulate_dive
@@ -200,7 +201,7 @@ def _simulate(job: _Job) -> CalibrationFiles:
     dive, dive_truth = _dive(job)
     nominal, rig = job.out / "nominal.yaml", job.folder("truth") / "rig.yaml"
     targets.write_yaml(nominal, _nominal_mapping(job.rig))
-    save_rig(job.rig, rig)
+    save_rig(with_exact_numbers(job.rig), rig)
     return CalibrationFiles(
         nominal=nominal,
         camera=camera,

@@ -174,11 +174,16 @@ class MessageMaker:
             yield (
                 Topic.POSTURE,
                 _pose_message(
-                    stamp, frame, posture.range, posture.pitch, posture.yaw, posture.covariance
+                    stamp,
+                    frame,
+                    posture.range,
+                    posture.pitch,
+                    posture.yaw,
+                    posture.total_covariance,
                 ),
             )
         if Topic.FILTERED in wanted and filtered is not None:
-            cov = filtered.covariance[:3, :3]
+            cov = filtered.total_covariance
             yield (
                 Topic.FILTERED,
                 _pose_message(stamp, frame, filtered.range, filtered.pitch, filtered.yaw, cov),
@@ -206,7 +211,7 @@ class MessageMaker:
             min_range=near,
             max_range=far,
             range=value,
-            variance=float(posture.covariance[0, 0]) if posture else 0.0,
+            variance=float(posture.total_covariance[0, 0]) if posture else 0.0,
         )
 
     def _diagnostics_are_due(self, sample: LiveSample) -> bool:
