@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.simulation.video import Recording, VideoWriter
+from aqualvs.simulation.video import Recording, VideoWriter, jpeg
 
 
 def _frames(n=5, size=(64, 48)):
@@ -47,6 +47,23 @@ def test_h264_is_420_with_the_right_clock(tmp_path):
         # H.264 at crf 20 on a smooth picture.
         error = frame.to_ndarray(format="rgb24").astype(int) - expected
         assert np.abs(error).mean() < 4.0
+
+
+def test_mjpeg_holds_every_frame_as_a_jpeg_in_full_range(tmp_path):
+    path, frames = tmp_path / "a.mp4", _frames()
+    with VideoWriter(path, (64, 48), 29.97, Recording(codec="mjpeg", jpeg_quality=90)) as writer:
+        for frame in frames:
+            writer.write(frame)
+    pixel_format, read = _read(path)
+    assert pixel_format == "yuvj420p"
+    assert [frame.time for frame in read] == pytest.approx(np.arange(5) / 29.97, abs=2e-4)
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    assert packets == [jpeg(frame, 90) for frame in frames]
+    for expected, frame in zip(frames, read, strict=True):
+        # JPEG at quality 90 on a smooth picture.
+        error = frame.to_ndarray(format="rgb24").astype(int) - expected
+        assert np.abs(error).mean() < 3.0
 
 
 def test_smaller_crf_or_more_bits_make_a_larger_file(tmp_path):

@@ -312,12 +312,12 @@ WEBCAM = SimulatedCamera(
 ACTION = SimulatedCamera(
     name="action",
     about="action camera with lamps: strong tone curve, white cores in a halo, H.264 at a low rate",
-    filters=ColourFilters(at_green=(0.42, 1.0, 0.84), saturation=0.6),
+    filters=ColourFilters(at_green=(0.42, 1.0, 0.90), saturation=0.6),
     development=Development(
         lamp=(0.30, 0.30, 0.28),
         defocus_px=0.6,
-        flare=0.05,
-        flare_px=7.0,
+        flare=0.08,
+        flare_px=6.0,
         exposure=0.15,
         exposure_drift=Drift(swing=0.06, period_s=9.0),
         red_drift=Drift(swing=0.05, period_s=13.0, phase=0.4),

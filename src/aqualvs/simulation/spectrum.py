@@ -28,8 +28,7 @@ LUMA.flags.writeable = False
 
 def laser_wavelength_nm(laser: Laser) -> float:
     """Return the wavelength of a rig's laser in nanometres; `GREEN_NM` if the rig tells none."""
-    stated = getattr(laser, "wavelength_nm", None)
-    return GREEN_NM if stated is None else float(stated)
+    return GREEN_NM if laser.wavelength_nm is None else laser.wavelength_nm
 
 
 def band_shares(wavelength_nm: float) -> FloatArray:
@@ -55,15 +54,17 @@ class ColourFilters:
         by the camera's colour matrix: colour minus luma is divided, then multiplied by 1 plus
         this. Daylight comes out as it was; a laser, whose one wavelength has crosstalk of its own,
         comes out with less red than was recorded, or with less than none: it darkens red.
-    peak_nm, width_nm : (float, float, float)
-        Middles and standard deviations of the filters in nanometres; they tell how other
-        wavelengths than `GREEN_NM` are recorded.
+    peak_nm : (float, float, float)
+        Middles of the filters in nanometres. Each falls off as a Gaussian.
+    width_nm : float
+        Standard deviation of the green filter, and of the others on the side away from green; on
+        the side towards green they are as wide as `at_green` asks.
     """
 
     at_green: Vector = (0.40, 1.0, 0.27)
     saturation: float = 0.0
-    peak_nm: Vector = (600.0, 540.0, 460.0)
-    width_nm: Vector = (40.0, 38.0, 35.0)
+    peak_nm: Vector = (600.0, GREEN_NM, 460.0)
+    width_nm: float = 45.0
 
     @property
     def correcting(self) -> FloatArray:
@@ -76,16 +77,16 @@ class ColourFilters:
         return np.asarray(np.linalg.inv(self.correcting))
 
     def recorded(self, wavelength_nm: float) -> FloatArray:
-        """Return what is recorded of a laser's light under the three filters, shape (3,).
-
-        Lasers that all three record less of than 1 keep that; the others have 1 at most.
-        """
-        far, at = (
-            (nm - np.array(self.peak_nm)) / np.array(self.width_nm)
-            for nm in (wavelength_nm, GREEN_NM)
-        )
-        seen = np.array(self.at_green) * np.exp(0.5 * (at**2 - far**2))
-        return np.asarray(seen / max(1.0, float(seen.max())))
+        """Return what is recorded of a laser's light under the three filters, shape (3,)."""
+        if wavelength_nm == GREEN_NM:
+            return np.array(self.at_green)
+        off = wavelength_nm - np.array(self.peak_nm)
+        seen = np.exp(-0.5 * (off / self.width_nm) ** 2)
+        for k in (0, 2):
+            to_green = GREEN_NM - self.peak_nm[k]
+            if off[k] * to_green > 0.0:
+                seen[k] = self.at_green[k] ** ((off[k] / to_green) ** 2)
+        return np.asarray(seen)
 
     def laser_colour(self, wavelength_nm: float) -> FloatArray:
         """Return the red, green and blue (3,) that a scene must hold to be recorded so."""
