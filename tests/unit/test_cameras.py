@@ -55,10 +55,10 @@ def _shoot(radiance, t=0.0, rng=None, filters=None, **options):
             {"R": (-0.52, 0.07), "B": (0.48, 0.70), "U": (-0.04, 0.04), "V": (-0.71, -0.44)},
         ),
         # Action: between a phone (60, 176, 154: dU 8, dV -56) and overexposed lines in the dark
-        # (106, 152, 177: dU 20, dV -25).
+        # (106, 152, 177: dU 20, dV -25); both were bright.
         (
             "action",
-            1.0,
+            6.0,
             {"R": (0.34, 0.70), "B": (0.85, 1.16), "U": (0.02, 0.13), "V": (-0.34, -0.16)},
         ),
         # Pal: lines under water, lamps off (71, 125, 84: dU -11, dV -23), by a third of it.
@@ -71,7 +71,7 @@ def _shoot(radiance, t=0.0, rng=None, filters=None, **options):
 )
 def test_a_line_has_the_colour_of_measured_ones(name, power, bounds):
     added = line_minus_background(name, power)
-    assert 25.0 < added[1] < 130.0
+    assert 25.0 < added[1] < 180.0
     u, v = chroma(added)
     found = {"R": added[0], "B": added[2], "U": u, "V": v}
     for part, (low, high) in bounds.items():

@@ -173,8 +173,9 @@ class Development:
         if rng is not None:
             variance = np.maximum(raw, 0.0) * np.float32(self.shot_noise)
             variance += np.float32(self.read_noise**2)
-            raw = raw + np.sqrt(variance) * rng.standard_normal(raw.shape, dtype=np.float32)
-        return np.clip(raw * np.float32(gain), 0.0, 1.0)
+            noise = np.sqrt(variance) * rng.standard_normal(raw.shape, dtype=np.float32)
+            raw = np.asarray(raw + noise, dtype=np.float32)
+        return np.asarray(np.clip(raw * np.float32(gain), 0.0, 1.0), dtype=np.float32)
 
     def _toned(self, linear: Rgb) -> Rgb:
         grey = linear ** np.float32(1.0 / self.gamma)
@@ -312,7 +313,7 @@ WEBCAM = SimulatedCamera(
 ACTION = SimulatedCamera(
     name="action",
     about="action camera with lamps: strong tone curve, white cores in a halo, H.264 at a low rate",
-    filters=ColourFilters(at_green=(0.42, 1.0, 0.90), saturation=0.6),
+    filters=ColourFilters(at_green=(0.37, 1.0, 0.76), saturation=0.6),
     development=Development(
         lamp=(0.30, 0.30, 0.28),
         defocus_px=0.6,

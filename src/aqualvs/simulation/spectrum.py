@@ -37,7 +37,7 @@ def band_shares(wavelength_nm: float) -> FloatArray:
     Linear between the middles of the bands, constant beyond: a laser of 635 nm is dimmed as red.
     """
     upward = np.interp(wavelength_nm, _BANDS_NM[::-1], np.arange(3.0))
-    return np.maximum(0.0, 1.0 - np.abs(np.array([2.0, 1.0, 0.0]) - upward))
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.array([2.0, 1.0, 0.0]) - upward)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

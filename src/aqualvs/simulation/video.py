@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self, TypeAlias, cast
+from typing import Any, Literal, Self, TypeAlias, cast
 
 import av
 import cv2
@@ -137,7 +137,7 @@ class VideoWriter:
         finally:
             self._container.close()
 
-    def _jpeg_packet(self, image: NDArray[np.uint8]) -> av.Packet:
+    def _jpeg_packet(self, image: NDArray[np.uint8]) -> "av.Packet[Any]":
         """Return a frame as a JPEG with the standard tables, as USB cameras make it."""
         packet = av.Packet(jpeg(image, self._recording.jpeg_quality))
         packet.stream = self._stream
@@ -153,7 +153,7 @@ class VideoWriter:
             raise OutputError(f"{self._path}: cannot write video ({error}); {_REMEDY}") from None
         self._mux(packets)
 
-    def _mux(self, packets: Sequence[av.Packet]) -> None:
+    def _mux(self, packets: "Sequence[av.Packet[Any]]") -> None:
         try:
             for packet in packets:
                 self._container.mux(packet)

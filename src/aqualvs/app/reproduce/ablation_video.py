@@ -15,10 +15,10 @@ _DEFAULT = 20
 def _run(laboratory: Laboratory) -> Outcome:
     # The clear net of the growth experiment, whose H.264 at the default quality is there already.
     course = scene("clear")
-    raw = laboratory.dive(course, Recording(codec="lossless"))
+    raw = laboratory.dive(course, recording=Recording(codec="lossless"))
     variants = [_variant(laboratory, raw, "uncompressed")]
     for crf in _CRFS:
-        dive = laboratory.dive(course, Recording(crf=crf))
+        dive = laboratory.dive(course, recording=Recording(crf=crf))
         variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == _DEFAULT))
     first, last = variants[1], variants[-1]
     return Outcome(
