@@ -155,6 +155,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
 
 def test_a_real_camera_keeps_jpegs_that_show_the_same_board(tmp_path):
     size = SetSize(camera=1, dome=1, box=1, index=1, dive=0)
+    simulate_calibration(small_rig(), tmp_path, size=size, seed=5)
     files = simulate_calibration(
         small_rig(), tmp_path, size=size, seed=5, camera=simulated_camera("pal")
     )

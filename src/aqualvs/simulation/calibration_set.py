@@ -137,6 +137,8 @@ class _Job:
         for scene, file in zip(scenes, names, strict=True):
             image = renderer.render(scene, rng, _BETWEEN_STILLS_S * self.done)
             _write_picture(folder / file, image, quality)
+            # Of an earlier set, which another camera took.
+            (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
             self.did_one()
         return names
 
