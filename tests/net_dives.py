@@ -231,9 +231,7 @@ def scans_of(dive: Dive, rig: Rig, *, h264: bool = False, seed: int = 0) -> list
         return [scanner.process(frame_of(i, dive.times[i], image)) for i, image in frames]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dive.mp4"
-        with VideoWriter(
-            path, rig.size_px, dive.fps, quality="h264", crf=20, bit_rate=None
-        ) as video:
+        with VideoWriter(path, rig.size_px, dive.fps) as video:
             for image in _pictures(dive, rig, seed):
                 video.write(image)
         return [scanner.process(frame) for frame in open_source(str(path))]
