@@ -101,11 +101,17 @@ class Measured:
         return not self.reason
 
 
-def rig_text(k: np.ndarray = K, size_px: tuple[int, int] = SIZE_PX) -> str:
-    """Return the rig file without lasers, as written by hand."""
-    return RIG.format(
-        width=size_px[0], height=size_px[1], fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2]
-    )
+def rig_text(crop: tuple[int, int, int, int] = (0, 0, *SIZE_PX)) -> str:
+    """Return the rig file without lasers, as written by hand; `crop` is x, y, width, height."""
+    _, _, width, height = crop
+    k = intrinsics(crop)
+    cx, cy = round(k[0, 2], 2), round(k[1, 2], 2)
+    return RIG.format(width=width, height=height, fx=k[0, 0], fy=k[1, 1], cx=cx, cy=cy)
+
+
+def intrinsics(crop: tuple[int, int, int, int] = (0, 0, *SIZE_PX)) -> np.ndarray:
+    """Return the camera matrix (3, 3) of pictures cropped to x, y, width, height."""
+    return K - np.array([[0.0, 0.0, crop[0]], [0.0, 0.0, crop[1]], [0.0, 0.0, 0.0]])
 
 
 def board_text() -> str:
@@ -136,7 +142,7 @@ def board_pose(image: np.ndarray, k: np.ndarray = K) -> BoardPose:
         range_m=abs(distance),
         pitch_deg=math.degrees(math.atan2(n_z, n_y)),
         yaw_deg=math.degrees(math.atan2(n_x, n_y)),
-        residual_px=float(np.sqrt(np.mean((projected - corners) ** 2) * 2.0)),
+        residual_px=float(np.sqrt(((projected - corners.reshape(-1, 1, 2)) ** 2).sum(-1).mean())),
         flat_pitch_deg=math.degrees(FLATNESS_M / placed[:, 1].std()),
         flat_yaw_deg=math.degrees(FLATNESS_M / placed[:, 0].std()),
     )
@@ -188,17 +194,22 @@ def call(arguments: Sequence[str | Path], log: Path) -> int:
     return code
 
 
-def calibrate(others: Iterable[Path], folder: Path, n_lasers: int | None) -> Path | None:
-    """Calibrate the lasers from pictures; return the rig file, None if the command refuses."""
+def calibrate(
+    others: Iterable[Path], folder: Path, n_lasers: int | None = None, *, rig: str = ""
+) -> Path | None:
+    """Calibrate the lasers from pictures; return the rig file, None if the command refuses.
+
+    `rig` is the text of the rig file without lasers, that of the whole pictures if left out.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "rig0.yaml").write_text(rig_text())
+    (folder / "rig0.yaml").write_text(rig or rig_text())
     (folder / "board.yaml").write_text(board_text())
-    rig = folder / "rig.yaml"
-    rig.unlink(missing_ok=True)
+    made = folder / "rig.yaml"
+    made.unlink(missing_ok=True)
     arguments = ["calibrate", "lasers", *others, "--board", folder / "board.yaml"]
-    arguments += ["--rig", folder / "rig0.yaml", "-o", rig, "--medium", "air"]
+    arguments += ["--rig", folder / "rig0.yaml", "-o", made, "--medium", "air"]
     arguments += [] if n_lasers is None else ["--lasers", str(n_lasers)]
-    return rig if call(arguments, folder / "calibrate.txt") == 0 else None
+    return made if call(arguments, folder / "calibrate.txt") == 0 else None
 
 
 def measure(source: Path, rig: Path, out: Path, more: Sequence[str] = ()) -> list[dict[str, str]]:
