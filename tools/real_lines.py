@@ -12,7 +12,7 @@ way `aqualvs calibrate lasers` finds stripes. Four questions are asked:
   the line that the difference of the pair shows;
 - everywhere: the share of points far from any line.
 
---page writes the pictures with their points as one HTML file; --sheet DIR writes them as JPEG.
+--page writes the pictures with their points as one HTML file, --sheets one JPEG file for each set.
 """
 
 import argparse
@@ -48,6 +48,10 @@ PAIR_PX = 1.0
 RED_NM, GREEN_NM = 650.0, 532.0
 # Weights of B, G, R when a line of a pair is centred: mostly red, but red alone saturates.
 _WEIGHTS = (0.2, 0.2, 0.6)
+# Drawing: pictures darker than this on average are brightened; space around lines, in widths;
+# width of a sheet in pixels.
+_DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1120
+_ON_GREEN_BGR, _ON_RED_BGR = (255, 0, 255), (255, 255, 0)
 
 
 @dataclass(frozen=True)
@@ -282,16 +286,50 @@ def summary(scores: Sequence[Score]) -> list[str]:
 
 
 def drawn(shot: Shot, width: int = 800) -> Image:
-    """Return the picture with its points, gamma-brightened where it is dark."""
+    """Return the picture, brightened where it is dark, and beside it the same with its points."""
     scale = width / shot.image.shape[1]
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
-    small = cv2.resize(shot.image, None, fx=scale, fy=scale, interpolation=how)
-    if small.mean() < 40.0:
-        small = np.rint(255.0 * np.sqrt(small / 255.0)).astype(np.uint8)
-    picture: Image = small.copy()
+    plain = cv2.resize(shot.image, None, fx=scale, fy=scale, interpolation=how)
+    if plain.mean() < _DARK:
+        plain = np.rint(255.0 * np.sqrt(plain / 255.0)).astype(np.uint8)
+    picture = plain.copy()
+    red = shot.scores[0].picture.startswith("red")
     for x, y in np.rint((shot.points + 0.5) * scale - 0.5).astype(int):
-        cv2.circle(picture, (int(x), int(y)), 1, (255, 0, 255), -1)
-    return np.hstack([small, picture])
+        cv2.circle(picture, (int(x), int(y)), 1, _ON_RED_BGR if red else _ON_GREEN_BGR, -1)
+    both: Image = np.hstack([plain, picture])
+    return both
+
+
+def around_lines(shot: Shot, lines: Sequence[tuple[str, Array]]) -> Shot:
+    """Return a shot cut to where its lines are."""
+    height, width = shot.image.shape[:2]
+    everything = np.concatenate([polyline for _, polyline in lines])
+    margin = _MARGIN * width
+    x0, y0 = np.clip(everything.min(axis=0) - margin, 0, (width, height)).astype(int)
+    x1, y1 = np.clip(everything.max(axis=0) + margin, 0, (width, height)).astype(int)
+    inside = ((shot.points >= (x0, y0)) & (shot.points < (x1, y1))).all(axis=1)
+    points = shot.points[inside] - (x0, y0)
+    return dataclasses.replace(shot, image=shot.image[y0:y1, x0:x1], points=points)
+
+
+def sheets(found: Sequence[Shot]) -> dict[str, Image]:
+    """Return one picture for each colour: all its shots with lines, green ones cut to these."""
+    traced = traced_lines()
+    rows: dict[str, list[Image]] = defaultdict(list)
+    pairs = []
+    for shot in found:
+        name, group = shot.scores[0].picture, shot.scores[0].group
+        if group == "pair":
+            pairs.append(drawn(shot, _SHEET_WIDTH // 4))
+        elif group != "off":
+            cut = shot if name.startswith("red") else around_lines(shot, traced[name])
+            rows[name.split("/")[0]].append(drawn(cut, _SHEET_WIDTH // 2))
+    made = {folder: np.vstack(of) for folder, of in rows.items()}
+    if pairs:
+        made["red-pairs"] = np.vstack(
+            [np.hstack([a, b]) for a, b in zip(pairs[::2], pairs[1::2], strict=True)]
+        )
+    return made
 
 
 def page(found: Sequence[Shot]) -> str:
@@ -312,7 +350,7 @@ def main() -> int:
     parser.add_argument("samples", type=Path, help="folder of the photographs")
     parser.add_argument("--formats", default=",".join(FORMATS), help="such as png,jpg80,crf23")
     parser.add_argument("--page", type=Path, help="HTML page of all pictures, to write")
-    parser.add_argument("--sheet", type=Path, help="folder for the same as JPEG files")
+    parser.add_argument("--sheets", type=Path, help="folder for a JPEG file of each set's lines")
     given = parser.parse_args()
     found = []
     for shot in shots(given.samples, given.formats.split(",")):
@@ -321,11 +359,11 @@ def main() -> int:
     print("\n".join(["", *summary([score for shot in found for score in shot.scores])]))
     if given.page:
         given.page.write_text(page(found))
-    if given.sheet:
-        given.sheet.mkdir(parents=True, exist_ok=True)
-        for shot in found:
-            name = shot.scores[0].picture.split("/")[1].rsplit(".", 1)[0]
-            cv2.imwrite(str(given.sheet / f"{name}_{shot.scores[0].format}.jpg"), drawn(shot))
+    if given.sheets:
+        given.sheets.mkdir(parents=True, exist_ok=True)
+        for folder, sheet in sheets(found).items():
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 70]
+            cv2.imwrite(str(given.sheets / f"real-{folder}.jpg"), sheet, quality)
     return 0
 
 

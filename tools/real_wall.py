@@ -25,6 +25,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 from typer.testing import CliRunner
 
 from aqualvs.app.cli import app
@@ -40,6 +41,9 @@ N_FRAMES = 3
 # The paper of the board is not flat: this much, over the standard deviation of its corners along
 # an axis, is what the board's own plane may be off by.
 FLATNESS_M = 1e-3
+# Of a sheet: what part of a picture it shows (x, y, x, y), and how wide.
+_TILE = (60, 320, 1500, 1130)
+_TILE_PX = 480
 
 RIG = """\
 aqualvs_rig: 1
@@ -261,6 +265,11 @@ def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose
     )
 
 
+def mode_name(n_lasers: int | None) -> str:
+    """Return the folder of results for a number of lasers passed on."""
+    return "auto" if n_lasers is None else f"lasers{n_lasers}"
+
+
 def leave_one_out(
     samples: Path,
     work: Path,
@@ -294,13 +303,12 @@ def leave_one_out(
         Called with a line for each result.
     """
     paths = sorted(samples.glob("*.png"))
-    mode = "auto" if n_lasers is None else f"lasers{n_lasers}"
     results = []
     for path in paths:
         if pictures and path.stem not in pictures:
             continue
         image = cv2.imread(str(path))
-        folder = work / mode / path.stem
+        folder = work / mode_name(n_lasers) / path.stem
         rig: Path | None = folder / "rig.yaml"
         if recalibrate or not (folder / "rig.yaml").exists():
             rig = calibrate([p for p in paths if p != path], folder, n_lasers)
@@ -316,6 +324,32 @@ def leave_one_out(
             results.append(result)
             tell(line(result))
     return results
+
+
+def sheet(samples: Path, work: Path, results: Sequence[Measured], columns: int = 3) -> np.ndarray:
+    """Return the pictures with the points that `run` used, and what it measured."""
+    tiles = []
+    x0, y0, x1, y1 = _TILE
+    for m in results:
+        image = cv2.imread(str(samples / f"{m.picture}.png"))[y0:y1, x0:x1]
+        scale = _TILE_PX / image.shape[1]
+        tile = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        table = work / m.picture / m.format / "points.parquet"
+        points = pq.read_table(table, filters=[("frame", "=", 0), ("used", "=", True)])
+        pixels = np.stack([points[name].to_numpy() for name in ("u_px", "v_px")], axis=-1)
+        for x, y in np.rint((pixels - (x0, y0) + 0.5) * scale - 0.5).astype(int):
+            cv2.circle(tile, (int(x), int(y)), 0, (255, 0, 255), -1)
+        errors = f"{m.range_error_mm:+.1f} mm, yaw {m.yaw_error_deg:+.2f}"
+        words = f"{m.picture}, board at {1e3 * m.board_range_m:.0f} mm: "
+        words += f"{errors}, pitch {m.pitch_error_deg:+.2f} deg" if m.valid else m.reason
+        title = np.full((24, _TILE_PX, 3), 255, np.uint8)
+        cv2.putText(title, words, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1)
+        tiles.append(np.vstack([title, tile]))
+    rows = [tiles[i : i + columns] for i in range(0, len(tiles), columns)]
+    missing = [np.zeros_like(tiles[0])] * (columns - len(rows[-1]))
+    rows[-1] += missing
+    made: np.ndarray = np.vstack([np.hstack(row) for row in rows])
+    return made
 
 
 def line(m: Measured) -> str:
@@ -363,6 +397,8 @@ def main() -> int:
     parser.add_argument("--pictures", default="", help="only these, such as image1,image4")
     parser.add_argument("--recalibrate", action="store_true", help="do not use rigs kept in --work")
     parser.add_argument("--json", type=Path, help="write the results to this file too")
+    parser.add_argument("--sheet", type=Path, help="JPEG file of the pictures with their points")
+    parser.add_argument("--sheet-format", default="crf23", help="which format the sheet shows")
     parser.add_argument("run", nargs="*", help="after --: further arguments of aqualvs run")
     given = parser.parse_args()
     print("picture  format  board        range      pitch      yaw  points")
@@ -378,6 +414,11 @@ def main() -> int:
     )
     print("\n".join(["", "error/sigma: total sigma and 1 mm of flatness of the board"]))
     print("\n".join(summary(results)))
+    if given.sheet:
+        shown = [m for m in results if m.format == given.sheet_format]
+        mode = mode_name(given.lasers)
+        picture = sheet(given.samples, given.work / mode, shown)
+        cv2.imwrite(str(given.sheet), picture, [cv2.IMWRITE_JPEG_QUALITY, 75])
     if given.json:
         given.json.write_text(json.dumps([asdict(m) for m in results], indent=1))
     return 0
