@@ -61,7 +61,8 @@ class Score:
     Attributes
     ----------
     picture, format, group : str
-        `group` is that of the traced lines, `off` (no laser) or `pair`.
+        `group` is that of the traced lines, `pair`, or `off532` and `off650` for pictures without
+        laser, searched for light of that wavelength.
     n_points : int
         Points found in the picture.
     found : float
@@ -238,17 +239,16 @@ def shots(samples: Path, formats: Sequence[str]) -> Iterator[Shot]:
         for fmt in formats:
             given = encoded(image, fmt)
             # Without a laser, nothing may be found whatever the colour of the rig's lasers.
-            colours = [RED_NM if red else GREEN_NM] if is_on else [GREEN_NM, RED_NM]
-            sets = [find_stripes(given, options_for(nm)).pixels for nm in colours]
-            points = np.concatenate(sets)
-            if line is not None:
-                scores = [score_pair(name, fmt, points, line)]
-            elif name in traced:
-                scores = score_lines(name, fmt, points, traced[name], image.shape[:2])
-            else:
-                n = len(points)
-                scores = [Score(name, fmt, "off", n, float("nan"), float("nan"), n)]
-            yield Shot(image, points, scores)
+            for nm in [RED_NM if red else GREEN_NM] if is_on else [GREEN_NM, RED_NM]:
+                points = find_stripes(given, options_for(nm)).pixels
+                if line is not None:
+                    scores = [score_pair(name, fmt, points, line)]
+                elif name in traced:
+                    scores = score_lines(name, fmt, points, traced[name], image.shape[:2])
+                else:
+                    n, none = len(points), float("nan")
+                    scores = [Score(name, fmt, f"off{nm:.0f}", n, none, none, n)]
+                yield Shot(image, points, scores)
 
 
 def text_line(score: Score) -> str:
@@ -271,7 +271,7 @@ def summary(scores: Sequence[Score]) -> list[str]:
             for s in scores
             if (s.picture.split("/")[0], s.group, s.format) == (folder, group, fmt)
         ]
-        if group == "off":
+        if group.startswith("off"):
             clean = sum(s.n_points == 0 for s in of)
             text = f"{clean} of {len(of)} without points; {sum(s.n_points for s in of)} points"
         elif group == "pair":
@@ -321,7 +321,7 @@ def sheets(found: Sequence[Shot]) -> dict[str, Image]:
         name, group = shot.scores[0].picture, shot.scores[0].group
         if group == "pair":
             pairs.append(drawn(shot, _SHEET_WIDTH // 4))
-        elif group != "off":
+        elif not group.startswith("off"):
             cut = shot if name.startswith("red") else around_lines(shot, traced[name])
             rows[name.split("/")[0]].append(drawn(cut, _SHEET_WIDTH // 2))
     made = {folder: np.vstack(of) for folder, of in rows.items()}

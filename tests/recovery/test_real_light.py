@@ -50,6 +50,12 @@ def test_a_photograph_gives_the_boards_plane(measured, picture: str, fmt: str) -
     assert abs(result.range_error_mm) < 10.0
     assert abs(result.yaw_error_deg) < 2.0
     assert abs(result.pitch_error_deg) < 1.0
+
+
+@pytest.mark.parametrize("picture", PICTURES)
+def test_errors_of_a_photograph_are_as_large_as_stated(measured, picture: str) -> None:
+    """Stated with the rig's part; 1 mm is added for the board, which is paper."""
+    result = measured[picture, "png"]
     assert max(map(abs, (result.range_score, result.pitch_score, result.yaw_score))) < 3.0
 
 
@@ -60,10 +66,10 @@ def test_compression_moves_a_posture_little(measured, picture: str, fmt: str) ->
     ours, plain = measured[picture, fmt], measured[picture, "png"]
     assert ours.valid
     assert plain.valid
-    # A stripe that H.264 moves by 0.1 px along all its length moves the wall by 0.5 mm.
-    assert abs(ours.range_error_mm - plain.range_error_mm) < 2.0
-    assert abs(ours.yaw_error_deg - plain.yaw_error_deg) < 0.5
-    assert abs(ours.pitch_error_deg - plain.pitch_error_deg) < 0.2
+    # Stripes that H.264 moves by 0.1 px along all their length move the wall by 0.5 mm.
+    assert abs(ours.range_error_mm - plain.range_error_mm) < 0.5
+    assert abs(ours.yaw_error_deg - plain.yaw_error_deg) < 0.2
+    assert abs(ours.pitch_error_deg - plain.pitch_error_deg) < 0.1
 
 
 @pytest.mark.parametrize("picture", PICTURES)
@@ -133,9 +139,9 @@ def test_lines_of_photographs_without_a_rig(samples, fmt: str) -> None:
     bright = [s for s in scores if s.picture.startswith("green15-bright")]
     dark = [s for s in scores if s.picture.startswith("green15-dark") and s.group == "line"]
     pairs = [s for s in scores if s.group == "pair"]
-    off = [s for s in scores if s.group == "off"]
-    assert (len(bright), len(dark), len(pairs), len(off)) == (4, 3, 10, 14)
+    off = [s for s in scores if s.group.startswith("off")]
+    assert (len(bright), len(dark), len(pairs), len(off)) == (4, 3, 10, 2 * 14)
     assert {s.picture: s.weakest for s in bright if s.weakest < 0.9} == {}
     assert {s.picture: s.found for s in dark if s.found < 0.8} == {}
-    assert {s.picture: s.n_points for s in off if s.n_points > 0} == {}
+    assert {(s.picture, s.group): s.n_points for s in off if s.n_points > 0} == {}
     assert sum(s.found >= 0.9 for s in pairs) >= 8
