@@ -50,8 +50,8 @@ RED_NM, GREEN_NM = 650.0, 532.0
 _WEIGHTS = (0.2, 0.2, 0.6)
 # Drawing: pictures darker than this on average are brightened; space around lines, in widths;
 # width of a sheet in pixels.
-_DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1120
-_ON_GREEN_BGR, _ON_RED_BGR = (255, 0, 255), (255, 255, 0)
+_DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1440
+_ON_GREEN_BGR, _ON_RED_BGR, _WHITE = (255, 0, 255), (255, 255, 0), (255, 255, 255)
 
 
 @dataclass(frozen=True)
@@ -262,27 +262,28 @@ def text_line(score: Score) -> str:
 
 
 def summary(scores: Sequence[Score]) -> list[str]:
-    """Return a line for each group and format."""
-    lines = []
-    keys = dict.fromkeys((s.picture.split("/")[0], s.group, s.format) for s in scores)
-    for folder, group, fmt in sorted(keys):
-        of = [
-            s
-            for s in scores
-            if (s.picture.split("/")[0], s.group, s.format) == (folder, group, fmt)
-        ]
-        if group.startswith("off"):
-            clean = sum(s.n_points == 0 for s in of)
-            text = f"{clean} of {len(of)} without points; {sum(s.n_points for s in of)} points"
-        elif group == "pair":
-            good = sum(s.found >= 0.9 for s in of)
-            text = f"{good} of {len(of)} pairs with 90 % of columns within {PAIR_PX:g} px; median "
-            text += f"{np.median([s.found for s in of]):.1%}"
-        else:
-            text = f"found {min(s.found for s in of):.1%} to {max(s.found for s in of):.1%}; "
-            text += f"weakest line {min(s.weakest for s in of):.1%}"
-        lines.append(f"{folder:15} {group:6} {fmt:5} {text}")
+    """Return a Markdown table, one row for each set and group, as docs/real-light.md has it."""
+    formats = list(dict.fromkeys(s.format for s in scores))
+    lines = [f"| pictures | lines | {' | '.join(formats)} |", "|---|---|" + "---|" * len(formats)]
+    for folder, group in sorted({(s.picture.split("/")[0], s.group) for s in scores}):
+        of = [s for s in scores if s.picture.startswith(f"{folder}/") and s.group == group]
+        cells = [_cell(group, [s for s in of if s.format == fmt]) for fmt in formats]
+        lines.append(f"| {folder} | {group} | {' | '.join(cells)} |")
     return lines
+
+
+def _cell(group: str, scores: Sequence[Score]) -> str:
+    """Return what one group of lines of a set came to in one format."""
+    if group.startswith("off"):
+        clean = sum(s.n_points == 0 for s in scores)
+        return f"{clean} of {len(scores)} without points, {sum(s.n_points for s in scores)} in all"
+    found = [s.found for s in scores]
+    if group == "pair":
+        good = sum(share >= 0.9 for share in found)
+        return f"{good} of {len(scores)} pairs by 90 %, median {np.median(found):.0%}"
+    return (
+        f"{min(found):.0%} to {max(found):.0%}, weakest line {min(s.weakest for s in scores):.0%}"
+    )
 
 
 def drawn(shot: Shot, width: int = 800) -> Image:
@@ -313,23 +314,28 @@ def around_lines(shot: Shot, lines: Sequence[tuple[str, Array]]) -> Shot:
 
 
 def sheets(found: Sequence[Shot]) -> dict[str, Image]:
-    """Return one picture for each colour: all its shots with lines, green ones cut to these."""
+    """Return one picture for each set: all its shots with lines, green ones cut to these."""
     traced = traced_lines()
-    rows: dict[str, list[Image]] = defaultdict(list)
-    pairs = []
+    shots_of: dict[str, list[Shot]] = defaultdict(list)
     for shot in found:
         name, group = shot.scores[0].picture, shot.scores[0].group
-        if group == "pair":
-            pairs.append(drawn(shot, _SHEET_WIDTH // 4))
-        elif not group.startswith("off"):
-            cut = shot if name.startswith("red") else around_lines(shot, traced[name])
-            rows[name.split("/")[0]].append(drawn(cut, _SHEET_WIDTH // 2))
-    made = {folder: np.vstack(of) for folder, of in rows.items()}
-    if pairs:
-        made["red-pairs"] = np.vstack(
-            [np.hstack([a, b]) for a, b in zip(pairs[::2], pairs[1::2], strict=True)]
-        )
-    return made
+        if not group.startswith("off"):
+            cut = around_lines(shot, traced[name]) if name.startswith("green") else shot
+            shots_of[name.split("/")[0]].append(cut)
+    return {folder: _in_columns(of) for folder, of in shots_of.items()}
+
+
+def _in_columns(of: Sequence[Shot]) -> Image:
+    """Return shots as one picture, two in a row unless there is but one."""
+    columns = 1 if len(of) == 1 else 2
+    tiles = [drawn(shot, _SHEET_WIDTH // (2 * columns)) for shot in of]
+    rows = []
+    for row in (tiles[i : i + columns] for i in range(0, len(tiles), columns)):
+        height = max(len(tile) for tile in row)
+        filled = [cv2.copyMakeBorder(t, 0, height - len(t), 0, 0, 0, value=_WHITE) for t in row]
+        missing = [np.full_like(filled[0], 255)] * (columns - len(row))
+        rows.append(np.hstack([*filled, *missing]))
+    return np.vstack(rows)
 
 
 def page(found: Sequence[Shot]) -> str:

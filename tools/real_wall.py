@@ -366,23 +366,28 @@ def line(m: Measured) -> str:
 
 
 def summary(results: Sequence[Measured]) -> list[str]:
-    """Return a line for each format: postures, medians, worst, rms of error over sigma."""
-    lines = []
+    """Return a Markdown table, one row for each format, as docs/real-light.md has it."""
+    lines = [
+        "| format | postures | range error | yaw error | pitch error | error / sigma, rms |",
+        "|---|---|---|---|---|---|",
+    ]
     for fmt in dict.fromkeys(m.format for m in results):
         of = [m for m in results if m.format == fmt]
         good = [m for m in of if m.valid]
         if not good:
-            lines.append(f"{fmt:6} 0 of {len(of)} postures")
+            lines.append(f"| {fmt} | 0 of {len(of)} | | | | |")
             continue
         errors = np.abs([(m.range_error_mm, m.yaw_error_deg, m.pitch_error_deg) for m in good])
         scores = np.array([(m.range_score, m.yaw_score, m.pitch_score) for m in good])
         share = max(abs(m.range_error_mm) / (1e3 * m.board_range_m) for m in good)
-        median, worst, rms = np.median(errors, axis=0), errors.max(axis=0), (scores**2).mean(axis=0)
+        median, worst = np.median(errors, axis=0), errors.max(axis=0)
+        rms = np.sqrt((scores**2).mean(axis=0))
         lines.append(
-            f"{fmt:6} {len(good)} of {len(of)} postures; median {median[0]:.2f} mm, yaw "
-            f"{median[1]:.3f}°, pitch {median[2]:.3f}°; worst {worst[0]:.2f} mm ({share:.1%}), "
-            f"yaw {worst[1]:.3f}°, pitch {worst[2]:.3f}°; error/sigma rms {rms[0] ** 0.5:.2f}, "
-            f"yaw {rms[1] ** 0.5:.2f}, pitch {rms[2] ** 0.5:.2f}"
+            f"| {fmt} | {len(good)} of {len(of)} "
+            f"| median {median[0]:.1f} mm, max {worst[0]:.1f} mm ({share:.1%}) "
+            f"| median {median[1]:.2f}°, max {worst[1]:.2f}° "
+            f"| median {median[2]:.2f}°, max {worst[2]:.2f}° "
+            f"| {rms[0]:.2f}, {rms[1]:.2f}, {rms[2]:.2f} |"
         )
     return lines
 
