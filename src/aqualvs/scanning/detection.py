@@ -38,6 +38,8 @@ DetectorOptions = StripeOptions | ThresholdOptions
 _SAMPLE_EVERY, _PEAKS_PER_LINE = 48, 12
 # What the frame's bright returns are as high as.
 _BRIGHT_QUANTILE = 0.9
+# An overexposed line is no wider than this share of the picture.
+_WIDEST_WHITE = 0.02
 _NO_CHROMA = np.empty((2, 0, 0), np.uint8)
 
 Peaks: TypeAlias = dict[SearchAxis, tuple[IntArray, FloatArray]]
@@ -196,7 +198,9 @@ class FrameDetector:
         """
         found = [
             laser_likelihood(
-                table, line or learn_colour(table, colour) or expected_colour(table, colour)
+                table,
+                line or learn_colour(table, colour) or expected_colour(table, colour),
+                _WIDEST_WHITE * self._size_px[0],
             )
             for line, colour in zip(known, self._colours, strict=True)
         ]
@@ -224,7 +228,7 @@ def select_returns(
     ----------
     line : int array, shape (N,)
         Search line of each peak, direction after direction.
-    table : array, shape (7, N)
+    table : array, shape (8, N)
         Measures of the peaks.
     likelihood : array, shape (N,)
         Of each peak.

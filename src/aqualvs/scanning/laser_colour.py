@@ -20,7 +20,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.scan import Frame, ImagePlane
-from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT
+from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT, TOP, WIDTH
 
 # Wavelengths (nm) that part blue, green and red lines.
 _BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
@@ -42,9 +42,11 @@ _LEARNED_QUANTILE = 0.35
 _LEAST_SIGMA = 0.7
 # Heights that are counted as one kind, and how often the shares of lines among them are refined.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
-# Heights of which no more than this share of a sample's peaks are clearly lines are not looked at; of
-# fewer peaks a few chance ones may be. Up to the height given.
-_USEFUL_SHARE, _CLEARLY, _FEW_PEAKS, _HIGHEST_USEFUL = 0.05, 0.8, 100, 32
+# Heights of which so few, or no more than this share, of a sample's peaks are clearly lines are not
+# looked at, up to the height given.
+_FEW_LINES, _USEFUL_SHARE, _CLEARLY, _HIGHEST_USEFUL = 4, 0.05, 0.8, 32
+# A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
+_WHITE = 225.0
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
 # Nothing is more certain than e to this power.
@@ -123,7 +125,7 @@ def learn_colour(table: FloatArray, colour: LaserColour) -> LineColour | None:
 
     Parameters
     ----------
-    table : array, shape (7, N)
+    table : array, shape (8, N)
         Measures of peaks, rows as `stripe` names them.
     colour : LaserColour
 
@@ -141,7 +143,7 @@ def expected_colour(table: FloatArray, colour: LaserColour) -> LineColour:
     return LineColour(*colour.value, _RATIO_EXPECTED, float(_noise(table)))
 
 
-def laser_likelihood(table: FloatArray, line: LineColour) -> FloatArray:
+def laser_likelihood(table: FloatArray, line: LineColour, widest_white_px: float) -> FloatArray:
     """Return how likely each peak of a frame is laser light, and not something else that is bright.
 
     Compares two explanations of a chroma step: a line moves the chroma in proportion to its height,
@@ -152,10 +154,13 @@ def laser_likelihood(table: FloatArray, line: LineColour) -> FloatArray:
 
     Parameters
     ----------
-    table : array, shape (7, N)
+    table : array, shape (8, N)
         Measures of all peaks of one frame, rows as `stripe` names them.
     line : LineColour
         From `learn_colour` or `expected_colour`.
+    widest_white_px : float
+        Overexposed peaks up to this width may be a line's white core, whatever their colour; wider
+        ones are paper or a window.
 
     Returns
     -------
@@ -163,7 +168,7 @@ def laser_likelihood(table: FloatArray, line: LineColour) -> FloatArray:
         0 to 1; 0.5 where colour says nothing.
     """
     likelihood = np.empty(table.shape[1])
-    _weigh(table, *line, likelihood)
+    _weigh(table, *line, widest_white_px, likelihood)
     return likelihood
 
 
@@ -231,8 +236,8 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
         peaks[kind] += 1.0
         lines[kind] += likelihood[i] > _CLEARLY
     n_useless = 0
-    while n_useless < _N_KINDS and lines[n_useless] <= _USEFUL_SHARE * max(
-        peaks[n_useless], _FEW_PEAKS
+    while n_useless < _N_KINDS and (
+        lines[n_useless] < _FEW_LINES or lines[n_useless] <= _USEFUL_SHARE * peaks[n_useless]
     ):
         n_useless += 1
     return min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), _HIGHEST_USEFUL)
@@ -240,7 +245,13 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
 
 @kernel
 def _weigh(
-    table: FloatArray, u: float, v: float, ratio: float, sigma: float, likelihood: FloatArray
+    table: FloatArray,
+    u: float,
+    v: float,
+    ratio: float,
+    sigma: float,
+    widest_white_px: float,
+    likelihood: FloatArray,
 ) -> None:
     """Write the likelihood of each peak, given what a line shows for each level of height."""
     n = table.shape[1]
@@ -265,3 +276,6 @@ def _weigh(
             lines[kind[i]] += likelihood[i]
             peaks[kind[i]] += 1.0
         share = lines / peaks
+    for i in range(n):
+        if table[TOP, i] >= _WHITE and table[WIDTH, i] <= widest_white_px:
+            likelihood[i] = max(likelihood[i], 0.5)

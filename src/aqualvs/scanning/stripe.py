@@ -27,9 +27,9 @@ _VALLEY_TENTHS = 6
 _WORD, _WORD_BITS, _IN_WORD = 8, 3, 7
 _NOTHING = np.uint64(0)
 _BRIGHT = np.uint8(255)
-POSITION, HEIGHT, WIDTH, STEP_U, STEP_V, IMBALANCE, TINT = range(7)
+POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT = range(8)
 """Rows of a table of peaks."""
-N_MEASURES = 7
+N_MEASURES = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,7 +191,7 @@ class PeakFinder:
         -------
         line : int array, shape (N,)
             Search line of each peak; ascending. A view: overwritten by the next call.
-        table : array, shape (7, N)
+        table : array, shape (8, N)
             Measures of each peak, rows as named above; likewise.
         """
         while True:
@@ -349,7 +349,7 @@ def _measure_run(
         line[n] = x
         table[POSITION, n] = _centroid(row, a, b, level)
         table[HEIGHT, n] = 2 * np.int64(row[peak]) - level
-        table[WIDTH, n] = width
+        table[WIDTH, n], table[TOP, n] = width, row[peak]
         if image.u.shape[0] > 0:
             _measure_chroma(image, x, peak, width, directions, table[:, n])
         n += 1
