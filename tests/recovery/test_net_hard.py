@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.lit_points import LitPoints
 from aqualvs.simulation.render import Renderer

@@ -15,11 +15,10 @@ from aqualvs.app.reproduce.point_truth import Judged as Reflections
 from aqualvs.app.reproduce.point_truth import LitTruth, judge_reflections, mean_judged
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.live.sources import open_source
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.paper_filter import PaperFilter
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
-from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.search import plan_searches
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions
