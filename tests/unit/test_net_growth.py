@@ -168,20 +168,21 @@ def wavy(n: int = 60) -> FloatArray:
 
 
 def test_the_mean_plane_of_folds_is_as_uncertain_as_they_are_few() -> None:
-    points = wavy()
-    few, many = fit_mean(points, FLAT, 4), fit_mean(points, FLAT, 16)
+    few, many = fit_mean(wavy(60), FLAT), fit_mean(wavy(240), FLAT)
     assert few is not None
     assert many is not None
     assert 1.0 / np.linalg.norm(few.m) == pytest.approx(RANGE, abs=4e-3)
-    np.testing.assert_allclose(few.covariance, 4.0 * many.covariance)
+    # Four times the strands at other random places: a quarter of the variance, within a third.
+    ratio = np.diag(few.covariance) / np.diag(many.covariance)
+    np.testing.assert_allclose(ratio, 4.0, rtol=0.33)
     assert 8e-3 < few.rms < 11e-3
 
 
 def test_a_few_strands_elsewhere_do_not_move_the_mean_plane() -> None:
     points = wavy()
-    clean = fit_mean(points, FLAT, 6)
+    clean = fit_mean(points, FLAT)
     elsewhere = points[:4] + np.array([0.0, 0.2, 0.0])
-    spoilt = fit_mean(np.vstack([points, elsewhere]), FLAT, 6)
+    spoilt = fit_mean(np.vstack([points, elsewhere]), FLAT)
     assert clean is not None
     assert spoilt is not None
     np.testing.assert_allclose(spoilt.m, clean.m, atol=2e-3)
@@ -191,7 +192,7 @@ def test_a_few_strands_elsewhere_do_not_move_the_mean_plane() -> None:
 def test_points_on_a_line_have_no_mean_plane() -> None:
     s = np.linspace(-0.2, 0.2, 20)
     line = np.stack([s, np.full(20, RANGE), np.zeros(20)], axis=-1)
-    assert fit_mean(line, FLAT, 6) is None
+    assert fit_mean(line, FLAT) is None
 
 
 def posture(distance: float, yaw: float) -> Posture:

@@ -164,6 +164,28 @@ def test_nothing_gives_no_surface() -> None:
     assert found == []
 
 
+def near_strands(points: FloatArray) -> BoolArray:
+    """Thick twine so near that 4 cm are lit, and 1 cm is not."""
+    lit: BoolArray = (points[:, 0] + 0.6 * points[:, 2]) % 0.05 < 0.04
+    return lit
+
+
+def seen_in_gaps(points: FloatArray) -> BoolArray:
+    lit: BoolArray = (points[:, 0] + 0.6 * points[:, 2]) % 0.03 < 0.01
+    return lit
+
+
+def test_a_near_net_that_fills_the_stripes_is_a_net() -> None:
+    """Nothing is seen through the gaps of a wall."""
+    behind = (plane(0.9), seen_in_gaps)
+    found, _, _ = surfaces_of(example_rig(), [(plane(0.35), near_strands), behind])
+    front = min(found, key=lambda surface: surface.plane.offset)
+    assert_near(front.plane, plane(0.35))
+    assert front.is_mesh
+    alone, _, _ = surfaces_of(example_rig(), [(plane(0.35), near_strands)])
+    assert not alone[0].is_mesh
+
+
 def test_scattered_light_gives_no_surface_worth_a_target() -> None:
     """Marine snow: returns anywhere, as many as a wall's."""
     rig = example_rig()

@@ -13,6 +13,7 @@ REASON_WORDS: dict[str, str] = {
     Reason.ONE_LASER: "only one laser on the target",
     Reason.COLLINEAR: "points lie on one line",
     Reason.NOT_A_PLANE: "stripes share no plane",
+    Reason.AMBIGUOUS: "stripes fit two planes",
     Reason.NO_TARGET: "no target of the kind asked for",
     Reason.OUT_OF_RANGE: "target outside the working range",
     Reason.CORRUPT_FRAME: "frame could not be decoded",

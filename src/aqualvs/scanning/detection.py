@@ -19,7 +19,7 @@ from aqualvs.scanning.laser_colour import (
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.search_image import SearchLines, U8Array
-from aqualvs.scanning.segments import on_long_segments
+from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
     HEIGHT,
     POSITION,
@@ -241,7 +241,7 @@ def select_returns(
     bright = min_share * element_at(table[HEIGHT][keep], _BRIGHT_QUANTILE)
     for k in range(sizes.shape[0] - 1):
         rows = sizes[k] + np.flatnonzero(keep[sizes[k] : sizes[k + 1]])
-        long = on_long_segments(line[rows], table[POSITION][rows])
+        long = in_a_row(line[rows], table[POSITION][rows])
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
     return keep

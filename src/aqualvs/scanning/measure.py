@@ -15,6 +15,8 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.sheet_kernels import COLUMNS, START, WINDOWED
 from aqualvs.scanning.measure_kernels import (
     distances_off,
+    light_share_near,
+    mark_beside,
     mark_rested_on,
     places_along,
     select_pieces,
@@ -38,7 +40,7 @@ from aqualvs.scanning.plane_fit import (
     fit_pseudo_inverse,
     fit_robust,
 )
-from aqualvs.scanning.posture import Posture, Reason, Refusal, believable, posture_of
+from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, believable, posture_of
 from aqualvs.scanning.quadric import LEAST_BEND, fit_patch, hints_at_curvature, refit_at_nearest
 from aqualvs.scanning.readings import Observations, Readings
 from aqualvs.scanning.search import StripeSearch
@@ -53,10 +55,19 @@ _SHORTEST_STRAND = 3
 _DEEPEST_BEND = 0.15
 _FEW_STRANDS, _STRONG_BEND = 36, 0.02
 # With less than this share of a net's light a surface does not stand for the net: its mean plane
-# does, of which so many strands err independently. Up to the greater share that casts doubt.
+# does. Up to the greater share that casts doubt.
 _MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
-_FOLDS = 6
+# Fewer strands do not show that a net is folded.
+_LEAST_FOLDED = 12
+# So far, as a share of the range, strands may scatter about the mean plane of a folded net.
+_FOLDED_RMS_SHARE = 0.04
 _NEAR_SHARE = 0.005
+# Light that lies so near the plane (share of the range) may be the net's where nothing else
+# explains it. A net with less than the first shares of its strands and of their light on the
+# surface is folds; with more than the last of light there is doubt only, as beside a single fold.
+# Found on simulated nets: folded ones reach 0.43 and 0.51, with a single fold 0.37 and 0.48; flat
+# ones in strong sun and those with growth come down to 0.34 and 0.57, or to 0.56 and 0.29.
+_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT, _DOUBTED_LIGHT = 0.06, 0.45, 0.54, 0.47
 # Independent pieces of stripe that the second best laser must show.
 _MIN_PIECES = 3
 
@@ -86,6 +97,8 @@ class Measurement:
         Readings on the net, also where its folds leave the surface; None for what is no net.
     weights : array, shape (N,), or None
         What each reading weighs in the fit, as 1 over the variance of m·X; None without a posture.
+    folded : bool
+        Whether the posture is that of a folded net's mean plane.
     """
 
     posture: Posture | Refusal
@@ -93,6 +106,7 @@ class Measurement:
     patch: Patch | None = None
     whole: BoolArray | None = None
     weights: FloatArray | None = None
+    folded: bool = False
 
 
 class PostureMeter:
@@ -156,7 +170,8 @@ class PostureMeter:
         """Return what was found if a pilot may rely on it, else why not."""
         if isinstance(found.posture, Refusal):
             return found
-        posture = believable(found.posture, self._working_range)
+        max_rms_share = _FOLDED_RMS_SHARE if found.folded else MAX_RMS_SHARE
+        posture = believable(found.posture, self._working_range, max_rms_share)
         if isinstance(posture, Refusal):
             return Measurement(posture, np.zeros(len(readings), np.bool_), whole=found.whole)
         return found
@@ -180,7 +195,8 @@ class PostureMeter:
             best = _doubted(flat, curved, 1.0)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         whole = self._followed(readings, best.rests_on, plane, patch)
-        best = self._weighed(readings, whole, plane, patch, best, best is curved)
+        folded = self._folded(readings, whole, off, plane, patch, best)
+        best = folded or self._weighed(readings, whole, plane, patch, best, best is curved)
         return replace(best, whole=whole)
 
     def _followed(
@@ -203,6 +219,39 @@ class PostureMeter:
         )
         return whole
 
+    def _folded(
+        self,
+        readings: Readings,
+        whole: BoolArray,
+        off: FloatArray,
+        plane: Plane,
+        patch: FloatArray,
+        best: Measurement,
+    ) -> Measurement | None:
+        """Return the posture to the mean plane of a net most of whose light is off the surface.
+
+        A surface on one flank of a fold explains little of the light that lies about it.
+        """
+        beside = np.empty(len(readings), np.bool_)
+        mark_beside(readings.source, whole, off, _BESIDE_SHARE, beside)
+        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, beside, plane.normal)
+        if len(seen.pieces.laser) < _LEAST_FOLDED:
+            return None
+        near = _NEAR_SHARE * plane.offset
+        if share_near(seen.pieces.points, patch, near) >= _FOLDED_STRANDS:
+            return None
+        light = light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near)
+        mean = self._mean(readings, seen, plane) if light < _FOLDED_LIGHT else None
+        if mean is None or light < _DOUBTED_LIGHT:
+            return mean
+        return _doubted(best, mean, 1.0 - light)
+
+    def _mean(self, readings: Readings, seen: "_Seen", plane: Plane) -> Measurement | None:
+        """Measure the posture to the mean plane of a folded net."""
+        fit = fit_mean(seen.pieces.points, plane)
+        found = None if fit is None else self._measured(readings, seen, fit, of_all=True)
+        return None if found is None else replace(found, folded=True)
+
     def _weighed(
         self,
         readings: Readings,
@@ -214,13 +263,12 @@ class PostureMeter:
     ) -> Measurement:
         """Return the measurement, doubted or replaced by a net's mean plane where it is folds."""
         seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, whole, plane.normal)
-        if len(seen.pieces.laser) < 2 * _FOLDS:
+        if len(seen.pieces.laser) < _LEAST_FOLDED:
             return best
         share = share_near(seen.pieces.points, patch, _NEAR_SHARE * plane.offset)
         if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or is_curved):
             return best
-        fit = fit_mean(seen.pieces.points, plane, _FOLDS)
-        mean = None if fit is None else self._measured(readings, seen, fit, of_all=True)
+        mean = self._mean(readings, seen, plane)
         if mean is None:
             return best
         return mean if share < _MAIN_SHARE else _doubted(best, mean, 1.0 - share)

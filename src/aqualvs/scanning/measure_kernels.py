@@ -5,6 +5,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.optics.sheet_kernels import sheet_distance
+from aqualvs.scanning.patch_kernels import heights_over
 
 # Two stripes disturb each other within this many full widths, and this many pixels more.
 _CROSSING_WIDTHS = 1.2
@@ -195,6 +196,63 @@ def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: Fl
     nx, ny, nz = normal[0] / offset, normal[1] / offset, normal[2] / offset
     for i in range(points.shape[0]):
         off[i] = abs(nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - 1.0)
+
+
+@kernel
+def mark_beside(
+    source: IntArray, whole: BoolArray, off: FloatArray, most: float, beside: BoolArray
+) -> None:
+    """Mark the readings of a net, and those near its plane whose light the net does not explain.
+
+    Parameters
+    ----------
+    source : int array, shape (N,)
+        Number of each reading's return.
+    whole : bool array, shape (N,)
+        Readings of the net.
+    off : array, shape (N,)
+        From `distances_off`.
+    most : float
+        What is farther off is not near.
+    beside : bool array, shape (N,)
+        Written.
+    """
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    explained = np.zeros(last + 1, np.bool_)
+    for i in range(source.shape[0]):
+        if whole[i]:
+            explained[source[i]] = True
+    for i in range(source.shape[0]):
+        beside[i] = whole[i] or (off[i] < most and not explained[source[i]])
+
+
+@kernel
+def light_share_near(
+    group: IntArray, trust: FloatArray, points: FloatArray, patch: FloatArray, near: float
+) -> float:
+    """Return the share of the light that is in pieces nearer to a patch than `near`, in metres.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_pieces`.
+    trust : array, shape (N,)
+        Of the readings.
+    points : array, shape (M, 3)
+        Of the pieces.
+    patch : array, shape (16,)
+        As `Patch.packed` gives it.
+    """
+    height = np.empty(points.shape[0])
+    heights_over(points, patch, height)
+    total, on = 0.0, 0.0
+    for i in range(group.shape[0]):
+        if group[i] >= 0:
+            total += trust[i]
+            on += trust[i] if abs(height[group[i]]) < near else 0.0
+    return on / max(total, 1e-12)
 
 
 @kernel

@@ -15,8 +15,10 @@ _EXACT = 1e-9
 _SINGULAR = 1e12
 
 
-def fit_mean(points: FloatArray, start: Plane, n_folds: int) -> PlaneFit | None:
-    """Fit m·X = 1 to strands all alike but outliers; strands on one flank of a fold err together.
+def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
+    """Fit m·X = 1 to the strands of a folded net: all alike, whatever the errors of their places.
+
+    Their scatter about the plane is that of the folds, and gives the covariance.
 
     Parameters
     ----------
@@ -24,14 +26,14 @@ def fit_mean(points: FloatArray, start: Plane, n_folds: int) -> PlaneFit | None:
         Of the strands, in `dome`, metres.
     start : Plane
         A first guess: tells outliers.
-    n_folds : int
-        So many of them err independently.
 
     Returns
     -------
     PlaneFit or None
         None where the points do not determine a plane.
     """
+    if len(points) <= 3:
+        return None
     m = start.normal / start.offset
     for _ in range(_ITERATIONS):
         off = points @ m - 1.0
@@ -46,7 +48,11 @@ def fit_mean(points: FloatArray, start: Plane, n_folds: int) -> PlaneFit | None:
         return None
     square = float(weights @ (points @ m - 1.0) ** 2)
     rms = float(np.sqrt(square / weights.sum()) / np.linalg.norm(m))
-    covariance = np.asarray(np.linalg.inv(normal), np.float64) * square / n_folds
+    covariance = (
+        np.asarray(np.linalg.inv(normal), np.float64)
+        * square
+        / (weights.sum() * (1.0 - 3.0 / len(points)))
+    )
     return PlaneFit(m, covariance, weights, rms)
 
 

@@ -21,6 +21,9 @@ _MIN_STRETCHES = 3
 _FEW_STRETCHES = 5
 LONGEST_STRETCH = 0.03
 """The light on one strand is typically shorter than this, in metres."""
+# A stripe with this share of its light in stretches so much longer lies on something solid that is
+# partly hidden or broken by its texture; growth and strands along a laser make few of them.
+_UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
 # A chunk with a smaller share of its light as voice lies in a curved stretch.
 _CURVED_VOICE = 0.21
 # Share of the lines at each end of a stripe that may be stragglers.
@@ -38,6 +41,9 @@ class Pattern(NamedTuple):
         seen, a few short stretches and nothing longer are enough.
     is_gappy : bool
         As on a dense net, or as on a wall in the shadows of a net: short stretches at any gaps.
+    is_unbroken : bool
+        As on something solid, if need be with gaps: on two lasers (or the only one asked) much
+        of the light is in stretches longer than those on strands.
     extent : float
         Search lines over which the gappy stripes reach, summed over the lasers.
     on_strands : array, shape (n_lasers,)
@@ -46,6 +52,7 @@ class Pattern(NamedTuple):
 
     is_mesh: bool
     is_gappy: bool
+    is_unbroken: bool
     extent: float
     on_strands: FloatArray
 
@@ -73,7 +80,7 @@ def describe_pattern(
     Pattern
     """
     on_strands = np.zeros(n_lasers)
-    is_mesh, is_gappy, extent = _describe(
+    is_mesh, is_gappy, is_unbroken, extent = _describe(
         chunks.table,
         chunks.light,
         chunks.n_lines,
@@ -85,7 +92,7 @@ def describe_pattern(
         focal_px,
         on_strands,
     )
-    return Pattern(is_mesh, is_gappy, extent, on_strands)
+    return Pattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
 
 
 @kernel
@@ -100,19 +107,20 @@ def _describe(
     min_lines: int,
     focal_px: float,
     on_strands: FloatArray,
-) -> tuple[bool, bool, float]:
+) -> tuple[bool, bool, bool, float]:
     """Write the light on strands; returns the rest of a `Pattern`."""
-    asked, broken, gappy, long, n_stretches = 0, 0, 0, 0, 0
+    asked, broken, gappy, long, unbroken, n_stretches = 0, 0, 0, 0, 0, 0
     total = 0.0
     for index in range(on_strands.shape[0]):
         order, n_mine = _in_order(first_line, n_lines, laser, members, index)
         if n_mine < min_lines:
             continue
         asked += 1
-        n, duty, length, extent, on_strands[index] = _describe_stripe(
+        n, duty, length, extent, on_strands[index], share = _describe_stripe(
             table, light, n_lines, first_line, last_line, order, focal_px
         )
         n_stretches += n
+        unbroken += share >= _UNBROKEN_SHARE
         is_short = length < LONGEST_STRETCH
         long += not is_short
         is_gappy = n >= _MIN_STRETCHES and is_short and duty < _GAPPY_DUTY
@@ -121,7 +129,7 @@ def _describe(
         total += extent if is_gappy else 0.0
     few = not long and gappy == broken and n_stretches >= _FEW_STRETCHES
     enough = min(2, asked)
-    return broken >= enough or few, gappy >= enough or few, total
+    return broken >= enough or few, gappy >= enough or few, unbroken >= enough, total
 
 
 @kernel
@@ -153,8 +161,10 @@ def _describe_stripe(
     last_line: IntArray,
     order: IntArray,
     focal_px: float,
-) -> tuple[int, float, float, float, float]:
+) -> tuple[int, float, float, float, float, float]:
     """Stretches of one laser's stripe: number, duty, typical length (m), extent, light on strands.
+
+    Last the share of the lit search lines that are in stretches much longer than a strand's light.
 
     Medians, so that what hides behind a fish or a box for a while does not count.
     """
@@ -181,12 +191,16 @@ def _describe_stripe(
     n_stretches += 1
     stretch = np.median(lit[:n_stretches])
     m_per_line = np.median(distance) / focal_px
-    on_strands = 0.0
+    on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
     for k in range(n_stretches):
+        all_lines += lit[k]
         if lit[k] * m_per_line < LONGEST_STRETCH:
             on_strands += bright[k]
+        elif lit[k] * m_per_line > _UNBROKEN_LENGTHS * LONGEST_STRETCH:
+            unbroken += lit[k]
+    share = float(unbroken / all_lines)
     duty = float(stretch / (stretch + gap))
-    return n_stretches, duty, float(stretch * m_per_line), extent, on_strands
+    return n_stretches, duty, float(stretch * m_per_line), extent, on_strands, share
 
 
 @kernel

@@ -5,10 +5,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
+from aqualvs.geometry.planes import Plane
 from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
+from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Verdict, widened
+from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
@@ -20,8 +23,14 @@ from aqualvs.scanning.readings import Readings, read_returns
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
 from aqualvs.scanning.stripe import Returns, StripeOptions
-from aqualvs.scanning.surfaces import MIN_LINES_PER_LASER, Surface, find_surfaces
-from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.surfaces import (
+    MIN_LINES_PER_LASER,
+    Surface,
+    find_surfaces,
+    shares_light,
+    surface_on,
+)
+from aqualvs.scanning.target import TargetKind, choose_target, read_as_wanted
 from aqualvs.scanning.threshold import ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -74,6 +83,9 @@ class Scanner:
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera)
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
+        self._assignment = AssignmentTest(
+            self._searches, self._triangulator, searched_range(rig.working_range)
+        )
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -148,12 +160,25 @@ class Scanner:
             searched_range(self.rig.working_range),
             self.rig.focal_px,
         )
+        surfaces = read_as_wanted(surfaces, self.options.target)
         target = choose_target(surfaces, self.options.target, self.rig.working_range)
+        tested = UNTESTED
+        if target is not None:
+            # The same peaks, read as other lasers', may make a plane that is as good or better.
+            tested = self._assignment.test(readings, chunks, chunk_index, target)
+            if tested.verdict is Verdict.RIVAL and tested.other is not None:
+                surfaces = self._with_rival(surfaces, target, tested.other, chunks)
+                target = choose_target(surfaces, self.options.target, self.rig.working_range)
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _no_target(readings, surfaces, self.options.target)
+        elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
+            found = _by_chance(readings)
+        elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
+            found = _ambiguous(readings, target.plane, tested.other)
         else:
             found = self._meter.measure(readings, chunk_index, target)
+            found = widened(found, tested)
         points, listed = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
@@ -174,10 +199,34 @@ class Scanner:
         )
         return replace(posture, rig_covariance=covariance)
 
+    def _with_rival(
+        self, surfaces: list[Surface], target: Surface, other: Plane, chunks: Chunks
+    ) -> list[Surface]:
+        """Put the rival that explains the picture better in place of a surface."""
+        rival = surface_on(other, chunks, len(self.rig.lasers), self.rig.focal_px)
+        kept = [
+            one for one in surfaces if one is not target and not shares_light(one, rival, chunks)
+        ]
+        return read_as_wanted([rival, *kept], self.options.target)
+
 
 def _on_mesh(paper_filter: PaperFilter, points: ScanPoints) -> BoolArray:
     laser = points.laser.astype(np.int64)
     return paper_filter.apply(points.pixels, points.width, laser).returns_on_mesh(len(points))
+
+
+def _by_chance(readings: Readings) -> Measurement:
+    detail = "the best plane is small, and lasers that should be seen on it are not"
+    return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(readings), np.bool_))
+
+
+def _ambiguous(readings: Readings, one: Plane, other: Plane) -> Measurement:
+    apart = np.rad2deg(np.arccos(min(float(one.normal @ other.normal), 1.0)))
+    detail = (
+        f"planes at {one.offset:.3f} m and {other.offset:.3f} m, {apart:.1f} deg apart, explain "
+        "the stripes about as well"
+    )
+    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(readings), np.bool_))
 
 
 def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Measurement:

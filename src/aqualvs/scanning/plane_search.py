@@ -34,8 +34,8 @@ _STEP = 32
 _NEIGHBOURHOOD = 8
 # Chunks with a smaller share of the typical voice are not sampled.
 _SOFTEST_SHARE = 0.5
-# Normals farther than this from the vehicle's forward axis are not a target in front of it.
-_MIN_FACING = float(np.cos(np.deg2rad(55.0)))
+MIN_FACING = float(np.cos(np.deg2rad(55.0)))
+"""Normals farther from the vehicle's forward axis are not a target in front of it."""
 # Distance of a chunk from a plane: this share of the range, and this shift of the stripe.
 _GATE_RANGE_SHARE = 0.003
 _GATE_PX = 1.0
@@ -107,7 +107,7 @@ def _near(
 
 
 @kernel
-def _refine(
+def refine_plane(
     table: FloatArray,
     plane: FloatArray,
     stretch: float,
@@ -303,7 +303,7 @@ def search_plane(
             continue
         if not _plane_through(table, i, j, k, plane):
             continue
-        if plane[3] < nearest or plane[3] > farthest or plane[1] < _MIN_FACING:
+        if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
             continue
         # A plane through neighbours is rough: judged by a wide gate, drawn in by narrower ones.
         score = _score(
@@ -313,7 +313,7 @@ def search_plane(
             continue
         best_rough = max(best_rough, score)
         for stretch in (_WIDE_GATE, 0.5 * (1.0 + _WIDE_GATE), 1.0):
-            _refine(table, plane, stretch, normal, scratch, lanes)
+            refine_plane(table, plane, stretch, normal, scratch, lanes)
         score = _score(table, laser_start, plane, 1.0, voice_after, best, lanes)
         if score <= best:
             continue
@@ -326,5 +326,5 @@ def search_plane(
         needed = min(most, int(25.0 / (share * share)) + 20)
     for _ in range(3):
         if best > 0.0:
-            _refine(table, best_plane, 1.0, normal, scratch, lanes)
+            refine_plane(table, best_plane, 1.0, normal, scratch, lanes)
     return best > 0.0

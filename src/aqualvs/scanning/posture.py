@@ -15,8 +15,8 @@ from aqualvs.scanning.plane_fit import PlaneFit
 # Beyond these a posture tells nothing that a pilot could use.
 _MAX_SIGMA_RANGE_SHARE = 0.05
 _MAX_SIGMA_ANGLE = np.deg2rad(5.0)
-# A plane fits a net or a wall within this share of the range, or it is not a plane.
-_MAX_RMS_SHARE = 0.02
+MAX_RMS_SHARE = 0.02
+"""A plane fits a net or a wall within this share of the range, or it is not a plane."""
 # What detection noise may add to the edge of the working range.
 _RANGE_TOLERANCE = 0.01
 
@@ -34,6 +34,8 @@ class Reason(StrEnum):
     """The points are almost on a line; the plane could turn about it."""
     NOT_A_PLANE = "not_a_plane"
     """Stripes that share no plane."""
+    AMBIGUOUS = "ambiguous"
+    """The stripes fit two planes about as well, read as different lasers'."""
     NO_TARGET = "no_target"
     """Surfaces, but none of the kind that was asked for."""
     OUT_OF_RANGE = "out_of_range"
@@ -152,7 +154,9 @@ def posture_of(
     )
 
 
-def believable(posture: Posture, working_range: tuple[float, float]) -> Posture | Refusal:
+def believable(
+    posture: Posture, working_range: tuple[float, float], max_rms_share: float = MAX_RMS_SHARE
+) -> Posture | Refusal:
     """Return the posture if a pilot may rely on it, else why not.
 
     Parameters
@@ -161,6 +165,8 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
         As measured.
     working_range : (float, float)
         Nearest and farthest range that is believed, in metres.
+    max_rms_share : float
+        Points may scatter about the surface by this share of the range.
     """
     near, far = working_range
     distance = posture.range
@@ -177,7 +183,7 @@ def believable(posture: Posture, working_range: tuple[float, float]) -> Posture 
             Reason.OUT_OF_RANGE,
             f"range {distance:.3f} m is outside the working range {near:.2f} to {far:.2f} m",
         )
-    if posture.rms > _MAX_RMS_SHARE * distance:
+    if posture.rms > max_rms_share * distance:
         return Refusal(
             Reason.NOT_A_PLANE, f"points are {1e3 * posture.rms:.1f} mm rms off the best plane"
         )

@@ -83,8 +83,8 @@ def link_segments(returns: Returns, search: StripeSearch) -> Segments:
 
 
 @kernel
-def on_long_segments(line: IntArray, position: FloatArray) -> BoolArray:
-    """Mark the returns (N,) that belong to long segments, wherever they run.
+def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
+    """Mark the returns (N,) of segments of at least `CHUNK_LINES`, wherever they run.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def on_long_segments(line: IntArray, position: FloatArray) -> BoolArray:
     _link(line, position, anywhere[0], anywhere[1], segment_of, first, last, count)
     long = np.empty(n, np.bool_)
     for i in range(n):
-        long[i] = count[segment_of[i]] >= _LONG_SEGMENT
+        long[i] = count[segment_of[i]] >= CHUNK_LINES
     return long
 
 

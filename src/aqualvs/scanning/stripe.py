@@ -27,6 +27,8 @@ _VALLEY_TENTHS = 6
 _WORD, _WORD_BITS, _IN_WORD = 8, 3, 7
 _NOTHING = np.uint64(0)
 _BRIGHT = np.uint8(255)
+# Luma of flanks that are dark; black is 16.
+_DARK = 36.0
 POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT = range(8)
 """Rows of a table of peaks."""
 N_MEASURES = 8
@@ -455,7 +457,8 @@ def _measure_chroma(
                     v_after - v_before
                 )
                 tint = along_u * (u_flank - 128.0) + along_v * (v_flank - 128.0)
-                measures[TINT] = tint / max(luma, 16.0)
+                # In the dark there is no light that paint could show, only the line's own glow.
+                measures[TINT] = tint / luma if luma > _DARK else 0.0
 
 
 @inline_borrowing_kernel

@@ -156,6 +156,40 @@ def _collect(
     return n
 
 
+@kernel
+def collect_surface(
+    table: FloatArray,
+    n_lines: IntArray,
+    light: FloatArray,
+    laser: IntArray,
+    n_lasers: int,
+    plane: FloatArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> None:
+    """Mark the chunks on a plane; write what `search_surfaces` writes of a surface.
+
+    Parameters
+    ----------
+    table, n_lines, light, laser
+        As in `Chunks`, C of them.
+    n_lasers : int
+        Lasers of the rig.
+    plane : array, shape (4,)
+        Normal and offset.
+    members : bool array, shape (C,)
+        Written where True; False at first.
+    sums : array, shape (3,)
+        Written: search lines, light and voice.
+    """
+    by_laser = np.zeros((3, n_lasers))
+    rows = np.arange(laser.shape[0])
+    _collect(table, rows, plane, n_lines, light, laser, members, by_laser)
+    sums[LINES] = np.sum(by_laser[LINES])
+    sums[SUPPORT] = on_two(by_laser[SUPPORT])
+    sums[VOICE] = on_two(by_laser[VOICE])
+
+
 @borrowing_kernel
 def on_two(weight: FloatArray) -> float:
     """Sum over the lasers, the first of them with at most three times the second's share."""

@@ -18,16 +18,26 @@ from aqualvs.scanning.surface_search import (
     MIN_LINES_PER_LASER,
     MOST_SURFACES,
     WORTH_SHARE,
+    collect_surface,
     on_two,
     search_surfaces,
 )
 
-__all__ = ("MIN_LINES_PER_LASER", "WORTH_SHARE", "Surface", "find_surfaces")
+__all__ = (
+    "MIN_LINES_PER_LASER",
+    "WORTH_SHARE",
+    "Surface",
+    "find_surfaces",
+    "shares_light",
+    "surface_on",
+)
 
 # So much of a net's light lies on strands; that of a fish lies in long or bent stretches.
 _STRANDS_SHARE = 0.4
 # A wall's shadows reach nearly as far as the net that casts them.
 _EXTENT_SHARE = 0.6
+# With more of its search lines on another surface it is a part of that one.
+_SHARED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +64,8 @@ class Surface:
         Whether its stripes are broken as those on a net are.
     is_gappy : bool
         Whether they are broken at least, as on a dense net or in a net's shadows.
+    is_unbroken : bool
+        Whether much of the light is in long stretches all the same, as on a table with gaps.
     n_pieces : int
         Planes that were joined, because a folded or bent net goes on from one to the next. `plane`
         is then that of the largest, or their mean where none of them has half of the light.
@@ -67,6 +79,7 @@ class Surface:
     extent: float
     is_mesh: bool
     is_gappy: bool = False
+    is_unbroken: bool = False
     n_pieces: int = 1
 
 
@@ -127,6 +140,30 @@ def find_surfaces(
     return _join_pieces(told, chunks)
 
 
+def surface_on(plane: Plane, chunks: Chunks, n_lasers: int, focal_px: float) -> Surface:
+    """Return the surface of all chunks on a plane, whatever else explains their light.
+
+    Parameters
+    ----------
+    plane : Plane
+        In `dome`, offset > 0.
+    chunks, n_lasers, focal_px
+        As in `find_surfaces`.
+    """
+    packed, members = np.append(plane.normal, plane.offset), np.zeros(len(chunks), np.bool_)
+    sums = np.empty(3)
+    collect_surface(
+        chunks.table, chunks.n_lines, chunks.light, chunks.laser, n_lasers, packed, members, sums
+    )
+    return _describe(chunks, packed, members, sums, n_lasers, focal_px)
+
+
+def shares_light(one: Surface, other: Surface, chunks: Chunks) -> bool:
+    """Tell whether half of a surface's chunks are on another one as well."""
+    shared = chunks.n_lines[one.members & other.members].sum()
+    return bool(shared > _SHARED * chunks.n_lines[one.members].sum())
+
+
 def _describe(
     chunks: Chunks,
     plane: FloatArray,
@@ -149,6 +186,7 @@ def _describe(
         extent=pattern.extent,
         is_mesh=pattern.is_mesh and on_strands,
         is_gappy=pattern.is_gappy and on_strands,
+        is_unbroken=pattern.is_unbroken,
     )
 
 
@@ -189,15 +227,15 @@ def _joined(pieces: list[Surface], chunks: Chunks) -> Surface:
 
 
 def _is_dense_net(surface: Surface, surfaces: list[Surface], chunks: Chunks) -> bool:
-    """Whether another surface, broken by shadows, is seen through the gaps of this one."""
-    return (
-        surface.is_gappy
-        and not surface.is_mesh
-        and any(
-            other.is_gappy
-            and other.plane.offset > surface.plane.offset
-            and other.extent >= _EXTENT_SHARE * surface.extent
-            and seen_through(surface.members, other.members, chunks)
-            for other in surfaces
-        )
+    """Whether another surface, broken by shadows, is seen through the gaps of this one.
+
+    A net that is near may fill most of the stripes; it then has more light than what it shadows.
+    """
+    return not surface.is_mesh and any(
+        other.is_gappy
+        and (surface.is_gappy or surface.support > other.support)
+        and other.plane.offset > surface.plane.offset
+        and other.extent >= _EXTENT_SHARE * surface.extent
+        and seen_through(surface.members, other.members, chunks)
+        for other in surfaces
     )

@@ -1,6 +1,7 @@
 """The target: which of the surfaces in view the posture is measured to."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 
 from aqualvs.scanning.surfaces import WORTH_SHARE, Surface
@@ -22,7 +23,17 @@ class TargetKind(StrEnum):
     NET = "net"
     """Only a mesh-like surface."""
     SOLID = "solid"
-    """Only a surface with unbroken stripes."""
+    """Only a surface with unbroken stripes, or with long stretches between gaps."""
+
+
+def read_as_wanted(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
+    """Return the surfaces, those solid that may be so where something solid is asked for.
+
+    A table with gaps, or a wall whose texture breaks the stripes, may look like a net.
+    """
+    if kind is not TargetKind.SOLID:
+        return surfaces
+    return [replace(one, is_mesh=one.is_mesh and not one.is_unbroken) for one in surfaces]
 
 
 def choose_target(

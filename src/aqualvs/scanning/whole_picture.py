@@ -1,5 +1,6 @@
 """Stripes in a whole picture, when nothing is known yet of the lasers that draw them."""
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -43,20 +44,20 @@ class WholePictureOptions:
     min_likelihood : float
         Least mean likelihood along a piece of stripe that its colour is a laser's: what tells a
         laser's line from a printed edge. Only used where the picture has colour.
-    min_length_px : int
-        Shortest unbroken piece of a stripe.
+    min_length_share : float
+        Shortest unbroken piece of a stripe, as a share of the picture's width.
     wavelength_nm : float or None
         Of the lasers; green if None.
     """
 
     min_likelihood: float = 0.4
-    min_length_px: int = 12
+    min_length_share: float = 0.015
     wavelength_nm: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        if self.min_length_px < 3:
-            raise OptionError(f"min_length_px is {self.min_length_px}; use 3 or more")
+        if not 0.0 < self.min_length_share < 1.0:
+            raise OptionError(f"min_length_share is {self.min_length_share}; use 0 to 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ def find_stripes(
     most = _RETURNS_PER_LINE * max(len(search.lowest) for search in searches)
     detector = FrameDetector((width, height), searches, StripeOptions(max_returns=most))
     returns = detector.detect(frame)
-    found = _joined([_pieces(search, returns[search.axis], options) for search in searches])
+    found = _joined([_pieces(search, returns[search.axis], width, options) for search in searches])
     return replace(found, sigma_px=_sigma_px(frame.luma, found))
 
 
@@ -128,11 +129,13 @@ def _whole_search(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColou
     return StripeSearch(axis, line_px, lowest, highest, -slopes, slopes, colour)
 
 
-def _pieces(search: StripeSearch, returns: Returns, options: WholePictureOptions) -> StripePixels:
+def _pieces(
+    search: StripeSearch, returns: Returns, width_px: int, options: WholePictureOptions
+) -> StripePixels:
     """Return the pieces that are of the colour, long enough, and cross the search lines well."""
     segments = link_segments(returns, search)
     chains = np.split(segments.order, np.flatnonzero(np.diff(segments.stretch)) + 1)
-    least = max(3, -(-options.min_length_px // search.line_px))
+    least = max(3, math.ceil(options.min_length_share * width_px / search.line_px))
     kept = [
         chain
         for chain in chains

@@ -1,0 +1,293 @@
+"""The test of a surface against rival assignments of the same peaks to lasers.
+
+Where lasers are nearly parallel, a picture in which every stripe is read as its neighbour's may
+show a plane as well: shifted and tilted, with small residuals. The rivals of a surface are found by
+reading the peaks of two of its stripes as other lasers', which gives a plane, and refining that
+plane on all peaks. Each hypothesis is then judged by
+
+- the light that it explains: peaks of the same looks that are left over count against it;
+- the light that it misses: a laser whose stripe would lie in the picture, beside others that are
+  seen, and shows nothing. It may be switched off or hidden, so this is a cost and no gate;
+- the residuals of each laser's stripe as a whole: the log-likelihood ratio of two fits with unknown
+  noise is half the degrees of freedom times the logarithm of the ratio of the variances.
+
+The order of the stripes needs no rule of its own: on a plane in front of camera and emitter a fan's
+stripes appear in the order of its lasers, and only such planes are considered.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.assignment_kernels import (
+    CELL_LINES,
+    DARK,
+    FREEDOM,
+    LIGHT,
+    N_FACTS,
+    PER_LASER,
+    SAME_ANGLE,
+    SAME_RANGE,
+    VARIANCE,
+    find_rivals,
+    judge_planes,
+    light_left,
+    seen_of,
+)
+from aqualvs.scanning.chunks import Chunks
+from aqualvs.scanning.measure import Measurement
+from aqualvs.scanning.net_mean import doubted
+from aqualvs.scanning.posture import Refusal, range_pitch_yaw
+from aqualvs.scanning.readings import Readings
+from aqualvs.scanning.search import SearchAxis, StripeSearch
+from aqualvs.scanning.surfaces import Surface
+from aqualvs.scanning.triangulate import Triangulator
+
+# Log-odds: a laser that shows nothing though it should is that unlikely (7 %), so is a stripe as
+# good as the others that is none (5 %); odds of 20 to 1 decide.
+_DARK_LASER, _FOREIGN_STRIPE, _DECIDED = 2.6, 3.0, 3.0
+# Residuals of half stripes count as at most so many independent ones, because errors of the rig are
+# no noise. Then what residuals may say at most.
+_MOST_FREEDOM, _MOST_BY_RESIDUALS = 10.0, 12.0
+# Hypotheses that are nearer than this are joined by a greater sigma instead of a refusal.
+_NEAR_RANGE, _NEAR_ANGLE = 0.02, math.radians(2.0)
+# So many rivals are refined.
+_N_RIVALS = 6
+# Samples across a laser's band, where its stripe on a plane is looked up.
+_N_SAMPLES = 16
+# A surface with less than this share of the light that no other explains, or a solid one whose
+# stripes are nowhere seen over this share of their way through the picture, must be seen evenly:
+# caustics and fish are not. This share of the lasers may be faint. Found on rendered dives: planes
+# through caustics have up to 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones
+# to 0.14.
+_LITTLE_LIGHT, _SHORT_WAY, _MAY_BE_FAINT = 0.12, 0.15, 0.25
+
+
+class Verdict(Enum):
+    """What the test says of a surface."""
+
+    CLEAR = "clear"
+    """No rival comes near it."""
+    RIVAL = "rival"
+    """Another plane explains the picture better."""
+    NEAR = "near"
+    """Another plane is as good, and near: the posture's sigma must cover both."""
+    AMBIGUOUS = "ambiguous"
+    """Another plane is as good, and far off."""
+
+
+class Outcome(NamedTuple):
+    """The verdict, the other plane where there is one, and the log-odds of the better one."""
+
+    verdict: Verdict
+    other: Plane | None = None
+    log_odds: float = math.inf
+
+
+UNTESTED = Outcome(Verdict.CLEAR)
+"""Where there is nothing to test, or nothing against it."""
+
+
+class AssignmentTest:
+    """Tests surfaces of one rig against rival assignments.
+
+    Parameters
+    ----------
+    searches : sequence of StripeSearch
+        One for each laser.
+    triangulator : Triangulator
+        Of the same rig.
+    searched : (float, float)
+        Nearest and farthest plane that is considered, in metres.
+    """
+
+    def __init__(
+        self,
+        searches: Sequence[StripeSearch],
+        triangulator: Triangulator,
+        searched: tuple[float, float],
+    ) -> None:
+        self._searched = searched
+        self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in searches], np.bool_)
+        self._bands = _sample_bands(searches, triangulator)
+
+    def by_chance(
+        self,
+        readings: Readings,
+        chunks: Chunks,
+        chunk_index: IntArray,
+        surfaces: Sequence[Surface],
+        target: Surface,
+    ) -> bool:
+        """Tell whether a surface is so small, and seen so unevenly, that it may be no surface.
+
+        Parameters
+        ----------
+        readings, chunks, chunk_index
+            As in `test`.
+        surfaces : sequence of Surface
+            All that were found: light on the others does not speak against this one.
+        target : Surface
+            The one to judge.
+        """
+        others = np.zeros(len(chunks), np.bool_)
+        for one in surfaces:
+            if one is not target:
+                others |= one.members
+        plane = np.append(target.plane.normal, target.plane.offset)
+        light = light_left(readings.source, readings.trust, chunk_index, target.members, others)
+        most, faint = seen_of(plane, target.members, chunks.n_lines, chunks.laser, self._bands)
+        small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not target.is_mesh)
+        return small and faint > _MAY_BE_FAINT
+
+    def test(
+        self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surface: Surface
+    ) -> Outcome:
+        """Test a surface.
+
+        Parameters
+        ----------
+        readings : Readings
+            N of them.
+        chunks : Chunks
+            C of them.
+        chunk_index : int array, shape (N,)
+            Row of each reading's chunk.
+        surface : Surface
+            The one to test.
+        """
+        n_lasers = len(self._along_x)
+        if n_lasers < 2:
+            return UNTESTED
+        planes = np.empty((_N_RIVALS + 1, 4))
+        facts = np.empty((_N_RIVALS + 1, N_FACTS))
+        planes[0, :3], planes[0, 3] = surface.plane.normal, surface.plane.offset
+        n = find_rivals(
+            readings.source,
+            readings.laser,
+            readings.trust,
+            readings.points,
+            readings.sensitivity,
+            chunk_index,
+            surface.members,
+            chunks.table,
+            *self._searched,
+            n_lasers,
+            planes,
+        )
+        if n == 0:
+            return UNTESTED
+        judge_planes(
+            planes[: n + 1],
+            chunks.table,
+            chunks.n_lines,
+            chunks.first_line,
+            chunks.last_line,
+            chunks.laser,
+            readings.source,
+            readings.trust,
+            chunk_index,
+            self._along_x,
+            self._bands,
+            facts,
+        )
+        return _verdict(planes[: n + 1], facts[: n + 1])
+
+
+def widened(found: Measurement, outcome: Outcome) -> Measurement:
+    """Return a measurement with its covariance widened by a near rival.
+
+    Parameters
+    ----------
+    found : Measurement
+        Of the surface that was tested.
+    outcome : Outcome
+        What the test said of it.
+    """
+    posture, other = found.posture, outcome.other
+    if outcome.verdict is not Verdict.NEAR or other is None or isinstance(posture, Refusal):
+        return found
+    distance, pitch, yaw = range_pitch_yaw(other.normal / other.offset)
+    rival = replace(posture, range=distance, pitch=pitch, yaw=yaw)
+    share = 1.0 / (1.0 + math.exp(outcome.log_odds))
+    return replace(found, posture=doubted(posture, rival, share))
+
+
+def _verdict(planes: FloatArray, facts: FloatArray) -> Outcome:
+    """Compare the surface, the first plane, with its rivals, and those with each other."""
+    best = 0
+    for k in range(1, len(planes)):
+        if _log_odds(facts[best], facts[k]) < 0.0:
+            best = k
+    # The nearest rival of the best one.
+    second, odds = -1, math.inf
+    for k in range(len(planes)):
+        one = _log_odds(facts[best], facts[k]) if not _alike(planes[best], planes[k]) else math.inf
+        if one < odds:
+            second, odds = k, one
+    kept = _alike(planes[best], planes[0])
+    if odds < _DECIDED:
+        other = _plane(planes[second] if kept else planes[best])
+        if not _alike(planes[best], planes[second], _NEAR_RANGE, _NEAR_ANGLE):
+            return Outcome(Verdict.AMBIGUOUS, other, odds)
+        if kept:
+            return Outcome(Verdict.NEAR, other, odds)
+    return UNTESTED if kept else Outcome(Verdict.RIVAL, _plane(planes[best]), odds)
+
+
+def _plane(packed: FloatArray) -> Plane:
+    return Plane(packed[:3].copy(), float(packed[3]))
+
+
+def _log_odds(one: FloatArray, other: FloatArray) -> float:
+    """Return the log-odds of one hypothesis against another."""
+    per_laser = max(one[PER_LASER], other[PER_LASER], 1e-9)
+    light = _FOREIGN_STRIPE * (one[LIGHT] - other[LIGHT]) / per_laser
+    dark = _DARK_LASER * (other[DARK] - one[DARK])
+    freedom = min(one[FREEDOM], other[FREEDOM], _MOST_FREEDOM)
+    residuals = 0.0
+    if freedom > 0.0:
+        residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE])
+    return float(light + dark + min(max(residuals, -_MOST_BY_RESIDUALS), _MOST_BY_RESIDUALS))
+
+
+def _alike(
+    one: FloatArray, other: FloatArray, share: float = SAME_RANGE, angle: float = SAME_ANGLE
+) -> bool:
+    cosine = float(one[:3] @ other[:3])
+    return bool(abs(one[3] / other[3] - 1.0) < share and cosine > math.cos(angle))
+
+
+def _sample_bands(searches: Sequence[StripeSearch], triangulator: Triangulator) -> FloatArray:
+    """Sample the points that each laser's band sees: (n_lasers, cells, samples, 4).
+
+    A point P is kept as (P, 1) / |P|: with it (m·X - 1) / |X| changes nearly evenly across a band.
+    NaN where nothing is seen.
+    """
+    n_cells = max((len(one.lowest) for one in searches), default=0) // CELL_LINES + 1
+    bands = np.full((len(searches), n_cells, _N_SAMPLES, 4), np.nan)
+    for i, search in enumerate(searches):
+        lines = np.arange(CELL_LINES // 2, len(search.lowest), CELL_LINES)
+        lines = lines[search.lowest[lines] <= search.highest[lines]]
+        if not len(lines):
+            continue
+        places = np.linspace(search.lowest[lines], search.highest[lines], _N_SAMPLES, axis=1)
+        across = np.broadcast_to((lines + 0.5)[:, None] * search.line_px - 0.5, places.shape)
+        along_x = search.axis is SearchAxis.ALONG_X
+        pixels = np.stack([places, across] if along_x else [across, places], axis=-1)
+        n = places.size
+        found = triangulator.triangulate(
+            np.ascontiguousarray(pixels.reshape(n, 2)), np.full(n, int(along_x)), np.full(n, i)
+        )
+        points = found.points_in_dome
+        share = 1.0 / np.linalg.norm(points, axis=1)
+        packed = np.column_stack([points * share[:, None], share])
+        packed[~found.valid] = np.nan
+        bands[i, lines // CELL_LINES] = packed.reshape(*places.shape, 4)
+    return bands

@@ -1,0 +1,581 @@
+"""The arithmetic of `AssignmentTest`: rivals of a plane, and what speaks for each of them."""
+
+import math
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.symmetric import solve_symmetric
+from aqualvs.scanning.plane_search import (
+    JX,
+    JY,
+    JZ,
+    MIN_FACING,
+    X,
+    Y,
+    Z,
+    refine_plane,
+    squared_gate,
+)
+
+LIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
+"""What is found of a hypothesis: light that it explains, the same for each laser, dark lasers,
+variance of half stripes (px²) and its degrees of freedom."""
+N_FACTS = 5
+CELL_LINES = 16
+"""Search lines to a cell along a stripe."""
+SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
+"""Hypotheses that are so near each other (share of the range, radians) are one."""
+
+# Rivals that explain less of the light, as a share of the surface's, are none.
+_RIVAL_SHARE = 0.5
+# Stripes of so many lasers start rivals.
+_N_SEEDS = 4
+# The noise (px) that half a stripe has at least.
+_HALF_STRIPE_PX = 0.1
+# What lies within this many gates of a plane is on it: lasers that a calibration knows less well
+# than a peak is measured must not count as dark, nor their light as foreign.
+_WIDE = 2.5
+# Fewer cells say nothing of a laser; with a smaller share of the typical one's light it is dark.
+_LEAST_CELLS, _DARK_SHARE = 3, 0.25
+# A cell is lit if this share of the other lasers that can be there is seen there.
+_LIT_SHARE = 0.15
+# Half a stripe with fewer search lines says nothing.
+_LEAST_LINES = 8
+# A laser is faint with this share of the best one's way through the picture.
+_FAINT = 0.4
+# Columns of sums over the peaks of one laser's stripe, read as some laser's.
+_XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = range(14)
+
+
+@kernel
+def find_rivals(
+    source: IntArray,
+    laser: IntArray,
+    trust: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    chunk_index: IntArray,
+    members: BoolArray,
+    table: FloatArray,
+    nearest: float,
+    farthest: float,
+    n_lasers: int,
+    planes: FloatArray,
+) -> int:
+    """Write planes on which a surface's peaks are other lasers'; returns how many.
+
+    Parameters
+    ----------
+    source, laser, trust, points, sensitivity
+        As in `Readings`, N of them.
+    chunk_index : int array, shape (N,)
+        Row of each reading's chunk.
+    members : bool array, shape (C,)
+        Chunks on the surface.
+    table : array, shape (7, C)
+        As in `Chunks`.
+    nearest, farthest : float
+        Planes beyond are not considered, in metres.
+    n_lasers : int
+        Lasers of the rig.
+    planes : array, shape (1 + n, 4)
+        Normals and offsets: that of the surface, which is refined, then written.
+    """
+    sums = np.zeros((n_lasers, n_lasers, _N_SUMS))
+    place = np.zeros((n_lasers, 3))
+    _sum_readings(source, laser, trust, points, sensitivity, chunk_index, members, sums)
+    total, other = 0.0, 0.0
+    for i in range(n_lasers):
+        own = sums[i, i, _N]
+        total += own
+        most = 0.0
+        for a in range(n_lasers):
+            if a != i:
+                most = max(most, sums[i, a, _N])
+        other += min(most, own)
+        if own > 0.0:
+            for k in range(3):
+                place[i, k] = sums[i, i, _SX + k] / own
+    if other < _RIVAL_SHARE * total:
+        return 0
+    seeds = _choose_seeds(sums, place)
+    score = np.zeros(planes.shape[0])
+    n = 0
+    for p in range(seeds.shape[0]):
+        for q in range(p + 1, seeds.shape[0]):
+            n = _try_pair(sums, seeds[p], seeds[q], nearest, farthest, total, planes, score, n)
+    return _refine_rivals(table, nearest, farthest, planes, n)
+
+
+@kernel
+def _sum_readings(
+    source: IntArray,
+    laser: IntArray,
+    trust: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    chunk_index: IntArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> None:
+    """Sum the moments of each laser's peaks on the surface, read as each laser's."""
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    owner = np.full(last + 1, -1)
+    for i in range(source.shape[0]):
+        if members[chunk_index[i]]:
+            owner[source[i]] = laser[i]
+    for i in range(source.shape[0]):
+        own = owner[source[i]]
+        if own < 0:
+            continue
+        w, row = trust[i], sums[own, laser[i]]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        row[_XX] += w * x * x
+        row[_XY] += w * x * y
+        row[_XZ] += w * x * z
+        row[_YY] += w * y * y
+        row[_YZ] += w * y * z
+        row[_ZZ] += w * z * z
+        row[_SX] += w * x
+        row[_SY] += w * y
+        row[_SZ] += w * z
+        row[_N] += w
+        row[_SJX] += w * sensitivity[i, 0]
+        row[_SJY] += w * sensitivity[i, 1]
+        row[_SJZ] += w * sensitivity[i, 2]
+
+
+@kernel
+def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
+    """Choose lasers whose stripes are bright and far from each other."""
+    n_lasers = place.shape[0]
+    seeds, n = np.empty(min(_N_SEEDS, n_lasers), np.int64), 0
+    while n < seeds.shape[0]:
+        best, most = -1, 0.0
+        for i in range(n_lasers):
+            value = sums[i, i, _N]
+            apart = np.inf
+            for k in range(n):
+                square = 0.0
+                for j in range(3):
+                    square += (place[i, j] - place[seeds[k], j]) ** 2
+                apart = min(apart, np.sqrt(square))
+            value *= 1.0 if n == 0 else apart
+            if value > most:
+                best, most = i, value
+        if best < 0:
+            break
+        seeds[n] = best
+        n += 1
+    return seeds[:n]
+
+
+@kernel
+def _try_pair(
+    sums: FloatArray,
+    i: int,
+    k: int,
+    nearest: float,
+    farthest: float,
+    total: float,
+    planes: FloatArray,
+    score: FloatArray,
+    n: int,
+) -> int:
+    """Read two stripes as those of any two lasers, and keep the planes that explain most light."""
+    n_lasers = sums.shape[0]
+    plane = np.empty(4)
+    normal, scratch, right, m = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for a in range(n_lasers):
+        for b in range(n_lasers):
+            if a == b or (a == i and b == k):
+                continue
+            first, second = sums[i, a], sums[k, b]
+            if first[_N] < _RIVAL_SHARE * sums[i, i, _N]:
+                continue
+            if second[_N] < _RIVAL_SHARE * sums[k, k, _N]:
+                continue
+            if not _fit_two(first, second, normal, scratch, right, m, plane):
+                continue
+            if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
+                continue
+            value = _explained(sums, plane)
+            if value >= _RIVAL_SHARE * total:
+                n = _keep_best(plane, value, planes, score, n)
+    return n
+
+
+@inline_borrowing_kernel
+def _fit_two(
+    first: FloatArray,
+    second: FloatArray,
+    normal: FloatArray,
+    scratch: FloatArray,
+    right: FloatArray,
+    m: FloatArray,
+    plane: FloatArray,
+) -> bool:
+    """Fit X·m = 1 to the peaks of two stripes, each with the same weight."""
+    u, v = 1.0 / first[_N], 1.0 / second[_N]
+    normal[0, 0] = u * first[_XX] + v * second[_XX]
+    normal[1, 0] = u * first[_XY] + v * second[_XY]
+    normal[2, 0] = u * first[_XZ] + v * second[_XZ]
+    normal[1, 1] = u * first[_YY] + v * second[_YY]
+    normal[2, 1] = u * first[_YZ] + v * second[_YZ]
+    normal[2, 2] = u * first[_ZZ] + v * second[_ZZ]
+    for j in range(3):
+        right[j] = u * first[_SX + j] + v * second[_SX + j]
+    if not solve_symmetric(normal, right, scratch, m):
+        return False
+    length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    if not (length > 0.0 and length < np.inf):
+        return False
+    for j in range(3):
+        plane[j] = m[j] / length
+    plane[3] = 1.0 / length
+    return True
+
+
+@borrowing_kernel
+def _explained(sums: FloatArray, plane: FloatArray) -> float:
+    """Return the light of the stripes that lie on a plane, each read as the laser that fits best.
+
+    A stripe counts less the farther it is off, by the root mean square over its length.
+    """
+    x, y, z, d = plane[0], plane[1], plane[2], plane[3]
+    total = 0.0
+    for i in range(sums.shape[0]):
+        best = 0.0
+        for a in range(sums.shape[0]):
+            row = sums[i, a]
+            n = row[_N]
+            if n <= best:
+                continue
+            square = x * (x * row[_XX] + 2.0 * (y * row[_XY] + z * row[_XZ]))
+            square += y * (y * row[_YY] + 2.0 * z * row[_YZ]) + z * z * row[_ZZ]
+            square += -2.0 * d * (x * row[_SX] + y * row[_SY] + z * row[_SZ]) + n * d * d
+            per_px = (x * row[_SJX] + y * row[_SJY] + z * row[_SJZ]) / n
+            gate = _WIDE * _WIDE * squared_gate(per_px, d)
+            best = max(best, n * (1.0 - square / (n * gate)))
+        total += best
+    return total
+
+
+@kernel
+def _keep_best(
+    plane: FloatArray, value: float, planes: FloatArray, score: FloatArray, n: int
+) -> int:
+    """Keep a plane from the second row on, unless one like it is better; the best come first."""
+    if _same(plane, planes[0], 2.0):
+        return n
+    for k in range(1, n + 1):
+        if _same(plane, planes[k], 2.0):
+            if value > score[k]:
+                planes[k], score[k] = plane, value
+            return n
+    if n + 1 < planes.shape[0]:
+        n += 1
+        planes[n], score[n] = plane, value
+        return n
+    worst = 1
+    for k in range(2, n + 1):
+        if score[k] < score[worst]:
+            worst = k
+    if value > score[worst]:
+        planes[worst], score[worst] = plane, value
+    return n
+
+
+@inline_borrowing_kernel
+def _same(one: FloatArray, other: FloatArray, times: float) -> bool:
+    cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    angle = times * SAME_ANGLE
+    near = abs(one[3] - other[3]) < times * SAME_RANGE * other[3]
+    return bool(near and 2.0 * (1.0 - cosine) < angle * angle)
+
+
+@kernel
+def _refine_rivals(
+    table: FloatArray, nearest: float, farthest: float, planes: FloatArray, n: int
+) -> int:
+    """Refine the planes from the second row on; drop those that become another; count the rest."""
+    normal, scratch, lanes = np.empty((3, 3)), np.empty((5, 3)), np.empty(table.shape[1])
+    kept = 0
+    for _ in range(2):
+        refine_plane(table, planes[0], _WIDE, normal, scratch, lanes)
+    for k in range(1, n + 1):
+        plane = planes[k]
+        good = True
+        for stretch in (_WIDE, 1.0, 1.0, _WIDE, _WIDE):
+            good = good and refine_plane(table, plane, stretch, normal, scratch, lanes)
+        good = good and nearest <= plane[3] <= farthest and plane[1] >= MIN_FACING
+        for j in range(kept + 1):
+            good = good and not _same(plane, planes[j], 1.0)
+        if good:
+            kept += 1
+            planes[kept] = plane
+    return kept
+
+
+@kernel
+def judge_planes(
+    planes: FloatArray,
+    table: FloatArray,
+    n_lines: IntArray,
+    first_line: IntArray,
+    last_line: IntArray,
+    laser: IntArray,
+    source: IntArray,
+    trust: FloatArray,
+    chunk_index: IntArray,
+    along_x: BoolArray,
+    bands: FloatArray,
+    facts: FloatArray,
+) -> None:
+    """Write what speaks for every plane.
+
+    Parameters
+    ----------
+    planes : array, shape (P, 4)
+        Normals and offsets.
+    table, n_lines, first_line, last_line, laser
+        As in `Chunks`, C of them.
+    source, trust
+        As in `Readings`, N of them.
+    chunk_index : int array, shape (N,)
+        Row of each reading's chunk.
+    along_x : bool array, shape (n_lasers,)
+        Whether each laser's search lines run along x.
+    bands : array, shape (n_lasers, cells, samples, 4)
+        What each laser's band sees: (P, 1) / |P| for points P, NaN where nothing.
+    facts : array, shape (P, 5)
+        Written, see `LIGHT`.
+    """
+    n_lasers, n_cells = bands.shape[0], bands.shape[1]
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    seen = np.empty(last + 1, np.int64)
+    seen[:] = -1
+    near = np.empty(laser.shape[0])
+    lit, expected = np.empty((n_lasers, n_cells), np.bool_), np.empty((n_lasers, n_cells), np.bool_)
+    for k in range(planes.shape[0]):
+        plane, found = planes[k], facts[k]
+        _mark_light(plane, table, first_line, last_line, laser, near, lit)
+        found[LIGHT] = _light_on(k, near, source, trust, chunk_index, seen)
+        found[VARIANCE], found[FREEDOM], n_lit = _variance(
+            plane, table, n_lines, first_line, laser, near, n_lasers
+        )
+        found[PER_LASER] = found[LIGHT] / max(n_lit, 1)
+        _mark_expected(plane, bands, expected)
+        found[DARK] = _dark_lasers(lit, expected, along_x)
+
+
+@borrowing_kernel
+def _mark_light(
+    plane: FloatArray,
+    table: FloatArray,
+    first_line: IntArray,
+    last_line: IntArray,
+    laser: IntArray,
+    near: FloatArray,
+    lit: BoolArray,
+) -> None:
+    """Write how near each chunk is to a plane, 0 to 1; mark the cells with light near it."""
+    lit[:] = False
+    x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
+    for c in range(laser.shape[0]):
+        residual = x * table[X, c] + y * table[Y, c] + z * table[Z, c] - offset
+        per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
+        gate = _WIDE * _WIDE * squared_gate(per_px, offset)
+        near[c] = max(1.0 - residual * residual / gate, 0.0)
+        if near[c] > 0.0:
+            for cell in range(first_line[c] // CELL_LINES, last_line[c] // CELL_LINES + 1):
+                lit[laser[c], cell] = True
+
+
+@borrowing_kernel
+def _light_on(
+    number: int,
+    near: FloatArray,
+    source: IntArray,
+    trust: FloatArray,
+    chunk_index: IntArray,
+    seen: IntArray,
+) -> float:
+    """Sum the trust of the peaks on a plane, each once, by how near it is."""
+    total = 0.0
+    for i in range(source.shape[0]):
+        share = near[chunk_index[i]]
+        if share > 0.0 and seen[source[i]] != number:
+            seen[source[i]] = number
+            total += trust[i] * share
+    return total
+
+
+@borrowing_kernel
+def _variance(
+    plane: FloatArray,
+    table: FloatArray,
+    n_lines: IntArray,
+    first_line: IntArray,
+    laser: IntArray,
+    near: FloatArray,
+    n_lasers: int,
+) -> tuple[float, float, int]:
+    """Variance (px²) of half stripes about a plane, its degrees of freedom, and lasers seen."""
+    x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
+    square, n, n_lit = 0.0, 0, 0
+    begin = 0
+    for i in range(n_lasers):
+        end = begin
+        middle, lines = 0.0, 0
+        while end < laser.shape[0] and laser[end] == i:
+            if near[end] > 0.0:
+                middle += n_lines[end] * first_line[end]
+                lines += n_lines[end]
+            end += 1
+        middle /= max(lines, 1)
+        n_lit += lines >= _LEAST_LINES
+        for half in range(2):
+            total, lines = 0.0, 0
+            for c in range(begin, end):
+                if near[c] > 0.0 and (first_line[c] >= middle) == (half == 1):
+                    residual = x * table[X, c] + y * table[Y, c] + z * table[Z, c] - offset
+                    per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
+                    total += n_lines[c] * residual / per_px
+                    lines += n_lines[c]
+            if lines >= _LEAST_LINES:
+                square += (total / lines) ** 2
+                n += 1
+        begin = end
+    freedom = n - 3.0
+    if freedom <= 0.0:
+        return 1.0, 0.0, n_lit
+    return square / freedom + _HALF_STRIPE_PX * _HALF_STRIPE_PX, freedom, n_lit
+
+
+@borrowing_kernel
+def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) -> None:
+    """Mark the cells in which each laser's stripe on a plane lies in its band in the picture."""
+    x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
+    for i in range(bands.shape[0]):
+        for cell in range(bands.shape[1]):
+            before = np.nan
+            found = False
+            for s in range(bands.shape[2]):
+                row = bands[i, cell, s]
+                here = x * row[0] + y * row[1] + z * row[2] - offset * row[3]
+                if here * before <= 0.0:
+                    found = True
+                    break
+                before = here
+            expected[i, cell] = found
+
+
+@kernel
+def light_left(
+    source: IntArray,
+    trust: FloatArray,
+    chunk_index: IntArray,
+    members: BoolArray,
+    others: BoolArray,
+) -> float:
+    """Return the share of the light on a surface, that on others left out.
+
+    Parameters
+    ----------
+    source, trust
+        As in `Readings`, N of them.
+    chunk_index : int array, shape (N,)
+        Row of each reading's chunk.
+    members, others : bool array, shape (C,)
+        Chunks on the surface, and on other surfaces.
+    """
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    light, owner = np.zeros(last + 1), np.zeros(last + 1, np.int64)
+    for i in range(source.shape[0]):
+        c, r = chunk_index[i], source[i]
+        light[r] = trust[i]
+        owner[r] = max(owner[r], 2 if members[c] else int(others[c]))
+    total, on = 0.0, 0.0
+    for r in range(last + 1):
+        total += light[r] if owner[r] != 1 else 0.0
+        on += light[r] if owner[r] == 2 else 0.0
+    return on / max(total, 1e-12)
+
+
+@kernel
+def seen_of(
+    plane: FloatArray,
+    members: BoolArray,
+    n_lines: IntArray,
+    laser: IntArray,
+    bands: FloatArray,
+) -> tuple[float, float]:
+    """Return how much of its best stripe's way a surface shows, and the share of faint lasers.
+
+    Parameters
+    ----------
+    plane : array, shape (4,)
+        Normal and offset.
+    members : bool array, shape (C,)
+        Chunks on the surface.
+    n_lines, laser
+        As in `Chunks`.
+    bands
+        As in `judge_planes`.
+    """
+    n_lasers, n_cells = bands.shape[0], bands.shape[1]
+    expected, way = np.empty((n_lasers, n_cells), np.bool_), np.zeros(n_lasers)
+    _mark_expected(plane, bands, expected)
+    for c in range(laser.shape[0]):
+        if members[c]:
+            way[laser[c]] += n_lines[c]
+    most, asked, faint = 0.0, 0, 0
+    for i in range(n_lasers):
+        cells = np.sum(expected[i])
+        way[i] = way[i] / (CELL_LINES * cells) if cells >= _LEAST_CELLS else np.nan
+        if way[i] > most:
+            most = way[i]
+    for i in range(n_lasers):
+        if way[i] == way[i]:
+            asked += 1
+            faint += way[i] < _FAINT * most
+    return most, faint / max(asked, 1)
+
+
+@borrowing_kernel
+def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> float:
+    """Count the lasers that show nothing where they should and others do; in part if dim."""
+    n_lasers, n_cells = lit.shape
+    dark = 0.0
+    for i in range(n_lasers):
+        asked, seen, of_others, by_others = 0, 0, 0.0, 0.0
+        for cell in range(n_cells):
+            if not expected[i, cell]:
+                continue
+            there, shown = 0, 0
+            for k in range(n_lasers):
+                if k != i and along_x[k] == along_x[i] and expected[k, cell]:
+                    there += 1
+                    shown += lit[k, cell]
+            if shown < 1 or shown < _LIT_SHARE * there:
+                continue
+            asked += 1
+            seen += lit[i, cell]
+            of_others += there
+            by_others += shown
+        if asked < _LEAST_CELLS:
+            continue
+        typical = _DARK_SHARE * by_others / of_others
+        share = seen / asked
+        if share < typical:
+            dark += 1.0 - share / typical
+    return dark

@@ -1,0 +1,168 @@
+"""Which laser made which stripe: rivals, light that is missing, planes by chance."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.scanning import assignment
+from aqualvs.scanning.assignment import UNTESTED, Outcome, Verdict, widened
+from aqualvs.scanning.measure import Measurement
+from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.target import TargetKind
+from aqualvs.simulation.example_rigs import example_rig
+from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
+from scanning_cases import everywhere, returns_of
+
+FAN = Fan()
+FAR_FAN = Fan(baseline=(0.2, 0.0, 0.02), aim_deg=-10.0)
+FEW = Fan(n_lines=3, spacing_deg=8.0, baseline=(0.15, 0.0, 0.0), aim_deg=-8.0)
+EASY = Trouble(p_dim=0.0, p_off=0.0, missing=0.05)
+EDGES = Trouble(n_edges=8, n_glints=60)
+STRANDS = Trouble(strands=True, missing=0.2, n_glints=40)
+WALL = Plane.from_normal((0.1, 1.0, -0.05), 0.6)
+
+
+class Tally(NamedTuple):
+    """Random walls before a fan: how many are measured, and how many wrongly by over 5 %."""
+
+    valid: int
+    wrong: int
+
+
+def tally(fan: Fan, trouble: Trouble, own_deg: float) -> Tally:
+    rig, valid, wrong = fan_rig(fan), 0, 0
+    for case in range(2):
+        told = miscalibrated(rig, np.random.default_rng([5, case]), own_deg=own_deg)
+        stage, scanner = Stage(told, fan, rig), Scanner(told)
+        for k in range(4):
+            scene = stage.scene(np.random.default_rng([9, case, k]), trouble)
+            found = scanner.measure(0, 0.0, scene.returns).posture
+            if isinstance(found, Posture):
+                valid += 1
+                wrong += abs(found.range / scene.plane.offset - 1.0) > 0.05
+    return Tally(valid, wrong)
+
+
+def untested(*_: object) -> Outcome:
+    return UNTESTED
+
+
+def measured(fan: Fan, trouble: Trouble) -> Posture | Refusal:
+    stage = Stage(fan_rig(fan), fan)
+    scene = stage.scene_of(np.random.default_rng(3), trouble, WALL)
+    return Scanner(stage.rig).measure(0, 0.0, scene.returns).posture
+
+
+CASES = {
+    "gaps": (FAN, Trouble(missing=0.5, p_dim=0.3, p_off=0.1)),
+    "edges": (FAN, EDGES),
+    "far strands": (FAR_FAN, STRANDS),
+    "far edges": (FAR_FAN, EDGES),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_stripe_of_a_fan_is_taken_for_its_neighbours(case: str) -> None:
+    found = tally(*CASES[case], own_deg=0.02)
+    assert found.wrong == 0
+    # Measured: all eight; one may be refused as ambiguous.
+    assert found.valid >= 7
+
+
+def test_without_the_test_of_rivals_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assignment.AssignmentTest, "test", untested)
+    assert tally(FAR_FAN, STRANDS, own_deg=0.02).wrong >= 2
+
+
+def test_lines_that_might_be_their_neighbours_are_ambiguous() -> None:
+    """Two lines of three: they might be the other two on a nearer or farther wall."""
+    found = measured(FEW, EASY._replace(n_dark_end=1))
+    assert isinstance(found, Refusal)
+    assert found.reason is Reason.AMBIGUOUS
+    assert found.detail.endswith("explain the stripes about as well")
+    assert measured(FEW, EASY)
+
+
+def test_light_that_must_be_there_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the count of dark lasers and of foreign light, only residuals are left."""
+    fan = Fan(n_lines=5, spacing_deg=2.0)
+    assert measured(fan, EASY)
+    monkeypatch.setattr(assignment, "_DARK_LASER", 0.0)
+    monkeypatch.setattr(assignment, "_FOREIGN_STRIPE", 0.0)
+    monkeypatch.setattr(assignment, "_MOST_FREEDOM", 0.0)
+    assert not measured(fan, EASY)
+
+
+def test_residuals_tell_a_fan_with_a_dark_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sines that are evenly spaced are no tangents: a shifted fan leaves residuals."""
+    trouble = EASY._replace(n_dark_end=1)
+    found = measured(FAN, trouble)
+    assert isinstance(found, Posture)
+    assert found.range == pytest.approx(WALL.offset, rel=0.01)
+    monkeypatch.setattr(assignment, "_MOST_FREEDOM", 0.0)
+    assert not measured(FAN, trouble)
+
+
+def posture(distance: float, yaw: float) -> Posture:
+    return Posture(
+        range=distance,
+        pitch=0.0,
+        yaw=yaw,
+        covariance=np.diag([1e-6, 1e-6, 1e-6]),
+        normal_in_dome=np.array([0.0, 1.0, 0.0]),
+        slant_range=distance,
+        nearest=distance,
+        n_points=100,
+        rms=1e-3,
+    )
+
+
+def test_a_near_rival_widens_and_a_far_one_does_not() -> None:
+    found = Measurement(posture(0.6, 0.0), np.ones(1, np.bool_))
+    other = Plane.from_normal((np.tan(0.02), 1.0, 0.0), 0.606 / np.cos(0.02))
+    near = widened(found, Outcome(Verdict.NEAR, other, 0.0)).posture
+    assert isinstance(near, Posture)
+    # Even odds: half of the squared distance between the two.
+    assert near.covariance[2, 2] == pytest.approx(1e-6 + 0.5 * 0.02**2)
+    assert near.range == 0.6
+    assert widened(found, UNTESTED) is found
+
+
+def small(points: FloatArray) -> BoolArray:
+    """Light on a flank of 8 cm, where two of the example rig's stripes cross at 0.95 m."""
+    lit: BoolArray = np.hypot(points[:, 0] - 0.085, points[:, 2] + 0.172) < 0.04
+    return lit
+
+
+def test_a_flank_that_one_laser_misses_is_no_wall() -> None:
+    rig, flank = example_rig(), Plane.from_normal((0.0, 1.0, 0.0), 0.95)
+    scanner = Scanner(rig, ScannerOptions(target=TargetKind.SOLID))
+    found = scanner.measure(0, 0.0, returns_of(rig, [(flank, small)], 0.1)).posture
+    assert isinstance(found, Refusal)
+    assert found.reason is Reason.NOT_A_PLANE
+    assert "lasers that should be seen on it are not" in found.detail
+    assert scanner.measure(0, 0.0, returns_of(rig, [(flank, everywhere)], 0.1)).posture
+
+
+def planks(points: FloatArray) -> BoolArray:
+    """Planks of 3 to 9 cm by the stripe's direction, and specks of texture between them."""
+    place = (points[:, 0] + 0.4 * points[:, 2]) % 0.1
+    lit: BoolArray = (place < 0.034) | ((place > 0.036) & ((place - 0.036) % 0.0056 < 0.0024))
+    return lit
+
+
+def test_a_table_with_gaps_is_solid_where_something_solid_is_asked_for() -> None:
+    rig = example_rig()
+    returns = returns_of(rig, [(Plane.from_normal((0.1, 1.0, 0.0), 0.6), planks)], 0.1)
+    labels = {}
+    for kind in (TargetKind.AUTO, TargetKind.SOLID):
+        scan = Scanner(rig, ScannerOptions(target=kind)).measure(0, 0.0, returns)
+        assert isinstance(scan.posture, Posture), scan.posture
+        assert scan.posture.range == pytest.approx(0.6 / np.hypot(0.1, 1.0), rel=2e-3)
+        labels[kind] = np.bincount(scan.points.label, minlength=2)
+    assert labels[TargetKind.AUTO][0] > labels[TargetKind.AUTO][1]
+    assert labels[TargetKind.SOLID][1] > labels[TargetKind.SOLID][0]
