@@ -228,7 +228,7 @@ def select_returns(
     ----------
     line : int array, shape (N,)
         Search line of each peak, direction after direction.
-    table : array, shape (8, N)
+    table : array, shape (9, N)
         Measures of the peaks.
     likelihood : array, shape (N,)
         Of each peak.

@@ -20,22 +20,27 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.scan import Frame, ImagePlane
-from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT, TOP, WIDTH
+from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
 # Wavelengths (nm) that part blue, green and red lines.
 _BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
 # R and B by V and U, in the scale of limited-range luma (BT.601).
 _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
-# Stripes to learn from: peaks with a chroma step of at least this share of the frame's largest, of
-# so many standard deviations, and of so many levels; and how many of them it takes.
-_BEST_SHARE, _CLEAR_SIGMAS, _CLEAR_LEVELS, _MIN_LEARNED = 0.4, 3.0, 3.0, 24
+# Stripes to learn from: peaks of so many grey levels, with a chroma step beyond that of paint of so
+# many standard deviations and so many levels, within an angle of this cosine to the wavelength's
+# direction, and at least this share of the largest for their height; and how many of them it takes.
+_MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.3
+_BEST_SHARE, _MIN_LEARNED = 0.6, 16
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least that a learned one counts with, and how far paint and glare spread
 # about none. Lines of nine cameras show 0.15 to 0.7, rendered ones 0.5.
 _RATIO_EXPECTED, _RATIO_LEAST, _RATIO_OF_PAINT = 0.25, 0.1, 0.05
-# Ratios of one frame's lines spread by this share: overexposed ones show less, faint ones more. So
-# much of a line's ratio is never taken for that of paint, be the scene ever so green.
-_RATIO_SPREAD, _PAINT_SHARE = 0.35, 0.5
+# One frame's lines spread about their ratio by this share, and by the second one across their
+# direction: overexposed ones show less and differ in hue, faint ones more.
+_RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
+# Paint shows up to this share of the tint of its flanks, and no more than the second share of what
+# a line would, be the scene ever so green.
+_TINT_SHARE, _PAINT_SHARE = 0.5, 0.5
 # The learned ratio is that which so many of the best stripes exceed.
 _LEARNED_QUANTILE = 0.35
 # Levels: what rounding and subsampling leave of chroma noise.
@@ -125,7 +130,7 @@ def learn_colour(table: FloatArray, colour: LaserColour) -> LineColour | None:
 
     Parameters
     ----------
-    table : array, shape (8, N)
+    table : array, shape (9, N)
         Measures of peaks, rows as `stripe` names them.
     colour : LaserColour
 
@@ -154,7 +159,7 @@ def laser_likelihood(table: FloatArray, line: LineColour, widest_white_px: float
 
     Parameters
     ----------
-    table : array, shape (8, N)
+    table : array, shape (9, N)
         Measures of all peaks of one frame, rows as `stripe` names them.
     line : LineColour
         From `learn_colour` or `expected_colour`.
@@ -205,16 +210,37 @@ def _noise(table: FloatArray) -> float:
     return max(noise / math.sqrt(2.0), _LEAST_SIGMA)
 
 
+@inline_kernel
+def _beyond_paint(table: FloatArray, i: int, most: float) -> tuple[float, float]:
+    """Return what paint leaves unexplained of a peak's chroma step, as U and V.
+
+    Brighter paint shows up to a share of the tint that its flanks have; `most` bounds its size.
+    """
+    u, v, height = table[STEP_U, i], table[STEP_V, i], table[HEIGHT, i]
+    tint_u, tint_v = height * table[TINT_U, i], height * table[TINT_V, i]
+    size = math.hypot(tint_u, tint_v)
+    if size < 1e-9:
+        return u, v
+    share = (u * tint_u + v * tint_v) / (size * size)
+    share = min(max(share, 0.0), min(_TINT_SHARE, most / size))
+    return u - share * tint_u, v - share * tint_v
+
+
 @kernel
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
-    step = u * table[STEP_U] + v * table[STEP_V]
-    clear = step > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
-    if np.sum(clear) < _MIN_LEARNED:
-        return u, v, 0.0, sigma
-    # Chosen by chroma: the highest peaks may be edges of paper, which hardly move it.
-    best = np.flatnonzero(clear & (step >= _BEST_SHARE * element_at(step[clear], 0.9)))
+    # Chosen by their chroma beyond that of paint, for their height: the highest peaks may be paper.
+    share = np.zeros(table.shape[1])
+    for i in range(table.shape[1]):
+        beyond_u, beyond_v = _beyond_paint(table, i, np.inf)
+        size = math.hypot(beyond_u, beyond_v)
+        step_u, step_v = table[STEP_U, i], table[STEP_V, i]
+        near = u * step_u + v * step_v > _LEAST_COSINE * math.hypot(step_u, step_v)
+        is_clear = size > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
+        if near and is_clear and table[HEIGHT, i] >= _MIN_HEIGHT:
+            share[i] = size / table[HEIGHT, i]
+    best = np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
     if best.shape[0] < _MIN_LEARNED:
         return u, v, 0.0, sigma
     of_u, of_v = (
@@ -258,13 +284,20 @@ def _weigh(
     odds, kind = np.empty(n), np.empty(n, np.int64)
     for i in range(n):
         height = table[HEIGHT, i]
-        step, line = u * table[STEP_U, i] + v * table[STEP_V, i], ratio * height
-        paint = min(max(table[TINT, i], 0.0), _PAINT_SHARE * ratio) * height
-        # More of the colour than expected is no evidence against a line, less than paint none for.
-        off_line, off_paint = min(step - line, 0.0), max(step - paint, 0.0)
-        var_line = sigma**2 + (_RATIO_SPREAD * line) ** 2
+        line = ratio * height
+        along = u * table[STEP_U, i] + v * table[STEP_V, i]
+        across = v * table[STEP_U, i] - u * table[STEP_V, i]
+        # More of the colour than expected is no evidence against a line.
+        off_line = min(along - line, 0.0)
+        var_along = sigma**2 + (_RATIO_SPREAD * line) ** 2
+        var_across = sigma**2 + (_ACROSS_SPREAD * line) ** 2
+        beyond_u, beyond_v = _beyond_paint(table, i, _PAINT_SHARE * line)
         var_paint = sigma**2 + (_RATIO_OF_PAINT * height) ** 2
-        log_odds = 0.5 * (off_paint**2 / var_paint - off_line**2 / var_line)
+        log_odds = 0.5 * (
+            (beyond_u**2 + beyond_v**2) / var_paint
+            - off_line**2 / var_along
+            - across**2 / var_across
+        )
         odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))
         kind[i] = _kind_of(height)
     share = np.full(_N_KINDS, 0.5)

@@ -29,9 +29,9 @@ _NOTHING = np.uint64(0)
 _BRIGHT = np.uint8(255)
 # Luma of flanks that are dark; black is 16.
 _DARK = 36.0
-POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT = range(8)
+POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V = range(9)
 """Rows of a table of peaks."""
-N_MEASURES = 8
+N_MEASURES = 9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,7 +193,7 @@ class PeakFinder:
         -------
         line : int array, shape (N,)
             Search line of each peak; ascending. A view: overwritten by the next call.
-        table : array, shape (8, N)
+        table : array, shape (9, N)
             Measures of each peak, rows as named above; likewise.
         """
         while True:
@@ -456,9 +456,12 @@ def _measure_chroma(
                 measures[IMBALANCE] = along_u * (u_after - u_before) + along_v * (
                     v_after - v_before
                 )
-                tint = along_u * (u_flank - 128.0) + along_v * (v_flank - 128.0)
-                # In the dark there is no light that paint could show, only the line's own glow.
-                measures[TINT] = tint / luma if luma > _DARK else 0.0
+    # In the dark there is no light that paint could show, only the line's own glow.
+    per_level = 1.0 / luma if luma > _DARK else 0.0
+    measures[TINT_U], measures[TINT_V] = (
+        (u_flank - 128.0) * per_level,
+        (v_flank - 128.0) * per_level,
+    )
 
 
 @inline_borrowing_kernel
