@@ -17,7 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
@@ -30,7 +30,8 @@ _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # many standard deviations and so many levels, within an angle of this cosine to the wavelength's
 # direction, and at least this share of the largest for their height; and how many of them it takes.
 _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.3
-_BEST_SHARE, _MIN_LEARNED = 0.6, 16
+# They scatter by no more than this share of their mean step, half of them.
+_BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER = 0.6, 16, 0.4
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least that a learned one counts with, and how far paint and glare spread
 # about none. Lines of nine cameras show 0.15 to 0.7, rendered ones 0.5.
@@ -211,10 +212,10 @@ def _noise(table: FloatArray) -> float:
 
 
 @inline_kernel
-def _beyond_paint(table: FloatArray, i: int, most: float) -> tuple[float, float]:
+def _beyond_paint(table: FloatArray, i: int, tint_share: float, most: float) -> tuple[float, float]:
     """Return what paint leaves unexplained of a peak's chroma step, as U and V.
 
-    Brighter paint shows up to a share of the tint that its flanks have; `most` bounds its size.
+    Brighter paint shows up to `tint_share` of the tint that its flanks have, and at most `most`.
     """
     u, v, height = table[STEP_U, i], table[STEP_V, i], table[HEIGHT, i]
     tint_u, tint_v = height * table[TINT_U, i], height * table[TINT_V, i]
@@ -222,7 +223,7 @@ def _beyond_paint(table: FloatArray, i: int, most: float) -> tuple[float, float]
     if size < 1e-9:
         return u, v
     share = (u * tint_u + v * tint_v) / (size * size)
-    share = min(max(share, 0.0), min(_TINT_SHARE, most / size))
+    share = min(max(share, 0.0), min(tint_share, most / size))
     return u - share * tint_u, v - share * tint_v
 
 
@@ -230,28 +231,41 @@ def _beyond_paint(table: FloatArray, i: int, most: float) -> tuple[float, float]
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
-    # Chosen by their chroma beyond that of paint, for their height: the highest peaks may be paper.
+    # What differs from all that paint may show is the surest; a line as green as the water is not.
+    for tint_share in (1.0, _TINT_SHARE):
+        best = _best_stripes(table, u, v, sigma, tint_share)
+        if best.shape[0] < _MIN_LEARNED:
+            continue
+        height = table[HEIGHT][best]
+        of_u, of_v = table[STEP_U][best] / height, table[STEP_V][best] / height
+        line_u, line_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+        size = math.hypot(line_u, line_v)
+        if element_at(np.hypot(of_u - line_u, of_v - line_v), 0.5) > _MOST_SCATTER * size:
+            continue
+        line_u, line_v = line_u / size, line_v / size
+        ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
+        return line_u, line_v, max(ratio, _RATIO_LEAST), sigma
+    return u, v, 0.0, sigma
+
+
+@kernel
+def _best_stripes(
+    table: FloatArray, u: float, v: float, sigma: float, tint_share: float
+) -> IntArray:
+    """Return the peaks with the most chroma beyond that of paint, for their height.
+
+    The highest peaks may be paper.
+    """
     share = np.zeros(table.shape[1])
     for i in range(table.shape[1]):
-        beyond_u, beyond_v = _beyond_paint(table, i, np.inf)
+        beyond_u, beyond_v = _beyond_paint(table, i, tint_share, np.inf)
         size = math.hypot(beyond_u, beyond_v)
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         near = u * step_u + v * step_v > _LEAST_COSINE * math.hypot(step_u, step_v)
         is_clear = size > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
         if near and is_clear and table[HEIGHT, i] >= _MIN_HEIGHT:
             share[i] = size / table[HEIGHT, i]
-    best = np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
-    if best.shape[0] < _MIN_LEARNED:
-        return u, v, 0.0, sigma
-    of_u, of_v = (
-        table[STEP_U][best] / table[HEIGHT][best],
-        table[STEP_V][best] / table[HEIGHT][best],
-    )
-    u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
-    size = math.hypot(u, v)
-    u, v = u / size, v / size
-    ratio = element_at(u * of_u + v * of_v, _LEARNED_QUANTILE)
-    return u, v, max(ratio, _RATIO_LEAST), sigma
+    return np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
 
 
 @kernel
@@ -291,7 +305,7 @@ def _weigh(
         off_line = min(along - line, 0.0)
         var_along = sigma**2 + (_RATIO_SPREAD * line) ** 2
         var_across = sigma**2 + (_ACROSS_SPREAD * line) ** 2
-        beyond_u, beyond_v = _beyond_paint(table, i, _PAINT_SHARE * line)
+        beyond_u, beyond_v = _beyond_paint(table, i, _TINT_SHARE, _PAINT_SHARE * line)
         var_paint = sigma**2 + (_RATIO_OF_PAINT * height) ** 2
         log_odds = 0.5 * (
             (beyond_u**2 + beyond_v**2) / var_paint
