@@ -9,7 +9,6 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.live.sources.planes import planes_of_image
 from aqualvs.optics.assumed import FOCAL_SHARE, assumptions, completed_uncertainty
 from aqualvs.optics.rig import Rig, Window
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
@@ -20,7 +19,7 @@ from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_paramet
 from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture, range_pitch_yaw
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig

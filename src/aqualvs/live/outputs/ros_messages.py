@@ -18,7 +18,7 @@ from aqualvs.live.outputs.ros_messages_diagnostics import DiagnosticsMessage, di
 from aqualvs.live.sample import LiveSample
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture, Reason
-from aqualvs.scanning.scan import ScanPoints
+from aqualvs.scanning.scan import Label, ScanPoints
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
@@ -261,8 +261,10 @@ def _no_range(sample: LiveSample) -> float:
     """
     posture, points = sample.scan.posture, sample.scan.points
     assert not isinstance(posture, Posture)
-    if posture.reason is not Reason.OUT_OF_RANGE or not len(points):
+    # A wall behind a net that is too near may well give more points than the net.
+    to_target = points.label != Label.BACKGROUND
+    if posture.reason is not Reason.OUT_OF_RANGE or not to_target.any():
         return float("nan")
     near, far = sample.rig.working_range
-    ahead = float(np.median(points.points_in_dome[:, 1]))
+    ahead = float(np.median(points.points_in_dome[to_target, 1]))
     return float("-inf") if ahead < 0.5 * (near + far) else float("inf")
