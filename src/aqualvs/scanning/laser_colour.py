@@ -280,7 +280,7 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
         lines[n_useless] < _FEW_LINES or lines[n_useless] <= _USEFUL_SHARE * peaks[n_useless]
     ):
         n_useless += 1
-    return min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), _HIGHEST_USEFUL)
+    return float(min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), _HIGHEST_USEFUL))
 
 
 @kernel
