@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.live.sources.opening import open_source
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.clutter import random_bubbles, random_fish
 from aqualvs.simulation.lit_points import cast
 from aqualvs.simulation.random_scenes import Difficulty, random_scene
@@ -231,9 +230,7 @@ def scans_of(dive: Dive, rig: Rig, *, h264: bool = False, seed: int = 0) -> list
         return [scanner.process(frame_of(i, dive.times[i], image)) for i, image in frames]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dive.mp4"
-        with VideoWriter(
-            path, rig.size_px, dive.fps, quality="h264", crf=20, bit_rate=None
-        ) as video:
+        with VideoWriter(path, rig.size_px, dive.fps) as video:
             for image in _pictures(dive, rig, seed):
                 video.write(image)
         return [scanner.process(frame) for frame in open_source(str(path))]

@@ -1,5 +1,7 @@
 """From simulated pictures to a rig file, through the real command line."""
 
+import contextlib
+import io
 import re
 
 import numpy as np
@@ -22,7 +24,10 @@ def calibrated(tmp_path_factory):
     files = simulate_calibration(small_rig(), out, size=SIZE)
     commands = calibration_commands(files, out, 3)
     # The camera's, dome's and lasers' steps; one picture does not tell the water's index.
-    codes = [main(command) for command in commands[:3]]
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        codes = [main(command) for command in commands[:3]]
+    (out / "said.txt").write_text(said.getvalue(), encoding="utf-8")
     return out, files, commands, codes
 
 
@@ -35,6 +40,17 @@ def test_every_step_succeeds_and_writes_its_page(calibrated):
         assert "</html>" in page
         # One file that opens anywhere: nothing is fetched.
         assert not re.search(r"""(src|href)=["']?https?://(?!doi\.org)""", page)
+
+
+def test_every_step_says_what_it_used(calibrated):
+    """Pictures, corners and the residual: of the camera, then of the dome."""
+    out, _, _, _ = calibrated
+    said = (out / "said.txt").read_text(encoding="utf-8")
+    told = re.findall(r"^8 pictures, (\d+) corners, residual (0\.\d+) px \(rms\)$", said, re.M)
+    assert len(told) == 2
+    for n_corners, rms_px in told:
+        assert int(n_corners) > 100
+        assert 0.0 < float(rms_px) < 0.3
 
 
 def test_the_camera_is_the_true_one(calibrated):

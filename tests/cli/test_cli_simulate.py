@@ -1,9 +1,13 @@
 """`aqualvs simulate`, and what it writes through `aqualvs run`."""
 
+import re
+
+import av
 import pytest
 
 from aqualvs.app.cli import main
 from aqualvs.app.simulate import CALIBRATION
+from aqualvs.simulation.cameras import list_cameras
 from aqualvs.simulation.scenarios import list_scenarios
 from shell_cases import rig_file
 
@@ -22,6 +26,7 @@ def test_the_list_names_every_scenario(capsys):
         (["nowhere", "-o", "x"], "nowhere"),
         (["missing.yaml", "-o", "x"], "missing.yaml"),
         (["wall", "-o", "x", "--rig", "missing-rig.yaml"], "missing-rig.yaml"),
+        (["wall", "-o", "x", "--camera", "gopro"], "--camera gopro"),
     ],
 )
 def test_bad_input_gives_one_line(arguments, words, capsys, tmp_path, monkeypatch):
@@ -31,6 +36,12 @@ def test_bad_input_gives_one_line(arguments, words, capsys, tmp_path, monkeypatc
     assert said.count("\n") == 1
     assert words in said
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_help_names_every_camera(capsys):
+    assert main(["simulate", "--help"]) == 0
+    words = set(re.findall(r"[a-z]+", capsys.readouterr().out))
+    assert words >= set(list_cameras())
 
 
 def test_an_existing_dive_is_kept(tmp_path, capsys):
@@ -57,3 +68,18 @@ def test_a_simulated_dive_runs_against_its_truth(tmp_path, capsys):
     command = next(line for line in said.splitlines() if line.startswith("next: aqualvs "))
     assert main([*command.removeprefix("next: aqualvs ").split(), "--no-report"]) == 0
     assert "against the truth in 3 frames" in capsys.readouterr().out
+
+
+def test_a_real_camera_s_dive_is_another_picture_of_the_same_truth(tmp_path):
+    scenario = tmp_path / "short.yaml"
+    scenario.write_text("duration_s: 0.04\nmotion: {range_mm: 500}\nwalls: [{}]\n")
+    for camera in ("ideal", "webcam"):
+        arguments = ["--camera", camera, "--rig", str(rig_file(tmp_path))]
+        assert main(["simulate", str(scenario), "-o", str(tmp_path / camera), *arguments]) == 0
+    ideal, webcam = (tmp_path / name for name in ("ideal", "webcam"))
+    assert (ideal / "truth.csv").read_bytes() == (webcam / "truth.csv").read_bytes()
+    codecs = []
+    for folder in (ideal, webcam):
+        with av.open(str(folder / "dive.mp4")) as container:
+            codecs.append(container.streams.video[0].codec_context.name)
+    assert codecs == ["h264", "mjpeg"]

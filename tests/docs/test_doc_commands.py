@@ -23,6 +23,7 @@ ELSEWHERE = {
     r"^follow udp": "needs a vehicle: tests/live",
     r"^follow --sim --rendered": "takes minutes: tests/recovery/test_closed_loop.py",
     r"^follow --sim( --vehicle bluerov2-heavy)? .*-o out$": "as in first-dive.md, longer",
+    r"^simulate .* --camera": "takes a minute: tests/cli/test_cli_simulate.py",
     r"^simulate net_holes": "takes minutes: tests/cli/test_cli_net.py",
     r"^net out/sim/run --log out/sim/vehicle.csv": "of the same dive",
     r"--log vehicle.tlog": "a real log: tests/unit/test_vehicle_log_mavlink.py",

@@ -8,8 +8,8 @@ import pytest
 
 from aqualvs.calibration.hold_out import fitted, leave_one_out, posture
 from aqualvs.calibration.laser_names import match_to_rig, named
-from aqualvs.calibration.laser_solve import paper_plane
-from aqualvs.calibration.laser_views import LaserView
+from aqualvs.calibration.laser_solve import Start, paper_plane, solve_lasers
+from aqualvs.calibration.laser_views import LaserView, place_views
 from aqualvs.calibration.lasers import LaserCalibration, LaserOptions, calibrate_lasers
 from aqualvs.calibration.stripes_on_planes import board_surface
 from aqualvs.errors import CalibrationError, OptionError
@@ -33,6 +33,7 @@ from laser_cases import (
     simulated,
     without_lasers,
 )
+from laser_scenes import Clutter, glint, joined, scene
 from windowed_cases import windowed
 
 RIG = example_rig()
@@ -289,6 +290,54 @@ def test_more_lasers_than_expected() -> None:
 def test_fewer_lasers_than_expected() -> None:
     with pytest.raises(CalibrationError, match="3 of 5 of the lasers"):
         calibrate_lasers(RIG, BOX, box(), options=LaserOptions(n_lasers=5))
+
+
+def test_one_picture_of_a_board_fixes_no_plane() -> None:
+    views = board_views(RIG, noise=NOISE, spacing=0.004)[:1]
+    with pytest.raises(CalibrationError, match=r"two places of the board that differ.*nearer, far"):
+        calibrate_lasers(without_lasers(RIG), views, board_surface())
+
+
+@pytest.mark.parametrize("laser", [0, 2])
+def test_one_laser_among_glints_is_found_where_it_is_told(laser: int) -> None:
+    one = replace(RIG, lasers=(RIG.lasers[laser],))
+    views = box_views(one, noise=NOISE, spacing=0.004)[:1]
+    rng = np.random.default_rng(4)
+    stripes = views[0].stripes
+    for _ in range(5):
+        stripes = joined(stripes, glint(rng, RIG.size_px))
+    views = [replace(views[0], stripes=stripes)]
+    told = calibrate_lasers(without_lasers(RIG), views, box(), options=LaserOptions(n_lasers=1))
+    angle, offset = laser_error(told.lasers[0].laser.plane, one.lasers[0].plane)
+    # One picture and two surfaces of it.
+    assert np.rad2deg(angle) < 0.3
+    assert abs(offset) < 2e-3
+    with pytest.raises(
+        CalibrationError, match=r"undecided: .* points in view_0\.png.*give --lasers N"
+    ):
+        calibrate_lasers(without_lasers(RIG), views, box())
+
+
+def test_a_plane_that_may_be_print_is_asked_about() -> None:
+    made = scene(3, 1, 8, clutter=Clutter(edges=0.6), noise_px=0.1, rail=True)
+    views = [LaserView(v.view, v.stripes) for v in made.views]
+    with pytest.raises(CalibrationError, match=r"1 laser is certain.*give --lasers N"):
+        calibrate_lasers(without_lasers(made.rig), views, board_surface())
+    told = calibrate_lasers(
+        without_lasers(made.rig), views, board_surface(), options=LaserOptions(n_lasers=1)
+    )
+    angle, offset = laser_error(told.lasers[0].laser.plane, made.rig.lasers[0].plane)
+    assert np.rad2deg(angle) < 0.3
+    assert abs(offset) < 2e-3
+
+
+def test_a_laser_that_no_point_tells_of_is_named_with_the_remedy() -> None:
+    camera, surfaces = RIG.camera(), box()
+    placed, _ = place_views(camera, BOX, surfaces)
+    start = Start(RIG, surfaces, tuple(placed), None)
+    n_points = sum(len(view.placed) for view in placed)
+    with pytest.raises(CalibrationError, match=r"laser 'lower' cannot be solved.*nearer, farther"):
+        solve_lasers(start, list(RIG.lasers), np.full(n_points, -1), None)
 
 
 def test_no_stripes() -> None:

@@ -14,7 +14,9 @@ from aqualvs.calibration.view import View
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
+from aqualvs.simulation.cameras import simulated_camera
 from panel_cases import small_rig
 
 SIZE = SetSize(camera=2, dome=3, box=2, index=1, dive=1)
@@ -63,7 +65,7 @@ def test_everything_is_there(made):
 def test_the_truth_and_what_is_known_beforehand_are_those_of_the_rig(made):
     files, _ = made
     rig = small_rig()
-    assert rig_to_mapping(load_rig(files.rig)) == rig_to_mapping(rig)
+    assert rig_to_mapping(load_rig(files.rig)) == rig_to_mapping(with_exact_numbers(rig))
     nominal = load_nominal(files.nominal)
     assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("example", (360, 288), 3)
     assert nominal.dome == rig.dome
@@ -150,3 +152,25 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").write_text("here")
     with pytest.raises(OutputError, match="file"):
         simulate_calibration(small_rig(), tmp_path / "file", size=SIZE)
+
+
+def test_a_real_camera_keeps_jpegs_that_show_the_same_board(tmp_path):
+    size = SetSize(camera=1, dome=1, box=1, index=1, dive=0)
+    simulate_calibration(small_rig(), tmp_path, size=size, seed=5)
+    files = simulate_calibration(
+        small_rig(), tmp_path, size=size, seed=5, camera=simulated_camera("pal")
+    )
+    kept = [p.name for p in (files.camera, files.dome, files.box, files.index) for p in p.iterdir()]
+    assert sum(name.endswith(".jpg") for name in kept) == 4
+    assert not any(name.endswith(".png") for name in kept)
+    assert [pose.name for pose in load_poses(files.poses)] == ["view_00.jpg"]
+    board, camera = load_board(files.board), small_rig().bare_camera()
+    ((name, pose),) = true_poses(files, "camera_air").items()
+    view = detect_board(picture(files.camera / name), board, name)
+    assert isinstance(view, View), view
+    pixels, valid = camera.project(pose.apply(view.points))
+    assert valid.all()
+    # Noise, blur and JPEG at quality 92; the picture stays where it is.
+    off = view.pixels - pixels
+    assert np.median(np.linalg.norm(off, axis=-1)) < 0.15
+    assert np.abs(np.median(off, axis=0)).max() < 0.06

@@ -227,7 +227,7 @@ def test_command_on_a_sane_rig(tmp_path: Path) -> None:
     assert "rig 'example'" in page
     assert "lower mm/px" in page
     assert "pixel noise" in page
-    assert "does not say how well it is known" in page
+    assert "How well the set of intrinsics is known is not written down" in " ".join(page.split())
     assert "This rig is sane" in page
 
 

@@ -59,7 +59,7 @@ def test_a_good_calibration_is_told_and_not_doubted() -> None:
     told = said(rig, Severity.OK)
     assert "The camera was calibrated 9 days ago from 14 pictures with 3040 points" in told
     assert "The lasers were calibrated today" in told
-    assert "At 600 mm the calibration leaves a systematic error of" in told
+    assert "At 600 mm the uncertainty of the rig leaves a systematic error of" in told
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,10 @@ def test_confident_nonsense_is_doubted(steps: dict[str, SolvedStep], words: str)
         ({"n_water": 5e-3}, "The water's index is known only to 0.005"),
         ({"left:tilt_2": np.deg2rad(0.6)}, "Laser 'left' is known only to 0.6 degrees and"),
         ({"left:offset": 5e-3}, "and 5 mm (one sigma); show its stripe on more surfaces"),
-        ({"left:offset": 5e-3}, "At 600 mm the calibration leaves a systematic error of"),
+        (
+            {"left:offset": 5e-3},
+            "At 600 mm the uncertainty of the rig leaves a systematic error of",
+        ),
     ],
 )
 def test_what_is_hardly_known_is_doubted(sigmas: dict[str, float], words: str) -> None:
@@ -109,9 +112,13 @@ def test_a_spread_that_no_single_number_shows_is_found() -> None:
 
 def test_what_is_not_written_down_is_named() -> None:
     rig = with_uncertainty(example_rig(), RigUncertainty.independent({"fx": 0.5, "left:offset": 0}))
+    told = said(rig, Severity.OK)
     assert (
-        "How well the lens's place, the laser 'lower', the laser 'right' are known is not"
-    ) in said(rig, Severity.OK)
+        "How well the lens's place is known is not written down; assumed (one sigma): 1 mm" in told
+    )
+    assert "How well the laser 'lower', the laser 'right' are known is not written down" in told
+    assert "laser 'left'," not in told
+    assert "intrinsics" not in told
 
 
 @pytest.mark.parametrize(
@@ -145,7 +152,7 @@ def rows_of(page: Sequence[str], word: str) -> list[list[float]]:
 def test_the_table_adds_both_errors(tmp_path: Path) -> None:
     page = page_of(solved_rig(), tmp_path)
     calibration, noise, both = (
-        np.array(rows_of(page, word)) for word in (" calibration ", " pixel noise ", " both ")
+        np.array(rows_of(page, word)) for word in (" rig ", " pixel noise ", " both ")
     )
     assert calibration.shape == (3, 4)
     # Three digits are shown.

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+import aqualvs.calibration.chessboard as chessboard_module
 from aqualvs.calibration.detection import detect_board, detect_markers
 from aqualvs.calibration.saddle_corners import refine_saddles
 from aqualvs.calibration.target_files import load_board
@@ -100,6 +101,90 @@ def test_a_symmetric_chessboard_begins_at_the_top_left():
     view = detect_board(image, board, "a.png")
     assert isinstance(view, View)
     assert np.allclose(view.pixels, truth[::-1], atol=_FARTHEST_PX)
+
+
+@pytest.mark.parametrize("squares", [(9, 6), (8, 6), (7, 5)])
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("negative", [False, True])
+def test_a_chessboard_is_the_same_either_way_round(squares, swapped, negative):
+    """Its file may give the counts in either order, and either tone may be in the corner."""
+    printed = chessboard(squares)
+    cells, border = board_cells(printed)
+    if negative:
+        cells[border:-border, border:-border] = 1 - cells[border:-border, border:-border]
+    h = homography(_WHOLE, cells.shape[::-1])
+    image, truth = picture(cells, h, _SIZE), truth_of_board(printed, h)
+    asked = dataclasses.replace(printed, squares=squares[::-1]) if swapped else printed
+    view = detect_board(image, asked, "a.png")
+    assert isinstance(view, View)
+    assert len(view) == asked.n_corners
+    # All corners, and a map without a mirror from the board asked for: a half or quarter turn.
+    apart = np.linalg.norm(view.pixels[:, None] - truth[None], axis=-1)
+    assert sorted(np.argmin(apart, axis=1)) == list(range(printed.n_corners))
+    assert apart.min(axis=1).max() < _FARTHEST_PX
+    x, y = view.pixels[1] - view.pixels[0], view.pixels[asked.corner_grid[0]] - view.pixels[0]
+    assert x[0] * y[1] - x[1] * y[0] > 0.0
+    # An even and an odd number: half a turn mends the tone. Two odd ones: no turn does. Two even
+    # ones: a quarter turn mends it, with the counts in the other order.
+    n_odd = sum(n % 2 for n in squares)
+    light = {0: negative != swapped, 1: False, 2: negative}[n_odd]
+    assert bool(view.notes) == light
+    if light:
+        assert "first square of the print is light" in view.notes[0]
+
+
+def _shifted(finder, by):
+    """A finder that is one row or column off."""
+
+    def find(image, grid):
+        found, corners = finder(image, grid)
+        if not found:
+            return found, corners
+        pixels = np.reshape(corners, (grid[1], grid[0], 2))
+        step = pixels[0, 1] - pixels[0, 0] if by == "column" else pixels[1, 0] - pixels[0, 0]
+        return found, (pixels + step).reshape(-1, 1, 2)
+
+    return find
+
+
+@pytest.mark.parametrize("by", ["row", "column"])
+@pytest.mark.parametrize("squares", [(7, 6), (8, 6)])
+def test_a_grid_that_is_one_line_off_is_shifted_back(monkeypatch, by, squares):
+    board = chessboard(squares)
+    image, truth = _shot(board, _WHOLE)
+    finders = [(name, _shifted(find, by)) for name, find in chessboard_module._FINDERS]
+    monkeypatch.setattr(chessboard_module, "_FINDERS", tuple(finders))
+    view = detect_board(image, board, "a.png")
+    assert isinstance(view, View)
+    assert len(view) == board.n_corners
+    assert _errors(view, truth).max() < _FARTHEST_PX
+    assert not view.notes
+
+
+def test_other_finders_are_tried_after_a_wrong_grid(monkeypatch):
+    board = chessboard((7, 6))
+    image, truth = _shot(board, _WHOLE)
+    first, *rest = chessboard_module._FINDERS
+
+    def wrong(image, grid):
+        return True, np.random.default_rng(1).uniform(50.0, 250.0, (grid[0] * grid[1], 1, 2))
+
+    monkeypatch.setattr(chessboard_module, "_FINDERS", ((first[0], wrong), *rest))
+    view = detect_board(image, board, "a.png")
+    assert isinstance(view, View)
+    assert _errors(view, truth).max() < _FARTHEST_PX
+    assert view.notes == ("board found at a later try (OpenCV's findChessboardCorners)",)
+
+
+def test_a_small_blurred_chessboard_is_found_whole():
+    """Blur makes the outline's corners look a little like inner ones; they must not count."""
+    board = chessboard((9, 6))
+    corners = [[100.0, 60.0], [300.0, 76.0], [272.0, 196.0], [108.0, 184.0]]
+    image, truth = _shot(board, corners, blur=1.9)
+    view = detect_board(image, board, "a.png")
+    assert isinstance(view, View)
+    assert len(view) == board.n_corners
+    assert _errors(view, truth).max() < _FARTHEST_PX
 
 
 def test_corners_off_the_board_are_refused():

@@ -124,9 +124,9 @@ def test_one_metre_of_offset_is_worth_what_geometry_says() -> None:
     error = 1e-3 * np.array(lengths)
     uncertainty = RigUncertainty(tuple(names), np.outer(error, error))
     for told in expected_posture_errors(rig, uncertainty):
-        # Differences of positions to 1e-16 m over steps of 1e-6 m.
+        # Rays between the nodes of the lattice are good to 1e-4.
         np.testing.assert_allclose(
-            told.sigma_calibration, [1e-3 * told.wall_range, 0.0, 0.0], atol=1e-9
+            told.sigma_calibration, [1e-3 * told.wall_range, 0.0, 0.0], rtol=1e-4, atol=1e-7
         )
 
 

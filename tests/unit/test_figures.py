@@ -14,7 +14,9 @@ from aqualvs.app.net_figures import Reflections, draw_figures
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.scanning.mesh import MeshFilterOptions, laser_frame
+from aqualvs.simulation.example_rigs import example_rig
 
 LASERS = {"lower": Plane.from_normal([0.0, -0.3, 0.954], -0.143)}
 LASERS["left"] = Plane.from_normal([0.96, -0.25, -0.12], -0.138)
@@ -159,3 +161,36 @@ def reflections(in_laser: FloatArray, net: bool) -> Reflections:
 def test_little_to_see_is_drawn_too(tmp_path: Path, points: FloatArray) -> None:
     written = draw_figures(reflections(points, False), MeshFilterOptions(), tmp_path)
     assert all(path.stat().st_size > 5000 for path in written)
+
+
+def threshold_run(folder: Path) -> Path:
+    """A run with the threshold detector: reflections 5 x 3 pixels every 25 mm, one frame."""
+    rig = example_rig()
+    plane = rig.lasers[0].plane
+    x = 0.025 * np.arange(-6, 7)
+    z = (plane.offset - plane.normal[0] * x - plane.normal[1] * 0.643) / plane.normal[2]
+    in_dome = np.column_stack([x, np.full(len(x), 0.643), z])
+    centres = np.rint(rig.camera().project(in_dome)[0])
+    pixels = (centres[:, None] + np.column_stack([np.arange(-2, 3), np.zeros(5)])).reshape(-1, 2)
+    n = len(pixels)
+    columns = {"u_px": pixels[:, 0], "v_px": pixels[:, 1], "width_px": np.full(n, 3.0)}
+    table = pa.table(
+        {name: pa.array(column, pa.float32()) for name, column in columns.items()}
+        | {"frame": pa.array([0] * n, pa.int32()), "laser": pa.array([0] * n, pa.int8())}
+        | dict.fromkeys(("x_m", "y_m", "z_m"), pa.array([0.5] * n, pa.float32()))
+        | {"label": pa.array(["net"] * n).dictionary_encode()}
+    )
+    parquet.write_table(table, folder / "points.parquet")
+    scanner = {"mesh_filter": None, "detector": {"kind": "threshold"}}
+    run = {"rig": rig_to_mapping(rig), "options": {"scanner": scanner}}
+    (folder / "run.yaml").write_text(yaml.safe_dump(run))
+    return folder
+
+
+def test_a_run_with_the_threshold_shows_every_bright_pixel(tmp_path: Path) -> None:
+    told: list[str] = []
+    figures(threshold_run(tmp_path), tmp_path / "out", told.append)
+    assert told[0].startswith(f"frame 0, laser lower: {13 * 15} bright pixels, {13 * 15} of them")
+    # All but the outermost reflections, as in test_paper_filter.
+    kept = int(told[1].split("paper's: ")[1].split(",")[0])
+    assert 0.7 * 13 * 15 < kept < 12 * 15

@@ -77,6 +77,8 @@ def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
         SimRequest(out=tmp_path, aim=Aim(), cage_radius=1.0)
     with pytest.raises(OptionError, match="--current 9"):
         SimRequest(out=tmp_path, aim=Aim(), current=9.0)
+    with pytest.raises(OptionError, match="add --rendered"):
+        SimRequest(out=tmp_path, aim=Aim(), camera="pal")
     with pytest.raises(OptionError, match="leave --range"):
         Aim(plan=tmp_path / "plan.yaml", range=0.5).mission((0.3, 1.0))
     with pytest.raises(OptionError, match="outside the working range"):

@@ -20,6 +20,7 @@ from aqualvs.control.gains_file import load_gains
 from aqualvs.control.mission import HoldMission
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
 from aqualvs.live.health import State
+from aqualvs.simulation.cameras import IDEAL, simulated_camera
 from aqualvs.simulation.example_rigs import example_rig
 from browser import open_page
 from live_cases import Collector
@@ -85,6 +86,16 @@ def test_rendered_pictures_come_with_their_own_points() -> None:
         assert sample.frame is not None
         assert sample.frame.time_s == sample.scan.time_s
         assert len(sample.scan.points) > 100
+
+
+def test_rendered_pictures_are_those_of_the_chosen_camera() -> None:
+    case = still_case()
+    lumas = []
+    for camera in (IDEAL, simulated_camera("pal")):
+        eye = RenderedEye(case.net, example_rig(), np.random.default_rng(3), camera=camera)
+        shown(eye, case, 0.1)
+        lumas.append(np.asarray(eye.shots[0][0].luma))
+    assert np.abs(lumas[0].astype(int) - lumas[1]).mean() > 5.0
 
 
 def test_a_browser_shows_the_loop_and_moves_its_setpoint(tmp_path: Path) -> None:

@@ -48,7 +48,9 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
         offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
         target = surfaces[int(np.argmin(offsets))]
         in_posture = target.members[index]
-    points = label_readings(readings, index, surfaces, target, Measurement(NONE, in_posture), RANGE)
+    points, _ = label_readings(
+        readings, index, surfaces, target, Measurement(NONE, in_posture), RANGE
+    )
     return Labelled(returns, readings, index, surfaces, points)
 
 
@@ -121,7 +123,7 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
     target = found.surfaces[0]
     on_it = target.members[found.index]
     left_out = on_it & (found.readings.pixels[:, 1] < 200.0)
-    points = label_readings(
+    points, _ = label_readings(
         found.readings,
         found.index,
         found.surfaces,
@@ -138,7 +140,7 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
 
 def test_short_pieces_that_nothing_explains_are_clutter_or_ambiguous() -> None:
     found = label([(NET, strands)], None)
-    points = label_readings(
+    points, _ = label_readings(
         found.readings,
         found.index,
         [],

@@ -105,7 +105,8 @@ def test_a_posture_becomes_messages(bench: Bench) -> None:
     assert distance.time_boot_ms == SAMPLE.instants.arrived_ns // 1_000_000
     assert distance.signal_quality > 50
     assert tuple(values) == NAMES
-    sigmas = np.sqrt(np.diag(posture.covariance))
+    assert posture.rig_covariance.any()
+    sigmas = np.sqrt(np.diag(posture.total_covariance))
     expected = {
         "aq_valid": 1.0,
         "aq_range": 1e3 * posture.range,

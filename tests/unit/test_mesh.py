@@ -1,8 +1,6 @@
 """The paper's mesh filter: the sparse form equals Algorithm 1, and it does what it is for."""
 
-import json
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,6 +117,37 @@ def test_net_is_kept_inside_and_lost_at_its_edge() -> None:
     assert keep[1:-1].mean() > 0.7
     # Algorithm 1 wants light on both sides, so the first and last thread go (docs/mesh-filter.md).
     assert not keep[[0, -1]].any()
+
+
+def bright_pixels(x: FloatArray, columns: int) -> FloatArray:
+    """Reflections at `x` as pixels see them: `columns` 1 mm apart in three rows 2.5 mm apart."""
+    across = 1e-3 * (np.arange(columns) - (columns - 1) / 2)
+    offsets = np.stack(np.meshgrid(across, [-2.5e-3, 0.0, 2.5e-3]), axis=-1).reshape(-1, 2)
+    centres = np.stack([x, np.full(len(x), 0.643)], axis=-1)
+    # Away from the edges of cells, where roundings decide.
+    return (centres[:, None] + offsets).reshape(-1, 2)
+
+
+EVEN = 0.025 * np.arange(9.0)
+# A laser cuts a diamond of 35 mm twice in each diagonal.
+DIAMOND = 0.035 * (np.arange(9.0)[:, None] + [0.0, 0.35]).ravel()
+
+
+@pytest.mark.parametrize(
+    ("x", "columns", "kept"),
+    [(EVEN, 2, False), (EVEN, 3, True), (EVEN, 4, False), (DIAMOND, 2, False), (DIAMOND, 3, False)],
+    ids=["6 cells", "9 cells", "12 cells", "diamond, 6 cells", "diamond, 9 cells"],
+)
+def test_which_reflections_pass_the_paper_s_limits(x: FloatArray, columns: int, kept: bool) -> None:
+    """Section 5.2: 6 to 11 cells in A and 17 to 22 in C, so 9 to 11 with two neighbours in C.
+
+    Of a diamond C holds four, because r_max is its diagonal: 17 to 22 are 5 each, too few for A.
+    """
+    points = bright_pixels(x, columns)
+    keep = mesh_filter(points, SIDEWAYS).reshape(len(x), -1)
+    np.testing.assert_array_equal(keep.ravel(), mesh_filter_dense(points, SIDEWAYS))
+    assert (keep[2:-2].mean(axis=1) > 0.5).all() == kept
+    assert keep[2:-2].any() == kept
 
 
 def test_walls_bubbles_and_lonely_threads_are_not_kept() -> None:
@@ -256,29 +285,3 @@ def _seconds(points: FloatArray) -> float:
         mesh_filter(points, SIDEWAYS)
         times.append(time.perf_counter() - start)
     return min(times)
-
-
-@pytest.mark.samples
-def test_net_with_clutter_from_the_samples(samples: Path) -> None:
-    """True points of an independently rendered dive: what is kept is net."""
-    folder = samples / "lab-paper" / "truth"
-    lasers = json.loads((folder / "rig_truth.json").read_text())["lasers"]
-    planes = [Plane.from_normal(laser["normal"], laser["d_mm"] / 1e3) for laser in lasers]
-    chosen = MeshFilterOptions(rd_theta=3e-3, dd=3e-3, r_min=8e-3, r_max=30e-3)
-    kept = {"net": 0, "other": 0}
-    seen = {"net": 0, "other": 0}
-    for path in sorted((folder / "dives" / "net_clutter").glob("*.npz"))[::4]:
-        frame = np.load(path)
-        net = list(frame["labels"]).index("net")
-        for i, plane in enumerate(planes):
-            own = frame["laser"] == i
-            keep = mesh_filter(frame["xyz"][own] / 1e3, plane, chosen)
-            for name, mask in (
-                ("net", frame["label"][own] == net),
-                ("other", frame["label"][own] != net),
-            ):
-                kept[name] += int(keep[mask].sum())
-                seen[name] += int(mask.sum())
-    # The paper's limits keep few threads of a slack diamond net, and next to nothing else.
-    assert kept["net"] > 0.2 * seen["net"]
-    assert kept["other"] < 0.01 * seen["other"]

@@ -78,7 +78,7 @@ def test_simulate_writes_log_and_holes_beside_a_dive_along_a_net(tmp_path, capsy
         "net: {holes_mm: [[100, 50, 30]]}\n"
     )
     out = tmp_path / "dive"
-    body.simulate(str(short), None, out, print, overwrite=False)
+    body.simulate(str(short), None, out, print, camera="ideal", overwrite=False)
     names = ["dive.mp4", "rig.yaml", "truth.csv", "truth_holes.csv", "vehicle.csv"]
     assert sorted(path.name for path in out.iterdir()) == names
     (hole,) = rows(out / "truth_holes.csv")

@@ -135,6 +135,7 @@ def test_the_report_warns() -> None:
         reasons=("",),
         posture=np.ones((2, 3)),
         sigma=nothing,
+        sigma_total=nothing,
         n_points=np.full(2, 200.0),
         n_water=np.full(2, 1.34),
     )

@@ -28,7 +28,9 @@ from shell_cases import scan
 HEADER = (
     "frame,time_s,valid,reason,range_m,pitch_deg,yaw_deg,sigma_range_m,sigma_pitch_deg,"
     "sigma_yaw_deg,slant_range_m,nearest_m,n_points,n_water,"
-    "curvature_x_per_m,curvature_z_per_m,sigma_curvature_x_per_m,sigma_curvature_z_per_m"
+    "curvature_x_per_m,curvature_z_per_m,sigma_curvature_x_per_m,sigma_curvature_z_per_m,"
+    "sigma_range_rig_m,sigma_pitch_rig_deg,sigma_yaw_rig_deg,"
+    "sigma_range_total_m,sigma_pitch_total_deg,sigma_yaw_total_deg"
 )
 
 
@@ -54,7 +56,10 @@ def read_ply(path):
 
 
 def test_a_posture_row_holds_the_posture_in_file_units():
-    cells = dict(zip(HEADER.split(","), posture_row(scan(3)).strip().split(","), strict=True))
+    measured = scan(3)
+    by_rig = np.diag([4e-3, 1e-3, 4e-3]) ** 2
+    measured = replace(measured, posture=replace(measured.posture, rig_covariance=by_rig))
+    cells = dict(zip(HEADER.split(","), posture_row(measured).strip().split(","), strict=True))
     assert cells["frame"] == "3"
     assert cells["valid"] == "1"
     assert cells["reason"] == ""
@@ -70,24 +75,31 @@ def test_a_posture_row_holds_the_posture_in_file_units():
         "nearest_m": 0.52,
         "n_points": 60,
         "n_water": 1.3333,
+        "sigma_range_rig_m": 4e-3,
+        "sigma_pitch_rig_deg": np.rad2deg(1e-3),
+        "sigma_yaw_rig_deg": np.rad2deg(4e-3),
+        "sigma_range_total_m": np.hypot(1e-3, 4e-3),
+        "sigma_pitch_total_deg": np.rad2deg(np.hypot(2e-3, 1e-3)),
+        "sigma_yaw_total_deg": np.rad2deg(5e-3),
     }
-    assert not any(cells[name] for name in HEADER.split(",")[-4:])
+    assert not any(cells[name] for name in HEADER.split(",")[-10:-6])
     found = {name: float(cells[name]) for name in expected}
     # The file keeps a micrometre, a hundred-thousandth of a degree, four digits of a sigma.
-    assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert found == pytest.approx(expected, rel=2e-4, abs=1e-6)
 
 
-def test_a_curved_net_has_its_curvature_in_the_last_columns():
+def test_a_curved_net_has_its_curvature_in_its_columns():
     flat = scan(3)
     bent = replace(flat.posture, curvature=(0.5, -0.25), sigma_curvature=(0.02, 0.0345678))
     cells = posture_row(replace(flat, posture=bent)).strip().split(",")
-    assert cells[-4:] == ["0.5", "-0.25", "0.02", "0.03457"]
-    assert cells[:-4] == posture_row(flat).strip().split(",")[:-4]
+    assert cells[-10:-6] == ["0.5", "-0.25", "0.02", "0.03457"]
+    plain = posture_row(flat).strip().split(",")
+    assert cells[:-10] + cells[-6:] == plain[:-10] + plain[-6:]
 
 
 def test_a_refused_frame_has_its_reason_and_no_numbers():
     row = posture_row(scan(7, reason=Reason.ONE_LASER))
-    assert row == "7,0.280000,0,one_laser" + "," * 14 + "\n"
+    assert row == "7,0.280000,0,one_laser" + "," * 20 + "\n"
     assert row.count(",") == HEADER.count(",")
 
 

@@ -109,7 +109,7 @@ def test_headline_gives_the_numbers(dive: Dive, page: str) -> None:
     assert f"{1e3 * np.median(dive.range_m[valid]):.1f} mm" in text
     assert "31 of 40 frames" in text
     assert "77.5 %" in text
-    assert "σ typically 0.8 mm" in text
+    assert "σ typically 0.8 mm by the frame's noise, 0.8 mm with the rig's uncertainty" in text
     assert "1.3400" in text
     assert "9.8.7" in text
     assert "filter.mode adaptive" in text
@@ -452,6 +452,7 @@ def long_track(n: int, seed: int = 3) -> Track:
         reasons=("no_stripes",),
         posture=posture,
         sigma=np.where(valid[:, None], 1e-3, np.nan) * np.ones(3),
+        sigma_total=np.where(valid[:, None], 2e-3, np.nan) * np.ones(3),
         n_points=np.full(n, 100.0),
         n_water=np.full(n, 1.34),
     )

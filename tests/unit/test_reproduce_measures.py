@@ -5,8 +5,14 @@ import pytest
 
 from aqualvs.app.reproduce.dome_or_not import Distances, _calibrated_without, distances, level_laser
 from aqualvs.app.reproduce.laboratory import Laboratory, Measured
-from aqualvs.app.reproduce.point_truth import LitTruth, judge_pixels, mean_judged
+from aqualvs.app.reproduce.point_truth import (
+    LitTruth,
+    judge_pixels,
+    judge_reflections,
+    mean_judged,
+)
 from aqualvs.app.reproduce.variants import Variant, told
+from aqualvs.scanning.paper_filter import FilteredPoints
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.simulation.scenario_file import parse_scenario
@@ -31,6 +37,32 @@ def test_points_are_judged_by_the_nearest_true_one():
     precision, recall = judge_pixels(net, lasers[:10] + 1, truth)
     assert np.isnan(precision)
     assert recall == 0.0
+
+
+def blobs(kept):
+    """Blobs of 3 x 3 pixels every 20 px along one search line, with how many pixels are kept."""
+    step = np.arange(3) - 1.0
+    offsets = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    centres = np.column_stack([50.0 + 20.0 * np.arange(len(kept)), np.full(len(kept), 100.0)])
+    pixels = (centres[:, None] + offsets).reshape(-1, 2)
+    on_mesh = (np.arange(9) < np.array(kept)[:, None]).ravel()
+    zeros = np.zeros(len(pixels), np.int64)
+    return FilteredPoints(zeros, zeros, pixels, np.zeros((len(pixels), 3)), on_mesh)
+
+
+def test_reflections_count_as_most_of_their_pixels_do():
+    # Two true points 4 px apart in each blob; three on the net, one on a wall.
+    u = np.repeat(50.0 + 20.0 * np.arange(4), 2) + np.tile([-2.0, 2.0], 4)
+    truth = LitTruth(np.column_stack([u, np.full(8, 100.0)]), np.zeros(8, np.int64), u < 100.0)
+    assert judge_reflections(blobs([9, 9, 9, 0]), truth) == (1.0, 1.0)
+    assert judge_reflections(blobs([5, 4, 0, 5]), truth) == (0.5, 1 / 3)
+    precision, recall = judge_reflections(blobs([4, 4, 4, 4]), truth)
+    assert np.isnan(precision)
+    assert recall == 0.0
+    # One blob of two touching ones is one reflection, though the true points are two.
+    joined = blobs([9, 0, 0, 0])
+    joined.pixels[9:18] = joined.pixels[:9] + np.array([3.0, 0.0])
+    assert judge_reflections(joined, truth) == pytest.approx((np.nan, 0.0), nan_ok=True)
 
 
 def test_the_mean_leaves_out_what_nothing_is_said_of():

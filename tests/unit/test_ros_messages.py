@@ -210,7 +210,7 @@ def test_posture_is_told_as_pose() -> None:
     posture = found.scan.posture
     assert posture
     pose = told(found)[Topic.POSTURE]
-    expected = plane_pose(posture.range, posture.pitch, posture.yaw, posture.covariance)
+    expected = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
     assert pose.stamp_ns == found.utc_ns
     assert pose.frame_id == "aqualvs_dome"
     np.testing.assert_allclose(
@@ -270,7 +270,7 @@ def test_range() -> None:
     assert posture
     told_range = told(found)[Topic.RANGE]
     assert told_range.range == posture.range
-    assert told_range.variance == posture.covariance[0, 0]
+    assert told_range.variance == posture.total_covariance[0, 0]
     assert (told_range.min_range, told_range.max_range) == found.rig.working_range
     # The demo's camera sees 36 degrees of water.
     assert 0.6 < told_range.field_of_view < 0.66

@@ -18,6 +18,7 @@ from aqualvs.simulation.scene import Box, Net, Scene, Wall, WaterOptics
 from aqualvs.simulation.sensor import expose, spread
 from aqualvs.simulation.trajectory import dome_from_target
 
+_NO_DIMMING, _DIMMING = (0.0, 0.0, 0.0), (0.3, 0.3, 0.3)
 _CLEAR = WaterOptics(attenuation=(0.0, 0.0, 0.0), sheet_scatter=0.0, forward_scatter=0.0)
 _PLAIN = Wall(contrast=0.0)
 
@@ -77,14 +78,14 @@ def test_power_is_stated_half_a_metre_from_the_source():
     for i, source in enumerate(sources):
         sheets_of_one = pack_sheets(replace(rig, lasers=rig.lasers[i : i + 1]), [source])
         at = source.position + np.outer([0.5, 1.0], source.direction)
-        light = light_on_points(at, sheets_of_one, 0.0)
+        light = light_on_points(at, sheets_of_one, _NO_DIMMING)[:, 1]
         assert light[0] == pytest.approx(source.power, rel=1e-3)
         # The fan spreads as 1/s, the sheet's thickness as its sigma.
         spread_ratio = 0.5 * (source.sigma + 0.5 * source.divergence)
         spread_ratio /= source.sigma + 1.0 * source.divergence
         assert light[1] / light[0] == pytest.approx(spread_ratio, rel=1e-6)
         off = at[:1] + rig.lasers[i].plane.normal * (source.sigma + 0.5 * source.divergence)
-        assert light_on_points(off, sheets_of_one, 0.0)[0] / light[0] == pytest.approx(
+        assert light_on_points(off, sheets_of_one, _NO_DIMMING)[0, 1] / light[0] == pytest.approx(
             np.exp(-0.5), rel=1e-6
         )
     # At a common point the sheets' lights add.
@@ -92,10 +93,10 @@ def test_power_is_stated_half_a_metre_from_the_source():
         [laser.plane.normal for laser in rig.lasers], [laser.plane.offset for laser in rig.lasers]
     )[None]
     alone = [
-        light_on_points(cross, pack_sheets(replace(rig, lasers=(laser,)), [source]), 0.3)[0]
+        light_on_points(cross, pack_sheets(replace(rig, lasers=(laser,)), [source]), _DIMMING)[0, 1]
         for laser, source in zip(rig.lasers, sources, strict=True)
     ]
-    assert light_on_points(cross, sheets, 0.3)[0] == pytest.approx(sum(alone))
+    assert light_on_points(cross, sheets, _DIMMING)[0, 1] == pytest.approx(sum(alone))
 
 
 def test_same_seed_same_picture_other_seed_other_noise(renderer):

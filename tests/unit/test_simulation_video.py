@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.simulation.video import VideoWriter
+from aqualvs.simulation.video import Recording, VideoWriter, jpeg
 
 
 def _frames(n=5, size=(64, 48)):
@@ -26,7 +26,7 @@ def _read(path):
 
 def test_lossless_gives_back_every_value(tmp_path):
     path, frames = tmp_path / "a.mp4", _frames()
-    with VideoWriter(path, (64, 48), 25.0, quality="lossless") as writer:
+    with VideoWriter(path, (64, 48), 25.0, Recording(codec="lossless")) as writer:
         for frame in frames:
             writer.write(frame)
     _, read = _read(path)
@@ -49,6 +49,23 @@ def test_h264_is_420_with_the_right_clock(tmp_path):
         assert np.abs(error).mean() < 4.0
 
 
+def test_mjpeg_holds_every_frame_as_a_jpeg_in_full_range(tmp_path):
+    path, frames = tmp_path / "a.mp4", _frames()
+    with VideoWriter(path, (64, 48), 29.97, Recording(codec="mjpeg", jpeg_quality=90)) as writer:
+        for frame in frames:
+            writer.write(frame)
+    pixel_format, read = _read(path)
+    assert pixel_format == "yuvj420p"
+    assert [frame.time for frame in read] == pytest.approx(np.arange(5) / 29.97, abs=2e-4)
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    assert packets == [jpeg(frame, 90) for frame in frames]
+    for expected, frame in zip(frames, read, strict=True):
+        # JPEG at quality 90 on a smooth picture.
+        error = frame.to_ndarray(format="rgb24").astype(int) - expected
+        assert np.abs(error).mean() < 3.0
+
+
 def test_smaller_crf_or_more_bits_make_a_larger_file(tmp_path):
     rng = np.random.default_rng(0)
     frames = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(4)]
@@ -60,7 +77,7 @@ def test_smaller_crf_or_more_bits_make_a_larger_file(tmp_path):
         "few_bits": {"bit_rate": 100_000},
     }.items():
         path = tmp_path / f"{name}.mp4"
-        with VideoWriter(path, (128, 96), 25.0, **options) as writer:
+        with VideoWriter(path, (128, 96), 25.0, Recording(**options)) as writer:
             for frame in frames:
                 writer.write(frame)
         sizes[name] = path.stat().st_size
@@ -84,8 +101,14 @@ def test_an_interrupted_file_can_be_read(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [{"quality": "best"}, {"crf": 60}, {"bit_rate": 0}, {"size_px": (63, 48)}, {"fps": 0.0}],
+    [{"codec": "best"}, {"crf": 60}, {"bit_rate": 0}, {"jpeg_quality": 0}, {"jpeg_quality": 101}],
 )
+def test_senseless_compression_is_refused(options):
+    with pytest.raises(OptionError):
+        Recording(**options)
+
+
+@pytest.mark.parametrize("options", [{"size_px": (63, 48)}, {"fps": 0.0}])
 def test_senseless_options_are_refused(tmp_path, options):
     given = {"size_px": (64, 48), "fps": 25.0, **options}
     with pytest.raises(OptionError):

@@ -19,6 +19,8 @@ from windowed_cases import windowed
 
 RIGS = [windowed(example_rig()), windowed(bluerov2_rig())]
 
+_NO_DIMMING, _DIMMING = (0.0, 0.0, 0.0), (0.3, 0.3, 0.3)
+
 
 def one_laser(rig: Rig, i: int) -> tuple[Rig, Sheets]:
     alone = replace(rig, lasers=(rig.lasers[i],))
@@ -40,14 +42,14 @@ def test_light_falls_off_with_the_distance_from_the_sheet(rig: Rig, i: int) -> N
     alone, packed = one_laser(rig, i)
     sheet, source = sheets_of(alone)[0], default_sources(alone)[0]
     points = fan_points(rig, i, 0.6)
-    middle = light_on_points(points, packed, 0.0)
+    middle = light_on_points(points, packed, _NO_DIMMING)[:, 1]
     assert np.all(middle > 0.5 * source.power)
     gradient = sheet.gradient(points)
     way = np.linalg.norm(points - sheet.source, axis=1)
     for sigmas in (-2.0, -1.0, 1.0, 2.0):
         off = sigmas * (source.sigma + source.divergence * way)
         moved = points + off[:, None] * gradient / np.linalg.norm(gradient, axis=1)[:, None]
-        ratio = light_on_points(moved, packed, 0.0) / middle
+        ratio = light_on_points(moved, packed, _NO_DIMMING)[:, 1] / middle
         # Distances are metres to 2 % here, and the light's way is bent.
         np.testing.assert_allclose(ratio, np.exp(-0.5 * sigmas**2), rtol=0.0, atol=0.012)
 
@@ -66,7 +68,7 @@ def test_leaving_out_what_is_far_from_a_sheet_changes_nothing(rig: Rig) -> None:
         ]
     )
     everywhere = packed._replace(stray=np.full_like(packed.stray, np.inf))
-    light, expected = (light_on_points(points, one, 0.3) for one in (packed, everywhere))
+    light, expected = (light_on_points(points, one, _DIMMING) for one in (packed, everywhere))
     # A sheet's light ends at so many sigma; what is left out is beyond.
     np.testing.assert_allclose(light, expected, rtol=0.0, atol=10.0 * np.exp(-8.0))
     assert np.count_nonzero(light > 0.01) > 100

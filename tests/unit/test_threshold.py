@@ -1,7 +1,10 @@
-"""The paper's detector: runs of bright pixels, their middles."""
+"""The paper's detector: every bright pixel, in runs along the search lines."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
@@ -9,7 +12,7 @@ from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.threshold import ThresholdOptions
+from aqualvs.scanning.threshold import ThresholdDetector, ThresholdOptions, pixels_of_returns
 
 U8 = NDArray[np.uint8]
 
@@ -51,7 +54,7 @@ def test_runs_come_in_order_with_middle_width_and_peak() -> None:
     np.testing.assert_array_equal(found.position, [21.5, 40.0, 8.0])
     np.testing.assert_array_equal(found.width, [4.0, 1.0, 3.0])
     np.testing.assert_array_equal(found.height, [200.0, 141.0, 255.0])
-    assert np.isnan(found.green_fall).all()
+    np.testing.assert_array_equal(found.likelihood, np.ones(3))
     assert len(found) == 3
 
 
@@ -61,14 +64,59 @@ def test_the_level_itself_is_bright_and_one_below_is_not() -> None:
     np.testing.assert_array_equal(detect(image).line, [0])
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (7, 3), (8, 8), (65, 129)])
-def test_every_run_of_any_picture_is_found_once(shape: tuple[int, int]) -> None:
-    image = np.random.default_rng(3).integers(0, 256, shape, dtype=np.uint8)
-    bright = np.pad(image >= 200, ((1, 1), (0, 0)))
-    starts = bright[1:-1] & ~bright[:-2]
-    found = detect(image, level=200)
-    np.testing.assert_array_equal(np.bincount(found.line, minlength=shape[1]), starts.sum(axis=0))
-    assert found.width.sum() == np.count_nonzero(image >= 200)
+def lit_pixels(lines: U8, low: int, high: int, options: ThresholdOptions) -> U8:
+    """Mark the pixels that the returns are made of, once for every time they are listed."""
+    n_lines, length = lines.shape
+    bounds = np.full(n_lines, low), np.full(n_lines, high)
+    detector = ThresholdDetector(SearchAxis.ALONG_X, (length, n_lines), *bounds, options)
+    found = detector.detect(lines)
+    source, place = pixels_of_returns(found.position, found.width)
+    seen = np.zeros(lines.shape, np.uint8)
+    np.add.at(seen, (found.line[source], place.astype(np.int64)), 1)
+    for line, position, height, width in zip(
+        found.line, found.position, found.height, found.width, strict=True
+    ):
+        first = int(position - 0.5 * (width - 1.0))
+        assert height == lines[line, first : first + int(width)].max()
+    return seen
+
+
+@given(
+    arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=24)),
+    st.integers(-3, 26),
+    st.integers(-3, 26),
+    st.integers(1, 255),
+)
+def test_every_bright_pixel_of_the_band_is_listed_once_and_no_other(
+    lines: U8, low: int, high: int, level: int
+) -> None:
+    seen = lit_pixels(lines, low, high, ThresholdOptions(level=level))
+    place = np.arange(lines.shape[1])
+    np.testing.assert_array_equal(seen, (lines >= level) & (place >= low) & (place <= high))
+
+
+@given(arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=16)), st.integers(1, 40))
+def test_where_there_are_too_many_the_lowest_level_that_suits_is_used(lines: U8, most: int) -> None:
+    options = ThresholdOptions(level=10, max_returns=most, max_pixels=2 * most)
+    seen = lit_pixels(lines, 0, lines.shape[1], options)
+    for level in range(10, 257):
+        bright = np.pad(lines, ((0, 0), (1, 0))) >= level
+        n_runs = np.count_nonzero(bright[:, 1:] & ~bright[:, :-1])
+        if n_runs <= most and np.count_nonzero(bright) <= 2 * most:
+            break
+    np.testing.assert_array_equal(seen, bright[:, 1:])
+
+
+def test_a_white_picture_has_no_returns() -> None:
+    white = np.full((64, 64), 255, np.uint8)
+    detector = full_detector((64, 64), ThresholdOptions(max_pixels=4000))
+    assert len(detector.detect(Frame(0, 0.0, white))[SearchAxis.ALONG_Y]) == 0
+
+
+def test_a_sub_pixel_return_has_the_pixels_above_half_its_height() -> None:
+    source, place = pixels_of_returns(np.array([20.4, 10.5, 7.0]), np.array([4.0, 0.5, 1.9]))
+    np.testing.assert_array_equal(source, [0, 0, 0, 0, 1, 2])
+    np.testing.assert_array_equal(place, [19, 20, 21, 22, 10, 7])
 
 
 def test_only_the_band_is_searched() -> None:
@@ -86,13 +134,6 @@ def test_a_second_frame_is_not_mixed_with_the_first() -> None:
     dark = np.full((64, n), 20, np.uint8)
     assert len(detector.detect(Frame(1, 0.0, dark))[SearchAxis.ALONG_Y]) == 0
     np.testing.assert_array_equal(first.position, np.full(n, 30.0))
-
-
-def test_more_than_may_be_kept_is_dropped_without_harm() -> None:
-    image = np.zeros((64, 64), np.uint8)
-    image[::2] = 255
-    detector = full_detector((64, 64), ThresholdOptions(max_returns=100))
-    assert len(detector.detect(Frame(0, 0.0, image))[SearchAxis.ALONG_Y]) == 100
 
 
 def test_rows_are_searched_where_the_stripe_stands_upright() -> None:

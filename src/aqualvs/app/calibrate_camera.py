@@ -56,8 +56,10 @@ def calibrate_camera(request: CameraRequest, tell: Tell) -> None:
         n_coefficients=request.n_coefficients,
     )
     rig = _rig(result, nominal)
+    n_pictures = len(found.views) + len(found.missed)
+    of = f" of {n_pictures}" if len(result.views) < n_pictures else ""
     tell(
-        f"{len(result.views)} pictures, {result.n_points} corners, residual "
+        f"{len(result.views)}{of} pictures, {result.n_points} corners, residual "
         f"{result.rms_px:.3f} px (rms)"
     )
     for line in (*found.remarks, *result.findings):

@@ -27,6 +27,8 @@ Detect: TypeAlias = Callable[[Path, Image], View | str]
 
 # More threads than this gain nothing on small pictures.
 _THREADS = 4
+# Names of pictures that a note lists.
+_NAMES_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,24 @@ class Found:
     @property
     def remarks(self) -> list[str]:
         """What to warn of."""
-        return [f"{name}: left out, {why}" for name, why in self.missed.items()]
+        return [
+            *self.notes,
+            *(f"{name}: left out, {why}" for name, why in self.missed.items()),
+        ]
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth knowing of how targets were found, each with its pictures."""
+        names: dict[str, list[str]] = {}
+        for view in self.views:
+            for note in view.notes:
+                names.setdefault(note, []).append(view.name)
+        return [f"{_listed(where)}: {note}" for note, where in names.items()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMES_SHOWN
+    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def find_targets(paths: Sequence[Path], detect: Detect, target: str) -> Found:

@@ -28,19 +28,19 @@ from aqualvs.calibration.dome_result import DomeCalibration
 from aqualvs.calibration.pose_files import BoardPose, load_poses, match_poses, picture_paths
 from aqualvs.calibration.target_files import load_board
 from aqualvs.errors import OptionError
+from aqualvs.optics.assumed import N_WATER, completed_uncertainty
 from aqualvs.optics.camera import DOME_PARAMETERS, POSE_PARAMETERS, Dome
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.solved import (
+    ASSUMED,
     SolvedStep,
+    file_parameter_name,
     merged,
     rig_uncertainty,
     with_step,
     with_uncertainty,
 )
-
-# Water whose index nobody measured: fresh to salt, cold to warm.
-_WATER_SIGMA = 3e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,11 +85,27 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
     """
     rig = _with_dome(load_rig(request.rig, need_lasers=False), request)
     shots = _all_shots(request, rig)
-    result = dome(rig, [one.board_set for one in shots], _options(request))
+    known = rig_uncertainty(rig)
+    if not set(known.names) & set(rig.lens.parameter_names):
+        # Intrinsics that were written by hand are not exact either.
+        given = completed_uncertainty(rig).only(rig.lens.parameter_names)
+        known = merged(known, given)
+    result = dome(rig, [one.board_set for one in shots], _options(request), known)
     solved = _noted(rig, result)
-    for line in result.findings:
+    for line in (*_summary(result, shots), *result.findings):
         tell(line)
     finish(solved, _page(rig, solved, result, shots, request), request.out, "dome", tell)
+
+
+def _summary(result: DomeCalibration, shots: Sequence[_Shots]) -> list[str]:
+    """Say how many pictures were used, with what residual, and which were left out and why."""
+    n_pictures = sum(len(one.found.views) + len(one.found.missed) for one in shots)
+    used = len(result.views)
+    of = f" of {n_pictures}" if used < n_pictures else ""
+    return [
+        f"{used}{of} pictures, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
+        *(line for one in shots for line in (*one.found.remarks, *one.notes)),
+    ]
 
 
 def _with_dome(rig: Rig, request: DomeRequest) -> Rig:
@@ -147,18 +163,26 @@ def _shots(
         views=found.views,
         poses=given,
         n_medium=n_medium,
-        sigma_medium=0.0 if in_air else rig_uncertainty(rig).sigmas.get("n_water", _WATER_SIGMA),
+        sigma_medium=0.0 if in_air else rig_uncertainty(rig).sigmas.get("n_water", N_WATER),
     )
     return _Shots(found, board_set, notes)
 
 
 def _noted(rig: Rig, result: DomeCalibration) -> Rig:
     uncertainty = merged(rig_uncertainty(rig), result.uncertainty)
+    names = set(rig_uncertainty(rig).names)
+    solved = set(POSE_PARAMETERS) | set(DOME_PARAMETERS)
+    assumed = [
+        file_parameter_name(name) for name in result.uncertainty.names if name not in names | solved
+    ]
     step = SolvedStep(
         pictures=len(result.views),
         points=result.n_points,
         rms_px=result.rms_px,
-        extras={"media": [round(medium.n, 6) for medium in result.media]},
+        extras={
+            "media": [round(medium.n, 6) for medium in result.media],
+            **({ASSUMED: assumed} if assumed else {}),
+        },
     )
     return with_uncertainty(with_step(result.rig, "dome", step), uncertainty)
 
@@ -187,7 +211,6 @@ def _page(
             )
         )
     missed = {name: why for one in shots for name, why in one.found.missed.items()}
-    notes = [note for one in shots for note in one.notes]
     dome_names = [name for name in DOME_PARAMETERS if name in sigmas]
     return Page(
         title="Calibration of the dome",
@@ -195,7 +218,7 @@ def _page(
         cards=tuple(cards),
         warnings=(
             *(f"{name}: {why}" for name, why in {**missed, **result.left_out}.items()),
-            *notes,
+            *(note for one in shots for note in (*one.found.notes, *one.notes)),
         ),
         words=result.findings,
         expectations=expectations(rig),

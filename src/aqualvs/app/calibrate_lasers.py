@@ -44,23 +44,25 @@ from aqualvs.calibration.stripe_points import StripePoints
 from aqualvs.calibration.stripes_on_planes import Surfaces, board_surface, box_surfaces
 from aqualvs.calibration.target_files import load_board, load_box
 from aqualvs.calibration.view import View
-from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.solved import (
+    ASSUMED,
     SolvedStep,
+    file_parameter_name,
     merged,
     rig_uncertainty,
     with_step,
     with_uncertainty,
 )
+from aqualvs.optics.uncertainty import RigUncertainty
 from aqualvs.scanning.whole_picture import find_stripes
 
 _DEG = 180.0 / math.pi
 _SHOTS = 6
-# More lasers than this in a box are believed only if somebody said that there are so many.
-_MOST_UNTOLD = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,15 +116,29 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
             n_medium=target.n_medium if in_air or request.medium else None,
             refine=request.refine,
         ),
-        uncertainty=rig_uncertainty(before),
+        uncertainty=_known(before, request, in_air=in_air),
     )
-    _check_count(result, _expected(request, before) or len(before.lasers) or None, request)
     rig = _noted(before, result, request, target)
     for warning in result.warnings:
         tell(f"note: {warning}")
     for figures, laser in zip(result.lasers, rig.lasers, strict=True):
         tell(_words(figures, laser))
     finish(rig, _page(before, rig, result, target, views, request), request.out, "lasers", tell)
+
+
+def _known(rig: Rig, request: LasersRequest, *, in_air: bool) -> RigUncertainty:
+    """Return how well the camera is known, with defaults for what was written by hand.
+
+    So lasers and camera are correlated as they are found together. Priors of a refinement are only
+    what the rig itself says, and an index that is only assumed is left to the water of the dive.
+    """
+    own = rig_uncertainty(rig)
+    if request.refine:
+        return own
+    known = completed_uncertainty(rig)
+    elsewhere = in_air or request.medium is not None
+    left_out = {"n_water"} - set(own.names) if elsewhere else set()
+    return known.only([name for name in known.names if name not in left_out])
 
 
 def _expected(request: LasersRequest, rig: Rig) -> int | None:
@@ -133,15 +149,6 @@ def _expected(request: LasersRequest, rig: Rig) -> int | None:
         return len(request.names)
     noted = rig.solved_from.get(N_LASERS)
     return noted if isinstance(noted, int) and not rig.lasers else None
-
-
-def _check_count(result: LaserCalibration, expected: int | None, request: LasersRequest) -> None:
-    n = len(result.lasers)
-    if expected is None and request.box is not None and n > _MOST_UNTOLD:
-        raise CalibrationError(
-            f"{n} lasers seem to shine in {request.images[0]}, which may be paper edges that look "
-            "like stripes; give --lasers N, how many there are"
-        )
 
 
 def _target(request: LasersRequest, rig: Rig) -> _Target:
@@ -180,6 +187,9 @@ def _stripes(path: Path, name: str) -> StripePoints:
 def _noted(before: Rig, result: LaserCalibration, request: LasersRequest, target: _Target) -> Rig:
     names = request.names
     lasers = result.rig.lasers
+    old = rig_uncertainty(before)
+    assumed = [name for name in result.uncertainty.names if ":" not in name]
+    assumed = [file_parameter_name(name) for name in assumed if name not in old.names]
     step = SolvedStep(
         pictures=len(result.views),
         points=sum(figures.n_points for figures in result.lasers),
@@ -189,9 +199,9 @@ def _noted(before: Rig, result: LaserCalibration, request: LasersRequest, target
             "n_medium": round(target.n_medium, 6),
             "surfaces": sorted({s for figures in result.lasers for s in figures.surfaces}),
             "refined": result.refined,
+            **({ASSUMED: assumed} if assumed else {}),
         },
     )
-    old = rig_uncertainty(before)
     noted = with_step(result.rig, "lasers", step)
     noted = with_uncertainty(noted, merged(old, result.uncertainty))
     if names is None:

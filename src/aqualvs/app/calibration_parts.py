@@ -13,9 +13,9 @@ from aqualvs.app.calibration_material import ExpectationRow, ParameterRow, Resid
 from aqualvs.calibration.view import View
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.expected_error import expected_posture_errors
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.uncertainty import RigUncertainty
 
 _DEG = 180.0 / math.pi
@@ -52,7 +52,7 @@ def expectations(rig: Rig) -> tuple[ExpectationRow, ...]:
             noise_pitch_deg=_DEG * float(found.sigma_noise[1]),
             noise_yaw_deg=_DEG * float(found.sigma_noise[2]),
         )
-        for found in expected_posture_errors(rig, rig_uncertainty(rig))
+        for found in expected_posture_errors(rig, completed_uncertainty(rig))
     )
 
 

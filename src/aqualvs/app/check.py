@@ -20,6 +20,7 @@ from aqualvs.app.check_finding import Finding, Severity, count_words, findings_t
 from aqualvs.app.check_solved import check_solved
 from aqualvs.app.check_view import blind_fraction, field_of_view
 from aqualvs.errors import RigError
+from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import load_rig
@@ -53,11 +54,10 @@ def run_check(path: Path, console: Console | None = None) -> int:
         raise RigError(f"{path}: {error}") from None
     console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
     console.print(findings_table(findings))
-    uncertainty = rig_uncertainty(rig)
-    errors = expected_errors(rig, uncertainty)
+    errors = expected_errors(rig, completed_uncertainty(rig))
     if errors:
         console.print(sensitivity_table(rig, errors))
-        console.print(error_table(errors, bool(uncertainty.names)))
+        console.print(error_table(errors))
     bad = any(finding.severity is Severity.BAD for finding in findings)
     console.print(_verdict(findings), style="bold red" if bad else "bold", highlight=False)
     return EXIT_BAD if bad else EXIT_SANE
@@ -87,7 +87,7 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
         *_check_lasers(rig, camera),
         *(_check_pair(a, b) for a, b in itertools.combinations(rig.lasers, 2)),
         *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
-        *check_errors(expected_errors(rig, uncertainty), bool(uncertainty.names)),
+        *check_errors(expected_errors(rig, completed_uncertainty(rig))),
     ]
 
 

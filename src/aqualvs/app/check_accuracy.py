@@ -32,8 +32,8 @@ def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedErro
     return expected_posture_errors(rig, uncertainty, inside or [near, far])
 
 
-def check_errors(errors: Sequence[ExpectedError], known: bool) -> Iterator[Finding]:
-    """Say what to expect at each range, from noise and, where it is `known`, from calibration."""
+def check_errors(errors: Sequence[ExpectedError]) -> Iterator[Finding]:
+    """Say what to expect at each range, from noise and from the uncertainty of the rig."""
     for expected in errors:
         place = f"At {expected.wall_range * 1e3:.0f} mm"
         if not expected.valid:
@@ -42,8 +42,7 @@ def check_errors(errors: Sequence[ExpectedError], known: bool) -> Iterator[Findi
             )
             continue
         yield _noise_finding(expected, place)
-        if known:
-            yield _calibration_finding(expected, place)
+        yield _calibration_finding(expected, place)
 
 
 def _noise_finding(expected: ExpectedError, place: str) -> Finding:
@@ -63,14 +62,14 @@ def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
     range_mm, pitch, yaw = _shown_units(expected.sigma_calibration)
     share = 1e-3 * range_mm / expected.wall_range
     sentence = (
-        f"{place} the calibration leaves a systematic error of {range_mm:.2g} mm ({share:.2%}) in "
-        f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw (one sigma)"
+        f"{place} the uncertainty of the rig leaves a systematic error of {range_mm:.2g} mm "
+        f"({share:.2%}) in range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw (one sigma)"
     )
     if share > _LARGE_SHARE or max(pitch, yaw) > _LARGE_ANGLE_DEG:
         return Finding(
             Severity.WARN,
             f"{sentence}, more than {_LARGE_SHARE:.1%} or {_LARGE_ANGLE_DEG} degrees; calibrate "
-            "again with more pictures, nearer and farther ones.",
+            "what is only assumed, or again with more pictures, nearer and farther ones.",
         )
     return Finding(Severity.OK, f"{sentence}.")
 
@@ -87,7 +86,7 @@ def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
     return table
 
 
-def error_table(errors: Sequence[ExpectedError], known: bool) -> Table:
+def error_table(errors: Sequence[ExpectedError]) -> Table:
     """Return the standard deviations of posture to a wall ahead, by where they come from."""
     title = f"Expected error, one sigma: a wall ahead, {SIGMA_PX} px on {N_POINTS} points a laser"
     table = Table(title=title, title_justify="left", box=None)
@@ -96,9 +95,11 @@ def error_table(errors: Sequence[ExpectedError], known: bool) -> Table:
     for name in ("range mm", "range %", "pitch deg", "yaw deg"):
         table.add_column(name, justify="right")
     for expected in errors:
-        rows = {"pixel noise": expected.sigma_noise}
-        if known:
-            rows = {"calibration": expected.sigma_calibration, **rows, "both": expected.sigma}
+        rows = {
+            "rig": expected.sigma_calibration,
+            "pixel noise": expected.sigma_noise,
+            "both": expected.sigma,
+        }
         for i, (name, sigmas) in enumerate(rows.items()):
             range_mm, pitch, yaw = _shown_units(sigmas)
             share = 0.1 * range_mm / expected.wall_range

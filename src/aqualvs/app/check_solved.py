@@ -8,9 +8,10 @@ from datetime import datetime
 import numpy as np
 
 from aqualvs.app.check_finding import Finding, Severity, count_words
+from aqualvs.optics.assumed import assumptions
 from aqualvs.optics.camera_params import POSE_PARAMETERS
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.solved import SolvedStep
+from aqualvs.optics.solved import ASSUMED, SolvedStep, is_exact
 from aqualvs.optics.uncertainty import RigUncertainty, laser_parameter_names
 
 SURFACES = "surfaces"
@@ -44,14 +45,7 @@ def check_solved(
         yield _told(name, step, now)
         yield from _doubts(name, step, now)
     yield from _out_of_order(steps)
-    if not uncertainty.names:
-        yield Finding(
-            Severity.OK,
-            "The rig does not say how well it is known (no solved_from.uncertainty), so its own "
-            "errors are not counted; 'aqualvs calibrate' writes them down.",
-        )
-        return
-    yield from _left_out(rig, uncertainty)
+    yield from _assumed(rig, steps)
     yield from _loose(rig, uncertainty)
 
 
@@ -130,19 +124,32 @@ def _out_of_order(steps: dict[str, SolvedStep]) -> Iterator[Finding]:
             )
 
 
-def _left_out(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
-    groups = {"lens's place": POSE_PARAMETERS[:3], "focal lengths": ("fx", "fy")}
-    for laser in rig.lasers:
-        groups[f"laser '{laser.name}'"] = laser_parameter_names(laser)
-    missing = [
-        words for words, names in groups.items() if not any(n in uncertainty.names for n in names)
-    ]
-    if missing:
+def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
+    """Numbers that nobody has said the uncertainty of, and what is assumed in its place."""
+    if is_exact(rig):
         yield Finding(
             Severity.OK,
-            f"How well the {', the '.join(missing)} {'is' if len(missing) == 1 else 'are'} known "
-            "is not written down; such errors are not counted.",
+            "The rig's numbers count as exact (solved_from.uncertainty), as those of a simulated "
+            "dive are; take that out for a rig that was built.",
         )
+    alike: dict[str, list[str]] = {}
+    for one in assumptions(rig):
+        alike.setdefault(one.words, []).append(f"the {one.what}")
+    for words, what in alike.items():
+        verb = "is" if len(what) == 1 else "are"
+        yield Finding(
+            Severity.OK,
+            f"How well {', '.join(what)} {verb} known is not written down; assumed (one sigma): "
+            f"{words}. 'aqualvs calibrate' finds it out.",
+        )
+    for name, step in steps.items():
+        numbers = step.extras.get(ASSUMED)
+        if isinstance(numbers, list) and numbers:
+            yield Finding(
+                Severity.OK,
+                f"The calibration of the {name} assumed how well {', '.join(map(str, numbers))} "
+                "are known: they were written by hand.",
+            )
 
 
 def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:

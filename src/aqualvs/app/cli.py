@@ -103,7 +103,7 @@ app.command(
 app.command(
     help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
     "SCENARIO is a name from --list or a YAML file.",
-    epilog="Example: aqualvs simulate net -o out/net",
+    epilog="Example: aqualvs simulate net_diamond --camera webcam -o out/net",
 )(simulate)
 app.command(
     help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",

@@ -81,6 +81,13 @@ def follow(
     rendered: Annotated[
         bool, typer.Option("--rendered", help="Sim: render every frame and measure in it.")
     ] = False,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="Sim, rendered: camera that takes the frames; ideal, webcam, action or pal.",
+            show_default=False,
+        ),
+    ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
     seed: Annotated[int, typer.Option(help="Sim: of waves and noise.")] = 0,
 ) -> None:
@@ -106,6 +113,7 @@ def follow(
             seconds=seconds,
             fps=fps,
             rendered=rendered,
+            camera=camera,
             seed=seed,
             dashboard=dashboard_address if dashboard else None,
             token=token,

@@ -199,6 +199,9 @@ def simulate(
     rig: Annotated[
         Path | None, typer.Option(help="Rig file; the example rig if left out.", show_default=False)
     ] = None,
+    camera: Annotated[
+        str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
+    ] = "ideal",
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a dive that is there.")
     ] = False,
@@ -210,7 +213,7 @@ def simulate(
     if list_:
         body.tell_scenarios(typer.echo)
     else:
-        body.simulate(scenario, rig, out, typer.echo, overwrite=overwrite)
+        body.simulate(scenario, rig, out, typer.echo, camera=camera, overwrite=overwrite)
 
 
 def demo(

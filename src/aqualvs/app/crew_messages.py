@@ -27,7 +27,7 @@ Message: TypeAlias = list[Measured] | Ended
 
 _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fields(ScanPoints)}
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
-_ARRAYS = ("covariance", "normal_in_dome")
+_ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
 # A line of the cache: no two columns share one.
 _ALIGNED = 64

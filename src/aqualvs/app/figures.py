@@ -15,10 +15,13 @@ from aqualvs.app.report_rig import LaserFacts, lasers_of, working_range_m
 from aqualvs.app.report_run import read_run_file
 from aqualvs.app.target_file import target_facts
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.geometry.arrays import IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.scanning.mesh import MeshFilterOptions, laser_frame, mesh_filter
+from aqualvs.scanning.paper_filter import PaperFilter
 from aqualvs.scanning.scan import Label
+from aqualvs.scanning.search import plan_searches
 
 _BATCH = 1 << 16
 # Frames have numbers of 32 bits, lasers of 8.
@@ -28,6 +31,7 @@ _CANDIDATES = 16
 _STRAND_GAP = 4e-3
 _NET = Label.NET.name.lower()
 _COLUMNS = ("x_m", "y_m", "z_m", "label")
+_PIXEL_COLUMNS = ("u_px", "v_px", "width_px", "label")
 
 
 class _Counts(NamedTuple):
@@ -56,6 +60,9 @@ def figures(
     target: Path | None = None,
 ) -> list[Path]:
     """Draw figures 13 and 14 of the paper, and its laser-plane image, from a run's folder.
+
+    A run with the threshold detector is shown by all its bright pixels, others by the centres of
+    their returns.
 
     Parameters
     ----------
@@ -188,6 +195,14 @@ def _worth(r: Reflections) -> float:
     return float(pieces * np.sqrt(1.0 + np.count_nonzero(r.usable & ~r.adaptive)))
 
 
+class _Judged(NamedTuple):
+    """Points of one laser in `dome`, shape (N, 3), and which of them each filter takes for net."""
+
+    in_dome: FloatArray
+    adaptive: BoolArray
+    paper: BoolArray
+
+
 def _read(
     points: Path,
     chosen: tuple[int, int],
@@ -195,29 +210,57 @@ def _read(
     run: Mapping[str, Any],
     options: MeshFilterOptions,
 ) -> Reflections:
-    wanted = [("frame", "==", chosen[0]), ("laser", "==", chosen[1])]
-    table = parquet.read_table(points, columns=list(_COLUMNS), filters=wanted)
-    in_dome = np.stack([table[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=-1)
-    in_dome = in_dome.astype(np.float64)
     plane = Plane(laser.normal, laser.offset)
     near, far = working_range_m(run["rig"]) or (0.0, np.inf)
-    distance = np.linalg.norm(in_dome, axis=1)
+    every_pixel = _every_pixel(run)
+    table = parquet.read_table(
+        points,
+        columns=list(_PIXEL_COLUMNS if every_pixel else _COLUMNS),
+        filters=[("frame", "==", chosen[0]), ("laser", "==", chosen[1])],
+    )
+    if every_pixel:
+        judged = _pixels(table, chosen[1], run, options)
+    else:
+        in_dome = _columns(table, "x_m", "y_m", "z_m")
+        kept = mesh_filter(in_dome, plane, options, working_range=(near, far))
+        judged = _Judged(in_dome, _is_net(table["label"]), kept)
+    distance = np.linalg.norm(judged.in_dome, axis=1)
     return Reflections(
         frame=chosen[0],
         laser=laser.name,
-        in_laser=np.ascontiguousarray(laser_frame(plane).apply(in_dome)[:, :2]),
+        in_laser=np.ascontiguousarray(laser_frame(plane).apply(judged.in_dome)[:, :2]),
         offset=laser.offset,
         working_range=(near, far),
         usable=(distance >= near) & (distance <= far),
-        adaptive=_is_net(table["label"]),
-        paper=mesh_filter(in_dome, plane, options, working_range=(near, far)),
+        adaptive=judged.adaptive,
+        paper=judged.paper,
+        every_pixel=every_pixel,
     )
+
+
+def _every_pixel(run: Mapping[str, Any]) -> bool:
+    detector = ((run.get("options") or {}).get("scanner") or {}).get("detector") or {}
+    return bool(detector.get("kind") == "threshold")
+
+
+def _pixels(table: Any, laser: int, run: Mapping[str, Any], options: MeshFilterOptions) -> _Judged:
+    """Return every bright pixel of a run with the threshold detector."""
+    rig = rig_from_mapping(run["rig"], source_name="run.yaml")
+    camera = rig.camera()
+    papers = PaperFilter(rig, camera, plan_searches(rig, camera), options, every_pixel=True)
+    centres, width = _columns(table, "u_px", "v_px"), _columns(table, "width_px")[:, 0]
+    found = papers.apply(centres, width, np.full(len(width), laser))
+    return _Judged(found.points_in_dome, _is_net(table["label"])[found.source], found.on_mesh)
+
+
+def _columns(table: Any, *names: str) -> FloatArray:
+    return np.stack([table[name].to_numpy() for name in names], axis=-1).astype(np.float64)
 
 
 def _summary(r: Reflections) -> list[str]:
     both = int(np.count_nonzero(r.adaptive & r.paper))
     return [
-        f"frame {r.frame}, laser {r.laser}: {len(r.in_laser)} reflections, "
+        f"frame {r.frame}, laser {r.laser}: {len(r.in_laser)} {r.noun}, "
         f"{int(r.usable.sum())} of them in the working range",
         f"net by the adaptive filter: {int(r.adaptive.sum())}; by the paper's: "
         f"{int(r.paper.sum())}, {both} of them the same",

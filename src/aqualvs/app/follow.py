@@ -27,6 +27,7 @@ from aqualvs.control.plan import load_plan
 from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
+from aqualvs.simulation.cameras import simulated_camera
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.net_motion import NetWall
 
@@ -101,6 +102,8 @@ class SimRequest:
         Frames a second.
     rendered : bool
         Render every frame and measure in it, instead of sampling the scanner's noise.
+    camera : str or None
+        Simulated camera that takes the rendered frames; the ideal one if left out.
     seed : int
     dashboard : str or None
         Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
@@ -121,6 +124,7 @@ class SimRequest:
     seconds: float = 60.0
     fps: float = 25.0
     rendered: bool = False
+    camera: str | None = None
     seed: int = 0
     dashboard: str | None = None
     token: str | None = None
@@ -135,6 +139,8 @@ class SimRequest:
         """
         if not self.seconds >= _LEAST_S:
             raise OptionError(f"--seconds {self.seconds:g}: choose at least {_LEAST_S:g}")
+        if self.camera is not None and not self.rendered:
+            raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
         if self.cage_radius and not self.cage_radius >= _LEAST_RADIUS:
             raise OptionError(
                 f"--cage-radius {self.cage_radius:g}: choose at least {_LEAST_RADIUS:g} m, or 0 "
@@ -166,7 +172,7 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     rng = np.random.default_rng([request.seed, 53])
     eye: Eye = SampledEye(case.net, rng, working_range=rig.working_range)
     if request.rendered:
-        eye = RenderedEye(case.net, rig, rng)
+        eye = RenderedEye(case.net, rig, rng, camera=simulated_camera(request.camera or "ideal"))
     loop = case.loop(eye, mission)
     with ExitStack() as undo:
         page = None

@@ -9,6 +9,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene
@@ -39,6 +40,8 @@ class RenderedEye:
         Defaults if left out.
     samples : int
         Rays along each side of a pixel.
+    camera : SimulatedCamera
+        Takes the pictures; they are measured before it compresses them.
 
     Attributes
     ----------
@@ -54,10 +57,11 @@ class RenderedEye:
         scene: Scene | None = None,
         options: ScannerOptions | None = None,
         samples: int = 1,
+        camera: SimulatedCamera = IDEAL,
     ) -> None:
         self._net, self._rng = net, rng
         self._scene = net_scene() if scene is None else scene
-        self._renderer = Renderer(rig, samples=samples)
+        self._renderer = Renderer(rig, samples=samples, camera=camera)
         self._scanner = Scanner(rig, options)
         self._n_frames = 0
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)

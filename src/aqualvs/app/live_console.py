@@ -71,7 +71,7 @@ def status_line(sample: LiveSample) -> str:
     """Return posture and health of a sample in one line."""
     posture, health = sample.scan.posture, sample.health
     if isinstance(posture, Posture):
-        sigma = posture.covariance.diagonal() ** 0.5
+        sigma = posture.total_covariance.diagonal() ** 0.5
         told = (
             f"range {posture.range:.3f} ± {sigma[0]:.3f} m  "
             f"yaw {math.degrees(posture.yaw):+.1f} ± {math.degrees(sigma[2]):.1f} deg  "

@@ -53,6 +53,8 @@ class Reflections:
         Points in that zone.
     adaptive, paper : bool array, shape (N,)
         Points that the two filters take for net.
+    every_pixel : bool
+        Whether the points are bright pixels, or centres of returns.
     """
 
     frame: int
@@ -63,6 +65,12 @@ class Reflections:
     usable: BoolArray
     adaptive: BoolArray
     paper: BoolArray
+    every_pixel: bool = False
+
+    @property
+    def noun(self) -> str:
+        """Name of the points."""
+        return "bright pixels" if self.every_pixel else "reflections"
 
 
 def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path) -> list[Path]:
@@ -123,11 +131,11 @@ def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
     figure = new_canvas(min(tall * (width + spare) / height + 1.0, 5.6), tall + 0.8)
     axes = figure.add_subplot()
     _zone(axes, r)
-    _dots(axes, xy[r.usable], 2.5, _BLUE, f"reflections in it ({int(r.usable.sum())})")
+    _dots(axes, xy[r.usable], 2.5, _BLUE, f"{r.noun} in it ({int(r.usable.sum())})")
     if not r.usable.all():
         _dots(axes, xy[~r.usable], 2.5, _GREY, f"others ({int((~r.usable).sum())})")
     _plane_axes(axes, low, high)
-    axes.set_title(f"Reflections of laser “{r.laser}” in its plane, frame {r.frame}")
+    axes.set_title(f"{r.noun.capitalize()} of laser “{r.laser}” in its plane, frame {r.frame}")
     axes.legend(loc="lower left", markerscale=3.0, frameon=False)
     return figure
 

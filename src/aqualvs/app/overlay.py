@@ -87,7 +87,7 @@ def posture_lines(posture: Posture | Refusal) -> list[str]:
     if isinstance(posture, Refusal):
         lines = ["no posture", reason_words(posture.reason)]
         return [*lines, posture.detail] if posture.detail else lines
-    sigma = np.sqrt(np.diag(posture.covariance))
+    sigma = np.sqrt(np.diag(posture.total_covariance))
     pitch, yaw = np.rad2deg([posture.pitch, posture.yaw])
     sigma_pitch, sigma_yaw = np.rad2deg(sigma[1:])
     return [

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from aqualvs.app.append_file import AppendFile
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
 
@@ -30,8 +31,17 @@ POSTURE_COLUMNS = (
     "curvature_z_per_m",
     "sigma_curvature_x_per_m",
     "sigma_curvature_z_per_m",
+    "sigma_range_rig_m",
+    "sigma_pitch_rig_deg",
+    "sigma_yaw_rig_deg",
+    "sigma_range_total_m",
+    "sigma_pitch_total_deg",
+    "sigma_yaw_total_deg",
 )
-"""The last four are empty unless the target is a curved net: horizontal and vertical."""
+"""Curvatures, horizontal and vertical, are empty unless the target is a curved net. `sigma_range_m`
+and its like are what the frame's noise makes, `sigma_..._rig_...` what the uncertainty of the rig
+does, which is common to all frames, and `sigma_..._total_...` the root of the sum of the squares of
+both."""
 _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 
 
@@ -88,7 +98,9 @@ def posture_row(scan: Scan) -> str:
     posture = scan.posture
     if not isinstance(posture, Posture):
         return f"{head},0,{posture.reason.value},{',' * (_N_NUMBERS - 1)}\n"
-    return f"{head},1,,{_numbers(posture)},{scan.n_water:.6f},{_curvature(posture)}\n"
+    return (
+        f"{head},1,,{_numbers(posture)},{scan.n_water:.6f},{_curvature(posture)},{_rig(posture)}\n"
+    )
 
 
 def _curvature(posture: Posture) -> str:
@@ -97,11 +109,19 @@ def _curvature(posture: Posture) -> str:
     return ",".join(f"{value:.4g}" for value in (*posture.curvature, *posture.sigma_curvature))
 
 
+def _rig(posture: Posture) -> str:
+    return f"{_sigmas(posture.rig_covariance)},{_sigmas(posture.total_covariance)}"
+
+
+def _sigmas(covariance: FloatArray) -> str:
+    """Return standard deviations of range (m), pitch and yaw (deg)."""
+    sigma_range, sigma_pitch, sigma_yaw = np.sqrt(covariance.diagonal()).tolist()
+    return f"{sigma_range:.4g},{math.degrees(sigma_pitch):.4g},{math.degrees(sigma_yaw):.4g}"
+
+
 def _numbers(posture: Posture) -> str:
-    variance = posture.covariance
     return (
         f"{posture.range:.6f},{math.degrees(posture.pitch):.5f},{math.degrees(posture.yaw):.5f},"
-        f"{np.sqrt(variance[0, 0]):.4g},{math.degrees(np.sqrt(variance[1, 1])):.4g},"
-        f"{math.degrees(np.sqrt(variance[2, 2])):.4g},"
+        f"{_sigmas(posture.covariance)},"
         f"{posture.slant_range:.6f},{posture.nearest:.6f},{posture.n_points}"
     )

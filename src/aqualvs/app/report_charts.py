@@ -153,10 +153,10 @@ def time_unit(track: Track) -> tuple[float, str]:
 
 
 def posture_words(track: Track, row: int) -> str:
-    """Return the posture of a frame with its sigma, or the refusal, in words."""
+    """Return the posture of a frame with its total sigma, or the refusal, in words."""
     if not track.valid[row]:
         return f"no posture: {reason_words(track.reasons[track.reason[row]])}"
-    (r, p, y), (sr, sp, sy) = track.posture[row], track.sigma[row]
+    (r, p, y), (sr, sp, sy) = track.posture[row], track.sigma_total[row]
     return signed(
         f"range {1e3 * r:.1f}{_plus_minus(1e3 * sr, 1)} mm, "
         f"pitch {p:+.2f}{_plus_minus(sp, 2)}°, yaw {y:+.2f}{_plus_minus(sy, 2)}°"
@@ -172,6 +172,7 @@ def _strip(
 ) -> Json:
     name, unit, factor, digits, least = _QUANTITIES[column]
     values, sigma = factor * posture[:, column], factor * track.sigma[:, column]
+    total = factor * track.sigma_total[:, column]
     rows = thin(values, _PER_LINE)
     strip = {
         "name": name,
@@ -179,6 +180,7 @@ def _strip(
         "x": rounded(track.time_s[rows] * scale, 4),
         "y": rounded(values[rows], digits),
         "sigma": rounded(sigma[rows], digits),
+        "total": rounded(total[rows], digits),
         "frame": track.frame[rows].tolist(),
         "breaks": breaks(rows, interruptions(track)),
         "error": False,
@@ -186,7 +188,7 @@ def _strip(
     true = None if truth is None else factor * truth[:, column]
     if true is not None:
         strip["truth"] = _line(track.time_s * scale, true, thin(true, _PER_LINE), digits)
-    strip["axis"] = _strip_axis(values, sigma, true, least)
+    strip["axis"] = _strip_axis(values, total, true, least)
     return strip
 
 

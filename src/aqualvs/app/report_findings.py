@@ -101,10 +101,14 @@ def _posture_card(
     sign = "" if column == 0 else "+"
     gap = " " if column == 0 else ""
     note = f"{values.min():{sign}.{digits}f} to {values.max():{sign}.{digits}f}{gap}{unit}"
-    sigma = scale * track.sigma[track.valid, column]
-    sigma = sigma[np.isfinite(sigma)]
-    if len(sigma):
-        note += f"; σ typically {np.median(sigma):.{digits}f}{gap}{unit}"
+    sigmas = (
+        scale * track.sigma[track.valid, column],
+        scale * track.sigma_total[track.valid, column],
+    )
+    frame, total = (sigma[np.isfinite(sigma)] for sigma in sigmas)
+    if len(frame):
+        note += f"; σ typically {np.median(frame):.{digits}f}{gap}{unit} by the frame's noise, "
+        note += f"{np.median(total):.{digits}f}{gap}{unit} with the rig's uncertainty"
     value = f"{np.median(values):{sign}.{digits}f}{gap}{unit}"
     return Card(name, signed(value), signed(f"median; {note}"))
 
@@ -167,7 +171,7 @@ def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> 
 
 
 def _precision_warnings(track: Track) -> Iterator[str]:
-    relative = track.sigma[track.valid, 0] / track.posture[track.valid, 0]
+    relative = track.sigma_total[track.valid, 0] / track.posture[track.valid, 0]
     loose = float((relative > _LOOSE).mean()) if len(relative) else 0.0
     if loose > 0.05:
         yield f"{100 * loose:.0f} % of the ranges are looser than {100 * _LOOSE:g} % (1 σ)."

@@ -23,9 +23,13 @@ _NUMBERS = (
     "sigma_range_m",
     "sigma_pitch_deg",
     "sigma_yaw_deg",
+    "sigma_range_total_m",
+    "sigma_pitch_total_deg",
+    "sigma_yaw_total_deg",
     "n_points",
     "n_water",
 )
+_TOTALS = tuple(name for name in _NUMBERS if "_total_" in name)
 # The one in C is ten times as fast; not every build of PyYAML has it.
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TRUE = ("true", "1", "yes")
@@ -47,7 +51,10 @@ class Track:
     reasons : tuple of str
         As the file spells them.
     posture, sigma : array, shape (N, 3)
-        Range in metres, pitch and yaw in degrees; NaN where not valid.
+        Range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what the noise of
+        one frame makes.
+    sigma_total : array, shape (N, 3)
+        By noise and rig together; that of the noise in runs of older versions.
     n_points, n_water : array, shape (N,)
         NaN where the file has none.
     """
@@ -59,6 +66,7 @@ class Track:
     reasons: tuple[str, ...]
     posture: FloatArray
     sigma: FloatArray
+    sigma_total: FloatArray
     n_points: FloatArray
     n_water: FloatArray
 
@@ -96,6 +104,8 @@ def read_track(path: Path) -> Track:
     order = np.argsort(columns["frame"], kind="stable")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
     sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
+    total = np.stack([columns[name] for name in _TOTALS], axis=-1)[order]
+    total = np.where(np.isfinite(total), total, sigma)
     words, (reasons, reason) = texts["valid"], texts["reason"]
     says_so = np.array([word.lower() in _TRUE for word in words.names])
     valid = says_so[words.codes][order] & np.isfinite(posture).all(axis=1)
@@ -107,6 +117,7 @@ def read_track(path: Path) -> Track:
         reasons=reasons,
         posture=np.where(valid[:, None], posture, np.nan),
         sigma=np.where(valid[:, None], sigma, np.nan),
+        sigma_total=np.where(valid[:, None], total, np.nan),
         n_points=columns["n_points"][order],
         n_water=columns["n_water"][order],
     )

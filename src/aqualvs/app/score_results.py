@@ -12,6 +12,8 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 
 _ANSWER = ("pitch_deg", "yaw_deg")
 _SIGMAS = ("sigma_pitch_deg", "sigma_yaw_deg")
+# What our own runs claim in all, next to what a frame's noise makes of it.
+_TOTALS = ("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg")
 # Names and units of the range, and of its sigma.
 _RANGES = {"range_m": 1.0, "range_mm": 1e-3}
 _YES, _NO = {"1", "true", "yes"}, {"0", "false", "no"}
@@ -137,7 +139,9 @@ def _answers(path: Path, rows: list[tuple[int, Row]], dive: DiveTruth) -> Answer
         answered.add(place)
         unit = _RANGES[range_column]
         numbers = [cell(path, i, row, column) for column in (range_column, *_ANSWER)]
-        sigmas = [cell(path, i, row, column) for column in (f"sigma_{range_column}", *_SIGMAS)]
+        own = (f"sigma_{range_column}", *_SIGMAS)
+        claimed = _TOTALS if set(_TOTALS) <= row.keys() and unit == 1.0 else own
+        sigmas = [cell(path, i, row, column) for column in claimed]
         found.valid[place] = _valid(path, i, row, numbers[0])
         found.posture[place] = [numbers[0] * unit, *numbers[1:]]
         found.sigma[place] = [sigmas[0] * unit, *sigmas[1:]]

@@ -8,7 +8,9 @@ from aqualvs.app.disk import writing
 from aqualvs.app.progress import progress
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
+from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.scenario import Scenario
@@ -30,6 +32,7 @@ def simulate(
     out: Path | None,
     tell: Callable[[str], object],
     *,
+    camera: str,
     overwrite: bool,
 ) -> None:
     """Render a scenario into a folder and tell how to run it.
@@ -44,28 +47,31 @@ def simulate(
         Folder to write.
     tell : callable
         Takes one line of text.
+    camera : str
+        Name of the camera that takes the pictures.
     overwrite : bool
         Whether what is already there may be replaced.
 
     Raises
     ------
     AqualvsError
-        If scenario, rig or folder cannot be used.
+        If scenario, camera, rig or folder cannot be used.
     """
     if scenario is None:
         raise OptionError("SCENARIO: missing; choose one from aqualvs simulate --list")
     if out is None:
         raise OptionError("--out: missing; give the folder to write")
+    eye = simulated_camera(camera)
     if scenario == CALIBRATION:
-        _simulate_calibration(rig_file, out, tell, overwrite=overwrite)
+        _simulate_calibration(rig_file, out, tell, camera=eye, overwrite=overwrite)
         return
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     _check_free(out, _FILES, overwrite=overwrite)
     with writing(out), progress(scenario, course.n_frames) as tick:
         _write_net_truth(course, out)
-        dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1))
-        save_rig(rig, out / "rig.yaml")
+        dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1), camera=eye)
+        save_rig(with_exact_numbers(rig), out / "rig.yaml")
     tell(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
     tell(
         f"next: aqualvs run {dive.video} --rig {out / 'rig.yaml'} --truth {dive.truth} "
@@ -87,12 +93,17 @@ def _write_net_truth(course: Scenario, out: Path) -> None:
 
 
 def _simulate_calibration(
-    rig_file: Path | None, out: Path, tell: Callable[[str], object], *, overwrite: bool
+    rig_file: Path | None,
+    out: Path,
+    tell: Callable[[str], object],
+    *,
+    camera: SimulatedCamera,
+    overwrite: bool,
 ) -> None:
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     _check_free(out, _CALIBRATION_FILES, overwrite=overwrite)
     with writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
-        files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1))
+        files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1), camera=camera)
     tell(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
     tell("next:")
     for command in calibration_commands(files, out, len(rig.lasers)):

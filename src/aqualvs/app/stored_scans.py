@@ -22,6 +22,7 @@ from aqualvs.scanning.scan import Label, Scan, ScanPoints
 _BATCH = 1 << 15
 _CODE = {name: code for code, name in enumerate(LABELS)}
 _SIGMAS = ("sigma_range_m", "sigma_pitch_deg", "sigma_yaw_deg")
+_RIG_SIGMAS = ("sigma_range_rig_m", "sigma_pitch_rig_deg", "sigma_yaw_rig_deg")
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 _NONE = np.empty(0)
@@ -39,9 +40,9 @@ def stored_scans(run_folder: Path) -> Iterator[Scan]:
     ------
     scan : Scan
         As the scanner gave it, as far as it was stored: pixels, points, sigma, intensity, width and
-        quality as float32, range to a micrometre, angles to 1e-5 degrees. The covariance holds the
-        variances alone (what is between range and angles was not stored), `rms` is NaN, a refusal
-        has lost its detail.
+        quality as float32, range to a micrometre, angles to 1e-5 degrees. The covariances hold
+        the variances alone (what is between range and angles was not stored; the rig's are NaN in
+        older runs), `rms` is NaN, a refusal has lost its detail.
 
     Raises
     ------
@@ -102,13 +103,11 @@ def _posture(row: dict[str, str]) -> Posture | Refusal:
         return Refusal(_reason(row["reason"]))
     pitch, yaw = math.radians(float(row["pitch_deg"])), math.radians(float(row["yaw_deg"]))
     normal = np.array([math.tan(yaw), 1.0, math.tan(pitch)])
-    sigma = np.array([float(row[name]) for name in _SIGMAS])
-    sigma[1:] = np.deg2rad(sigma[1:])
     return Posture(
         range=float(row["range_m"]),
         pitch=pitch,
         yaw=yaw,
-        covariance=np.diag(sigma**2),
+        covariance=_variances(row, _SIGMAS),
         normal_in_dome=normal / np.linalg.norm(normal),
         slant_range=float(row["slant_range_m"]),
         nearest=float(row["nearest_m"]),
@@ -116,7 +115,15 @@ def _posture(row: dict[str, str]) -> Posture | Refusal:
         rms=math.nan,
         curvature=_pair(row, "curvature_{}_per_m"),
         sigma_curvature=_pair(row, "sigma_curvature_{}_per_m"),
+        rig_covariance=_variances(row, _RIG_SIGMAS),
     )
+
+
+def _variances(row: dict[str, str], names: tuple[str, ...]) -> FloatArray:
+    """Return a covariance (3, 3) without what is between its numbers."""
+    sigma = np.array([_number(row.get(name)) for name in names])
+    sigma[1:] = np.deg2rad(sigma[1:])
+    return np.diag(sigma**2)
 
 
 def _pair(row: dict[str, str], name: str) -> tuple[float, float] | None:

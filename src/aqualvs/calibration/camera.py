@@ -9,6 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from aqualvs.calibration.board_bend import (
+    BEND_DEGREES,
+    BentFit,
+    bend_is_significant,
+    fit_bend,
+)
 from aqualvs.calibration.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState
 from aqualvs.calibration.camera_checks import (
     check_camera_solution,
@@ -16,11 +22,16 @@ from aqualvs.calibration.camera_checks import (
     coverage,
     pixel_grid,
 )
-from aqualvs.calibration.camera_problem import direction_sigma_px, fitted_camera
+from aqualvs.calibration.camera_problem import (
+    direction_sigma_px,
+    fitted_camera,
+    with_supported_coefficients,
+)
 from aqualvs.calibration.dome_result import ViewFit, rms_px, view_fit
 from aqualvs.calibration.held_back import predicted
 from aqualvs.calibration.least_squares import Solution, solve
 from aqualvs.calibration.view import View
+from aqualvs.calibration.view_covariance import ViewCovariance, shared_covariance
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.lens import Lens, LensModel
@@ -34,6 +45,10 @@ _HELD_BACK_EVERY, _MIN_HELD_BACK, _MIN_POINTS = 4, 8, 12
 _MANY_OUTLIERS = 0.05
 _WEAK_PIXEL_PX = 1.0
 _THIN_COVERAGE = 0.6
+# Variance by views over that by corners that is worth a word: sigmas half as large again.
+_SHARED_ERRORS = 2.25
+# Uncertainty of the focal length (share) that is worth a word: ranges are off by as much.
+_WEAK_FOCAL = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +61,9 @@ class CameraCalibration:
     size_px : (int, int)
         Image width and height.
     uncertainty : RigUncertainty
-        Of the intrinsics, scaled by the residuals.
+        Of the intrinsics, from how the views disagree (`view_covariance`).
+    inflation : float
+        How many times larger that variance is than if the errors of corners were independent.
     views : tuple of ViewFit
         Poses are `cam_from_target`.
     left_out : dict
@@ -58,6 +75,9 @@ class CameraCalibration:
     held_back_rms_px : float
         How well a model from three views in four predicts corners of the fourth; NaN where there
         are too few views.
+    bend_height : float
+        How far apart the highest and the lowest corner of a bent board are, in metres; 0 for a
+        board that is flat as far as the views tell.
     findings : tuple of str
         In plain words: what is worth knowing.
     n_iterations : int
@@ -66,11 +86,13 @@ class CameraCalibration:
     lens: Lens
     size_px: tuple[int, int]
     uncertainty: RigUncertainty
+    inflation: float
     views: tuple[ViewFit, ...]
     left_out: dict[str, str]
     noise_px: float
     coverage: IntArray
     held_back_rms_px: float
+    bend_height: float
     findings: tuple[str, ...]
     n_iterations: int
 
@@ -117,9 +139,39 @@ def camera(
     check_camera_views(views, size_px)
     bundle, solution = fitted_camera(views, size_px, model, n_coefficients)
     bundle, solution, left_out = _without_bad_views(bundle, solution)
-    check_camera_solution(solution, [target.view for target in bundle.views])
-    result = _result(bundle, solution, left_out)
+    flat = [target.view for target in bundle.views]
+    bent = _bent(bundle, solution, n_coefficients)
+    if bent is not None:
+        bundle, solution = bent.bundle, bent.solution
+    covariance = shared_covariance(bundle, solution)
+    check_camera_solution(solution, covariance.by_corners, flat)
+    result = _result(bundle, solution, covariance, left_out)
+    if bent is not None:
+        result = replace(result, bend_height=bent.bend.height(flat))
     return replace(result, findings=tuple(_findings(result)))
+
+
+def _bent(
+    bundle: Bundle, solution: Solution[BundleState], n_coefficients: int | None
+) -> BentFit | None:
+    """Solve with a bend of the board, of the highest degree that is significant."""
+    best: BentFit | None = None
+    flat = bundle
+    for degree in BEND_DEGREES:
+        n_solved = 0 if best is None else len(best.bend.exponents)
+        if not bend_is_significant(bundle, solution, degree, n_solved):
+            continue
+        fit = fit_bend(flat, solution.state, degree)
+        if fit is None:
+            break
+        if n_coefficients is None:
+            # What the bend did to the pictures may have passed for distortion.
+            straight, settled = with_supported_coefficients(fit.bundle, fit.solution)
+            if straight.free != flat.free:
+                flat = replace(straight, views=flat.views)
+                fit = fit_bend(flat, settled.state, degree) or fit
+        best, bundle, solution = fit, fit.bundle, fit.solution
+    return best
 
 
 def _without_bad_views(
@@ -158,7 +210,10 @@ def _state(state: BundleState, keep: Sequence[int]) -> BundleState:
 
 
 def _result(
-    bundle: Bundle, solution: Solution[BundleState], left_out: dict[str, str]
+    bundle: Bundle,
+    solution: Solution[BundleState],
+    covariance: ViewCovariance,
+    left_out: dict[str, str],
 ) -> CameraCalibration:
     rig, n = solution.state.rig, len(bundle.free)
     fits = []
@@ -179,12 +234,14 @@ def _result(
     return CameraCalibration(
         lens=rig.lens,
         size_px=rig.size_px,
-        uncertainty=RigUncertainty(bundle.free, solution.covariance[:n, :n]),
+        uncertainty=RigUncertainty(bundle.free, covariance.by_views[:n, :n]),
+        inflation=covariance.inflation,
         views=tuple(fits),
         left_out=left_out,
         noise_px=CORNER_SIGMA_PX * solution.scales[CORNERS],
         coverage=coverage(seen, rig.size_px),
         held_back_rms_px=_held_back(bundle, solution),
+        bend_height=0.0,
         findings=(),
         n_iterations=solution.n_iterations,
     )
@@ -199,7 +256,8 @@ def _held_back(bundle: Bundle, solution: Solution[BundleState]) -> float:
     rest = [i for i in range(n) if i not in held]
     try:
         state = solve(_part(bundle, rest), _state(solution.state, rest)).state
-        return rms_px(predicted(state, [0] * len(held), [believed[i] for i in held]))
+        errors = np.concatenate(predicted(state, [0] * len(held), [believed[i] for i in held]))
+        return rms_px(errors[np.isfinite(errors).all(axis=1)])
     except CalibrationError:
         return float("nan")
 
@@ -213,6 +271,7 @@ def _findings(result: CameraCalibration) -> list[str]:
         f"{lens.cy:.2f} ± {sigmas['cy']:.2f} px",
         f"distortion: {n} coefficients of the {lens.model} model",
     ]
+    lines += _shared_errors(result)
     if np.isfinite(result.held_back_rms_px):
         lines.append(
             f"corners of views held back are predicted to {result.held_back_rms_px:.3f} px"
@@ -223,6 +282,32 @@ def _findings(result: CameraCalibration) -> list[str]:
         if wrong > _MANY_OUTLIERS * len(fit.view):
             lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
     return lines + _weak_places(result)
+
+
+def _shared_errors(result: CameraCalibration) -> list[str]:
+    lines = []
+    if result.bend_height > 0.0:
+        lines.append(
+            f"the board is not flat: {1e3 * result.bend_height:.2g} mm between its highest and its "
+            "lowest corner, the same in all views; this bend is solved for. Glue the board to "
+            "something stiff before the next step"
+        )
+    if result.inflation > _SHARED_ERRORS:
+        lines.append(
+            "views disagree more than their corners' noise explains: the uncertainties are "
+            f"{np.sqrt(result.inflation):.1f} times larger than independent corners would make "
+            "them. Usual causes: the board bends, it moves while the shutter is open, rolling "
+            "shutter, autofocus"
+        )
+    sigmas, lens = result.uncertainty.sigmas, result.lens
+    focal = max(sigmas["fx"] / lens.fx, sigmas["fy"] / lens.fy)
+    if focal > _WEAK_FOCAL:
+        lines.append(
+            f"the focal length is uncertain by {100.0 * focal:.2g} %: take more views, with a "
+            "stiff board, tilted by 20 to 40 degrees to different sides, near, and in all parts of "
+            "the picture"
+        )
+    return lines
 
 
 def _weak_places(result: CameraCalibration) -> list[str]:

@@ -51,8 +51,17 @@ def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
             )
 
 
-def check_camera_solution(solution: Solution[BundleState], views: Sequence[View]) -> None:
+def check_camera_solution(
+    solution: Solution[BundleState], covariance: FloatArray, views: Sequence[View]
+) -> None:
     """Refuse intrinsics that do not explain the views, or that the views do not determine.
+
+    Parameters
+    ----------
+    solution : Solution
+    covariance : array, shape (P, P)
+        Of the intrinsics, by corners: focal lengths and image centre first.
+    views : sequence of View
 
     Raises
     ------
@@ -66,7 +75,7 @@ def check_camera_solution(solution: Solution[BundleState], views: Sequence[View]
             "check squares_x, squares_y and the dictionary against the print, that the board is "
             "flat, and that zoom and focus stood still"
         )
-    _check_determined(solution)
+    _check_determined(solution, covariance)
     poses = solution.state.poses
     away = [np.linalg.norm(p.apply(v.middle)) for p, v in zip(poses, views, strict=True)]
     fault = unbelievable_distance(np.array(away), [view.name for view in views])
@@ -74,9 +83,9 @@ def check_camera_solution(solution: Solution[BundleState], views: Sequence[View]
         raise CalibrationError(fault)
 
 
-def _check_determined(solution: Solution[BundleState]) -> None:
+def _check_determined(solution: Solution[BundleState], covariance: FloatArray) -> None:
     rig = solution.state.rig
-    sigma = np.sqrt(np.diag(solution.covariance)[:4])
+    sigma = np.sqrt(np.diag(covariance)[:4])
     focal = max(sigma[0] / rig.lens.fx, sigma[1] / rig.lens.fy)
     centre = float(sigma[2:].max()) / rig.size_px[0]
     normals = np.array([pose.rotation[:, 2] for pose in solution.state.poses])

@@ -11,6 +11,7 @@ from aqualvs.calibration.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleS
 from aqualvs.calibration.least_squares import Solution, inverse, solve
 from aqualvs.calibration.start import start_pose
 from aqualvs.calibration.view import View
+from aqualvs.calibration.view_covariance import shared_covariance
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
@@ -46,12 +47,21 @@ def fitted_camera(
     CalibrationError
         If no camera can have taken the views.
     """
-    steps = _STEPS[model]
-    first = steps[0] if n_coefficients is None else n_coefficients
+    first = _STEPS[model][0] if n_coefficients is None else n_coefficients
     bundle, solution = _first_fit(views, size_px, model, first)
     if n_coefficients is not None:
         return bundle, solution
-    if model is LensModel.OPENCV and not _distorts(bundle, solution):
+    return with_supported_coefficients(bundle, solution)
+
+
+def with_supported_coefficients(
+    bundle: Bundle, solution: Solution[BundleState]
+) -> tuple[Bundle, Solution[BundleState]]:
+    """Solve with as many distortion coefficients as the views show to be there."""
+    steps = _STEPS[solution.state.rig.lens.model]
+    if len(solution.state.rig.lens.distortion) != steps[0]:
+        bundle, solution = with_coefficients(bundle, solution, steps[0])
+    if solution.state.rig.lens.model is LensModel.OPENCV and not _distorts(bundle, solution):
         return with_coefficients(bundle, solution, 0)
     for n in steps[1:]:
         if gain_of_coefficients(bundle, solution, n) < _price(bundle, solution, n):
@@ -103,7 +113,9 @@ def _distorts(bundle: Bundle, solution: Solution[BundleState]) -> bool:
 def _price(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:
     more = abs(n - len(solution.state.rig.lens.distortion))
     values = sum(2 * int(np.count_nonzero(i)) for i in solution.inliers[: len(bundle.views)])
-    return more * float(np.log(values))
+    # Errors that the corners of a view share make chance gains so many times larger.
+    inflation = max(shared_covariance(bundle, solution).inflation, 1.0)
+    return more * inflation * float(np.log(values))
 
 
 def _resized(bundle: Bundle, state: BundleState, n: int) -> tuple[Bundle, BundleState]:

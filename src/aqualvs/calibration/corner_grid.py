@@ -25,10 +25,13 @@ class Grid:
         In `image`.
     known : bool array, shape (rows, columns)
         Which were found.
+    notes : tuple of str
+        What a user should know of how they were found.
     """
 
     pixels: FloatArray
     known: BoolArray
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ def detect_board(
 
 def _view(grid: Grid, board: Board, name: str) -> View:
     ids = np.flatnonzero(grid.known).astype(np.int64)
-    return View(name, ids, board.corner_points()[ids], grid.pixels.reshape(-1, 2)[ids])
+    return View(name, ids, board.corner_points()[ids], grid.pixels.reshape(-1, 2)[ids], grid.notes)
 
 
 def detect_markers(

@@ -3,14 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import ttest_1samp
 
 from aqualvs.calibration.blocks import Block
 from aqualvs.calibration.bundle import CORNER_SIGMA_PX
 from aqualvs.calibration.view import View
-from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.uncertainty import RigUncertainty
+
+# Views that a comparison takes, and the chance of a wrong verdict that the dome is needed.
+_FEWEST_COMPARED, _CHANCE = 3, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,26 +63,62 @@ class SolvedMedium:
 
 @dataclass(frozen=True, slots=True)
 class HeldBack:
-    """How well corners are predicted that nothing was solved from.
+    """How well corners are predicted that nothing was solved from: both models, same corners.
 
     Attributes
     ----------
-    dome_rms_px, bare_rms_px : float
-        Root mean square distance with the dome, and with a bare lens free to sit anywhere.
-    n_views, n_points : int
-        Held back.
+    dome_px, bare_px : array, shape (V,)
+        For every view held back, the root mean square distance of its predicted corners with the
+        dome, and with a bare lens free to sit anywhere.
+    n_by_view : int array, shape (V,)
+        How many corners were predicted by both.
     """
 
-    dome_rms_px: float
-    bare_rms_px: float
-    n_views: int
-    n_points: int
+    dome_px: FloatArray
+    bare_px: FloatArray
+    n_by_view: IntArray
+
+    @property
+    def n_views(self) -> int:
+        """Number of views held back."""
+        return len(self.n_by_view)
+
+    @property
+    def n_points(self) -> int:
+        """Number of their corners."""
+        return int(self.n_by_view.sum())
+
+    @property
+    def dome_rms_px(self) -> float:
+        """Root mean square distance of all corners with the dome."""
+        return float(np.sqrt(np.average(self.dome_px**2, weights=self.n_by_view)))
+
+    @property
+    def bare_rms_px(self) -> float:
+        """Root mean square distance of all corners with a bare lens."""
+        return float(np.sqrt(np.average(self.bare_px**2, weights=self.n_by_view)))
+
+    @property
+    def n_dome_better(self) -> int:
+        """Number of views that the dome predicts better."""
+        return int(np.count_nonzero(self.dome_px < self.bare_px))
+
+    @property
+    def p_value(self) -> float:
+        """Chance of such an advantage of the dome, if there were none.
+
+        Student's test of the views' log ratios: what both models have in common cancels in a view,
+        and corners of one view are not independent. NaN with fewer than three views.
+        """
+        if self.n_views < _FEWEST_COMPARED:
+            return float("nan")
+        ratios = np.log(self.bare_px / self.dome_px)
+        return float(ttest_1samp(ratios, 0.0, alternative="greater").pvalue)
 
     @property
     def dome_is_better(self) -> bool:
-        """Whether refraction shows: the bare lens is worse by more than chance."""
-        chance = 3.0 / float(np.sqrt(self.n_points))
-        return self.bare_rms_px > self.dome_rms_px * (1.0 + chance)
+        """Whether refraction shows: the bare lens is worse, view by view, by more than chance."""
+        return self.p_value < _CHANCE
 
 
 @dataclass(frozen=True, slots=True)

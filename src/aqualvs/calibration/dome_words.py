@@ -169,8 +169,9 @@ def _held_back(held: HeldBack | None) -> list[str]:
     if held is None:
         return []
     told = (
-        f"{held.n_points} corners of {held.n_views} views held back are predicted to "
-        f"{held.dome_rms_px:.3f} px with the dome, to {held.bare_rms_px:.3f} px with a bare lens"
+        f"{held.n_points} corners of {held.n_views} views, each held back once, are predicted to "
+        f"{held.dome_rms_px:.3f} px with the dome, to {held.bare_rms_px:.3f} px with a bare lens; "
+        f"the dome is better in {held.n_dome_better} of the views"
     )
     if held.dome_is_better:
         return [f"{told}: the dome model is needed"]

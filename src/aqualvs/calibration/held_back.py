@@ -16,8 +16,8 @@ from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Camera
 
-# Every so-many-th view is held back; fewer views than this are all needed for the solve.
-_EVERY, _MIN_VIEWS = 4, 8
+# The views are held back in so many parts, one after the other; fewer than this are all needed.
+_PARTS, _MIN_VIEWS = 4, 8
 # Half a view must still fix a pose.
 _MIN_POINTS = 12
 
@@ -25,10 +25,11 @@ _MIN_POINTS = 12
 def compare_with_bare_lens(
     problem: DomeProblem, solution: Solution[BundleState]
 ) -> HeldBack | None:
-    """Solve both models from three views in four, and predict the fourth with them.
+    """Solve both models from three views in four, and predict the fourth with them; four times.
 
     The pose of a view held back is found from half of its corners; the other half is predicted.
-    Outliers of the whole solve are left out for both.
+    Outliers of the whole solve are left out for both, and so are corners that either model cannot
+    see.
 
     Returns
     -------
@@ -41,18 +42,34 @@ def compare_with_bare_lens(
         for shot, inliers in zip(problem.shots, solution.inliers[:n], strict=True)
     ]
     usable = [i for i in range(n) if len(believed[i]) >= _MIN_POINTS]
-    held = usable[_EVERY // 2 :: _EVERY]
-    if len(usable) < _MIN_VIEWS or not held:
+    if len(usable) < _MIN_VIEWS:
         return None
-    rest = [i for i in range(n) if i not in held]
-    media = [problem.shots[i].i_set for i in held]
-    views = [believed[i] for i in held]
-    try:
-        with_dome = predicted(_dome_state(problem, solution, rest), media, views)
-        bare = predicted(_bare_state(problem, solution, rest), media, views)
-    except CalibrationError:
+    pairs: list[tuple[FloatArray, FloatArray]] = []
+    for part in range(_PARTS):
+        held = usable[part::_PARTS]
+        rest = [i for i in range(n) if i not in held]
+        media = [problem.shots[i].i_set for i in held]
+        views = [believed[i] for i in held]
+        try:
+            with_dome = predicted(_dome_state(problem, solution, rest), media, views)
+            bare = predicted(_bare_state(problem, solution, rest), media, views)
+        except CalibrationError:
+            return None
+        pairs += zip(with_dome, bare, strict=True)
+    return _compared(pairs)
+
+
+def _compared(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> HeldBack | None:
+    """Compare residuals (N, 2) of the same corners, view by view."""
+    rows = []
+    for dome, bare in pairs:
+        both = np.isfinite(dome).all(axis=1) & np.isfinite(bare).all(axis=1)
+        if both.any():
+            rows.append((rms_px(dome[both]), rms_px(bare[both]), np.count_nonzero(both)))
+    if not rows:
         return None
-    return HeldBack(rms_px(with_dome), rms_px(bare), len(held), len(with_dome))
+    dome_px, bare_px, counts = np.array(rows).T
+    return HeldBack(dome_px, bare_px, counts.astype(np.int64))
 
 
 def _dome_state(
@@ -93,14 +110,17 @@ def _bare_view(camera: Camera, target: TargetView, state: BundleState, i: int) -
     return replace(target, dome_from_target=pose)
 
 
-def predicted(state: BundleState, media: Sequence[int], views: Sequence[View]) -> FloatArray:
-    """Return residuals (N, 2) of the odd corners, from poses found with the even ones."""
+def predicted(state: BundleState, media: Sequence[int], views: Sequence[View]) -> list[FloatArray]:
+    """Return residuals (N, 2) of each view's odd corners, from poses found with the even ones.
+
+    NaN where the model cannot see a corner.
+    """
     errors = []
     for medium, view in zip(media, views, strict=True):
         camera = state.camera(medium)
         even = np.arange(len(view)) % 2 == 0
         pose = target_pose(camera, view.where(even), max_rms_px=float("inf")).dome_from_target
         odd = view.where(~even)
-        pixels, valid = camera.project(pose.apply(odd.points))
-        errors.append((odd.pixels - pixels)[valid])
-    return np.concatenate(errors)
+        pixels, _ = camera.project(pose.apply(odd.points))
+        errors.append(odd.pixels - pixels)
+    return errors

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aqualvs.calibration.laser_candidates import plane_residuals_px
 from aqualvs.calibration.laser_report import LaserCalibration
-from aqualvs.calibration.laser_split import PooledStripes, plane_residuals_px
 from aqualvs.calibration.laser_views import LaserView, PlacedView, place_views, pooled
 from aqualvs.calibration.lasers import LaserOptions, calibrate_lasers
-from aqualvs.calibration.stripes_on_planes import Surfaces
+from aqualvs.calibration.stripes_on_planes import PooledStripes, Surfaces
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane

@@ -8,6 +8,7 @@ from aqualvs.calibration.bundle import CORNER_SIGMA_PX
 from aqualvs.calibration.laser_names import match_to_rig
 from aqualvs.calibration.laser_report import Solved
 from aqualvs.calibration.laser_split import LaserSplit
+from aqualvs.calibration.laser_verdicts import JudgedPlane, Verdict
 from aqualvs.calibration.laser_views import LaserView, PlacedView
 from aqualvs.calibration.stripes_on_planes import Surfaces
 from aqualvs.errors import CalibrationError
@@ -23,7 +24,7 @@ _CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
 _FEWEST_BINS = 5
 # No detection is as bad as this, in pixels.
 _IMPOSSIBLE_PX = 2.0
-# A further plane of light with this share of the weakest laser's points is a laser as well.
+# A stripe with this share of the points that the weakest laser has in a picture is mentioned.
 _AS_STRONG = 0.5
 
 
@@ -93,30 +94,58 @@ def check_count(
     views: Sequence[PlacedView],
     surfaces: Surfaces,
 ) -> list[str]:
-    """Refuse fewer or more lasers than expected; return warnings about the rest.
+    """Refuse fewer or more lasers than expected, or an undecided number; warn about the rest.
 
     Raises
     ------
     CalibrationError
-        If there are fewer, more, or none.
+        If there are fewer, more, or none, or planes of light of which the pictures do not tell
+        whether they are lasers.
     """
     found = len(split.planes)
     if found < (expected or 1):
         raise CalibrationError(_too_few(split, expected, rig, views, surfaces))
-    counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
-    if expected is not None and split.n_further >= _AS_STRONG * counts.min():
+    if expected is not None and found > expected:
         raise CalibrationError(
-            f"more than {expected} lasers are seen: a further plane of light has "
-            f"{split.n_further} points, the weakest of the {expected} has {counts.min()}; correct "
-            "the number of lasers, or cover what reflects them"
+            f"more than {expected} lasers are seen: {found} planes of light explain the stripes; "
+            "correct the number of lasers, or cover what reflects them"
         )
-    return [
+    if expected is None and split.undecided:
+        several = "another plane" if len(split.undecided) == 1 else "further planes"
+        raise CalibrationError(
+            f"{found} {'laser is' if found == 1 else 'lasers are'} certain, but {several} of light "
+            "may be of lasers as well: "
+            f"{_planes(split.undecided, views, surfaces)}; give --lasers N, how many there are, or "
+            f"{_remedy(surfaces)}"
+        )
+    words = [
+        f"a plane of light ({_plane(plane, views, surfaces)}) is not taken for a laser: {plane.why}"
+        for plane in split.spare
+        if plane.verdict is Verdict.OTHER or plane in split.undecided
+    ]
+    taken = [line for plane in split.spare for line in plane.members.tolist()]
+    counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
+    return words + [
         f"a stripe of {len(line.members)} points ({_where(line.patch, views, surfaces)}) belongs "
         "to no laser; a reflection, perhaps"
         for line in split.unmatched
         # The lasers' counts are of all pictures, a line is of one.
         if len(line.members) >= _AS_STRONG * counts.min() / len(views)
+        and not np.isin(line.members, taken).any()
     ]
+
+
+def _planes(planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+    some = [f"{_plane(plane, views, surfaces)}: {plane.why}" for plane in planes[:3]]
+    more = [f"and {len(planes) - 3} more"] if len(planes) > 3 else []
+    return "; ".join(some + more)
+
+
+def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+    """Return how many points a plane has, and where it is seen."""
+    patches = plane.patches
+    rest = f" and {len(patches) - 1} others" if len(patches) > 1 else ""
+    return f"{len(plane.members)} points in {_where(patches[0], views, surfaces)}{rest}"
 
 
 def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
@@ -192,16 +221,24 @@ def _too_few(
     lonely = ""
     if split.unmatched:
         where = sorted({_where(line.patch, views, surfaces) for line in split.unmatched[:4]})
-        lonely = f"; stripes seen on one plane only: {'; '.join(where)}"
+        what = "seen on one plane only" if len(where) == 1 else "that no certain plane explains"
+        lonely = f"; stripes {what}: {'; '.join(where)}"
+    wanted = "on two places of the board that differ"
     if len(surfaces.planes) > 1:
         wanted = "on two planes of the box"
-        remedy = "add pictures in which every stripe crosses from one plane to another"
-    else:
-        wanted = "on two places of the board that differ"
-        remedy = "add pictures from other distances or angles"
+    if split.possible:
+        lonely += f"; undecided: {_planes(split.possible, views, surfaces)}"
+    told = "give --lasers N, how many there are, or " if split.possible and not expected else ""
     return (
-        f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; {remedy}"
+        f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; "
+        f"{told}{_remedy(surfaces)}"
     )
+
+
+def _remedy(surfaces: Surfaces) -> str:
+    if len(surfaces.planes) > 1:
+        return "add pictures in which every stripe crosses from one plane to another"
+    return "add pictures with the board nearer, farther or tilted another way"
 
 
 def _where(patch: int, views: Sequence[PlacedView], surfaces: Surfaces) -> str:

@@ -104,19 +104,20 @@ def solve_lasers(
     words : list of str
         For every laser, which sheet was taken and why.
     """
-    first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of)
+    names = [laser.name for laser in lasers]
+    first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of, names)
     if len(start.surfaces.planes) == 1 and (contradicts(first) if loose is None else loose):
         error = typical_corner_error_px(start.views)
         again = replace(start, slack=_LOOSE, shared_error_px=error)
     else:
         again, laser_of = _sorted_again(start, first, laser_of, tolerance_px(lasers))
-    flat = _solve_from(again, first.state.sheets, laser_of)
+    flat = _solve_from(again, first.state.sheets, laser_of, names)
     found = [
         replace(laser, plane=sheet.plane)
         for laser, sheet in zip(lasers, flat.state.sheets, strict=True)
     ]
     return choose_sheets(
-        flat, start.rig, found, lambda sheets: _solve_from(again, sheets, laser_of)
+        flat, start.rig, found, lambda sheets: _solve_from(again, sheets, laser_of, names)
     )
 
 
@@ -141,7 +142,9 @@ def _sorted_again(
     return replace(start, views=views), sorted_anew
 
 
-def _solve_from(start: Start, sheets: tuple[Sheet, ...], laser_of: IntArray) -> Solved:
+def _solve_from(
+    start: Start, sheets: tuple[Sheet, ...], laser_of: IntArray, names: Sequence[str]
+) -> Solved:
     camera, groups = start.rig.camera(), []
     for i_view, mine in enumerate(split_by_view(laser_of, start.views)):
         view = start.views[i_view]
@@ -155,8 +158,45 @@ def _solve_from(start: Start, sheets: tuple[Sheet, ...], laser_of: IntArray) -> 
                 groups.append(with_gain(group, camera, planes, sheet))
     problem = LaserProblem(start.bundle(), start.surfaces, tuple(groups), len(sheets), start.slack)
     slack = np.zeros((len(start.views), N_SLACK))
-    solution = solve(problem, LaserState(start.state(), sheets, slack))
+    state = LaserState(start.state(), sheets, slack)
+    solution = solve(problem, state, remedy=lambda i: free_words(problem, names, start.views, i))
     return Solved(problem, solution, start.views)
+
+
+def free_words(
+    problem: LaserProblem, names: Sequence[str], views: Sequence[PlacedView], parameter: int
+) -> str:
+    """Return what to do about a parameter of the problem that the pictures do not tell.
+
+    Parameters
+    ----------
+    problem : LaserProblem
+    names : sequence of str
+        Of the lasers.
+    views : sequence of PlacedView
+        The pictures.
+    parameter : int
+        Its column.
+    """
+    for i, name in enumerate(names):
+        if parameter in problem.laser_columns(i):
+            seen = [group for group in problem.groups if group.laser == i]
+            points = sum(int(group.counts.sum()) for group in seen)
+            return (
+                f"laser '{name}' cannot be solved from its {points} points in {len(seen)} "
+                "pictures; take more pictures in which its stripe crosses the target, with the "
+                "target nearer, farther and tilted, or correct the number of lasers (--lasers N)"
+            )
+    for i, view in enumerate(views):
+        if parameter in problem.bundle.pose_columns(i):
+            return (
+                f"{view.view.name}: its {len(view.view)} corners do not tell where the target is; "
+                "leave this picture out, or show more of the target in it"
+            )
+    return (
+        "the pictures do not tell the camera's numbers that are to be refined; leave --refine "
+        "out, or add pictures with the target nearer, farther and tilted"
+    )
 
 
 def paper_planes(solved: Solved) -> list[Plane]:

@@ -1,8 +1,7 @@
 """Which stripe points belong to which laser, when all lasers shine at once.
 
 Points on known surfaces fall apart into laser planes in space. On each surface a laser plane draws
-a straight line; two lines on different surfaces span a plane, and the lines of other surfaces and
-views say whether a laser shines there.
+a straight line; lines on different surfaces tell which planes there are, and how many lasers.
 """
 
 from collections.abc import Sequence
@@ -10,9 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aqualvs.calibration.laser_candidates import (
+    find_candidates,
+    fitted_plane,
+    plane_residuals_px,
+)
+from aqualvs.calibration.laser_verdicts import JudgedPlane, Verdict, judged
 from aqualvs.calibration.stripe_lines import StripeLine, lines_on_patch
-from aqualvs.calibration.stripes_on_planes import PlacedStripes
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.calibration.stripes_on_planes import PlacedStripes, PooledStripes
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
 TOLERANCE_PX = 3.0
@@ -21,33 +26,18 @@ BENT_TOLERANCE_PX = 10.0
 """Likewise where the light may be bent at a window, so that no plane fits well."""
 # Points this near to the stripe of a second laser have its light in their centre.
 _CROSSING_PX = 9.0
-# Surfaces of which the normals differ by less (sine), at one distance, are one surface.
-_SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
-# Stripes of what is no laser of its own, reflections between surfaces above all, are short.
-_LEAST_SHARE = 0.1
 _LEAST_POINTS = 40
 _N_FITS = 5
-# A point's stripe runs along the plane's to within this tangent, as seen in the image.
-_ALIGNED = 0.35
-
-
-@dataclass(frozen=True, slots=True)
-class PooledStripes:
-    """Stripe points of all views, on all surfaces.
-
-    Attributes
-    ----------
-    placed : PlacedStripes
-        N points of all views; `index` counts within each view.
-    patch : int array, shape (N,)
-        Which surface of which view a point lies on, counted through.
-    patch_planes : tuple of Plane
-        Surface of every patch, in `dome`.
-    """
-
-    placed: PlacedStripes
-    patch: IntArray
-    patch_planes: tuple[Plane, ...]
+# A straight stripe holds this share of the chains that it is cut from, or is a chord of a curve.
+_LEAST_OF_CHAIN = 0.25
+# Accidents are so many times as likely (natural logarithm) to make a plane that is clearly worse.
+_CLEARLY_WORSE = 3.0
+# Accidents that a plane which is asked for may be expected to be, at most, and how many times as
+# long as its own a stripe in no plane may be: tuned on 24 simulated scenes of one picture of a box
+# with glints. Accidents that a plane which has to be asked about may be expected to be.
+_TOLD = float(np.log(0.2))
+_LONGER = 1.5
+_HARDLY_AN_ACCIDENT = float(np.log(0.05))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,23 +47,49 @@ class LaserSplit:
     Attributes
     ----------
     planes : tuple of Plane
-        Rough planes, those with the most points first.
+        Rough planes of the lasers, the one with the best evidence first.
     laser : int array, shape (N,)
         Index into `planes`; -1 for points of none, or near where two stripes cross.
     unmatched : tuple of StripeLine
         Long stripes that belong to none of the planes, the longest first.
-    n_further : int
-        Points of the best further plane, beyond as many as were asked for.
+    spare : tuple of JudgedPlane
+        Further planes of light, which are not taken for lasers; undecided ones first.
     """
 
     planes: tuple[Plane, ...]
     laser: IntArray
     unmatched: tuple[StripeLine, ...]
-    n_further: int = 0
+    spare: tuple[JudgedPlane, ...] = ()
+
+    @property
+    def undecided(self) -> tuple[JudgedPlane, ...]:
+        """Planes that accidents hardly make, and that may be lasers nevertheless."""
+        return self._undecided(_HARDLY_AN_ACCIDENT)
+
+    @property
+    def possible(self) -> tuple[JudgedPlane, ...]:
+        """Planes that may be lasers if there must be more of them."""
+        return self._undecided(_TOLD)
+
+    def _undecided(self, most: float) -> tuple[JudgedPlane, ...]:
+        return tuple(
+            plane
+            for plane in self.spare
+            if plane.verdict is not Verdict.OTHER and plane.candidate.log_false_alarms <= most
+        )
+
+    @property
+    def torn(self) -> bool:
+        """Whether a laser seems to lie in several planes, as on a board that is not flat."""
+        return any(plane.verdict is Verdict.TORN for plane in self.spare)
 
 
 def split_lasers(
-    pooled: PooledStripes, *, n_lasers: int | None = None, tolerance_px: float = TOLERANCE_PX
+    pooled: PooledStripes,
+    lens_in_dome: FloatArray,
+    *,
+    n_lasers: int | None = None,
+    tolerance_px: float = TOLERANCE_PX,
 ) -> LaserSplit:
     """Sort stripe points by the laser plane that they lie in.
 
@@ -81,175 +97,82 @@ def split_lasers(
     ----------
     pooled : PooledStripes
         Points of all views.
+    lens_in_dome : array, shape (3,)
+        The lens's projection centre; a plane through it is no laser.
     n_lasers : int, optional
-        How many lasers shine; as many as have enough points if left out.
+        How many lasers shine; if left out, all planes of which the evidence is clear.
     tolerance_px : float
         How far a stripe may be from its plane.
 
     Returns
     -------
     LaserSplit
-        Fewer planes than `n_lasers` where only so many are seen on two surfaces.
+        All planes that are clear, be there more than `n_lasers`. Where there are fewer, the best
+        undecided ones, if they are clearly better than the rest of those.
     """
     lines = _all_lines(pooled)
-    table = _LineTable.of(pooled, lines)
-    free = np.ones(len(lines), np.bool_)
-    planes: list[Plane] = []
-    most = n_further = 0
-    while True:
-        found = _best_plane(pooled, lines, table, free, tolerance_px)
-        if found is None:
-            break
-        plane, mine = found
-        n_points = int(table.n_points[mine].sum())
-        most = max(most, n_points)
-        wanted = n_lasers is not None and len(planes) < n_lasers
-        if n_points < _LEAST_POINTS or (not wanted and n_points < _LEAST_SHARE * most):
-            break
-        if n_lasers is not None and not wanted:
-            n_further = n_points
-            break
-        planes.append(plane)
-        free[mine] = False
-    planes = _refined(pooled, planes, tolerance_px)
+    found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
+    taken = [plane for plane in found if plane.verdict is Verdict.LASER]
+    in_planes = {int(i) for plane in found for i in plane.candidate.lines}
+    lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
+    longest = max(lonely, default=0)
+    perhaps = [plane for plane in found if _may_be_laser(plane, lines, longest)]
+    missing = 0 if n_lasers is None else max(n_lasers - len(taken), 0)
+    if 0 < missing <= len(perhaps):
+        best, rest = perhaps[:missing], perhaps[missing:]
+        if not any(_as_good(plane, best[-1]) for plane in rest):
+            taken += best
+    planes = _refined(pooled, [plane.candidate.plane for plane in taken], tolerance_px)
     laser = assigned(pooled, planes, tolerance_px)
-    return LaserSplit(tuple(planes), laser, _unmatched(lines, laser), n_further)
+    spare = tuple(plane for plane in found if plane not in taken)
+    return LaserSplit(tuple(planes), laser, _unmatched(lines, laser), spare)
 
 
-def plane_residuals_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
-    """Return how far points are from the stripes of planes, across their own stripe, (N, L) px.
+def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
+    """Return whether a plane can be a laser if there are known to be more of them.
 
-    Infinite where a point's stripe runs along none of the directions that the plane's could.
+    Not if a much longer stripe, of `longest` points, is in no plane: then that may be the laser,
+    seen on one surface only.
     """
-    normals = np.array([p.normal for p in planes]).reshape(-1, 3)
-    offsets = np.array([p.offset for p in planes])
-    gain = np.abs(placed.by_across @ normals.T)
-    slant = np.abs(placed.by_along @ normals.T)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        residuals: FloatArray = (placed.points_in_dome @ normals.T - offsets) / gain
-        residuals[~(slant <= _ALIGNED * gain)] = np.inf
-    return residuals
+    perhaps = plane.verdict in (Verdict.WEAK, Verdict.DOUBTFUL)
+    own = max(len(lines[int(i)].members) for i in plane.candidate.lines)
+    return perhaps and plane.candidate.log_false_alarms <= _TOLD and longest <= _LONGER * own
+
+
+def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
+    """Return whether a plane is nearly as good as another that is a little better."""
+    worse = plane.candidate.log_false_alarms - other.candidate.log_false_alarms
+    return plane.verdict is other.verdict and worse < _CLEARLY_WORSE
 
 
 def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
     lines = []
-    for patch, plane in enumerate(pooled.patch_planes):
+    n_of_chain = _counts_on_patch(pooled)
+    for patch in range(len(pooled.patch_planes)):
         members = np.flatnonzero(pooled.patch == patch)
-        lines += lines_on_patch(pooled.placed, plane.normal, members, patch)
+        lines += [
+            line
+            for line in lines_on_patch(pooled, members, patch)
+            if _share_of_chains(pooled, line, n_of_chain) >= _LEAST_OF_CHAIN
+        ]
     return lines
 
 
-@dataclass(frozen=True, slots=True)
-class _LineTable:
-    """Ends and middles of lines: what planes are guessed from and tried on."""
-
-    patch: IntArray
-    n_points: FloatArray
-    points: FloatArray
-    by_across: FloatArray
-
-    @classmethod
-    def of(cls, pooled: PooledStripes, lines: Sequence[StripeLine]) -> "_LineTable":
-        points, by_across = np.zeros((len(lines), 3, 3)), np.zeros((len(lines), 3, 3))
-        for i, line in enumerate(lines):
-            mine = pooled.placed.points_in_dome[line.members]
-            middle = mine.mean(axis=0)
-            direction = np.linalg.svd(mine - middle, full_matrices=False)[2][0]
-            way = (mine - middle) @ direction
-            ends = np.quantile(way, [0.02, 0.5, 0.98])
-            points[i] = middle + ends[:, None] * direction
-            nearest = np.argmin(np.abs(way[:, None] - ends), axis=0)
-            by_across[i] = pooled.placed.by_across[line.members][nearest]
-        return cls(
-            np.array([line.patch for line in lines], np.int64),
-            np.array([float(len(line.members)) for line in lines]),
-            points,
-            by_across,
-        )
-
-    def worst_px(self, normals: FloatArray, offsets: FloatArray) -> FloatArray:
-        """Return how far each line (L) is from planes (H) at its worst end, shape (H, L)."""
-        distance = np.abs(np.einsum("hi,lki->hlk", normals, self.points) - offsets[:, None, None])
-        gain = np.abs(np.einsum("hi,lki->hlk", normals, self.by_across))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            worst: FloatArray = np.max(distance / gain, axis=2)
-        return np.nan_to_num(worst, nan=np.inf)
+def _counts_on_patch(pooled: PooledStripes) -> IntArray:
+    """Return how many points (N,) of its own chain lie on a point's surface."""
+    n_chains = int(pooled.chain.max(initial=-1)) + 1
+    _, place, counts = np.unique(
+        pooled.patch * n_chains + pooled.chain, return_inverse=True, return_counts=True
+    )
+    n_of_chain: IntArray = counts[place]
+    return n_of_chain
 
 
-def _best_plane(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    table: _LineTable,
-    free: BoolArray,
-    tolerance_px: float,
-) -> tuple[Plane, IntArray] | None:
-    """Return the plane with the most points among free lines, and its lines."""
-    pairs = _pairs(pooled, table, free)
-    if not len(pairs):
-        return None
-    normals, offsets = _planes_of_pairs(table, pairs)
-    worst = table.worst_px(normals, offsets)
-    believed = np.max(np.take_along_axis(worst, pairs, axis=1), axis=1) <= tolerance_px
-    support = np.where(free, np.clip(1.0 - (worst / tolerance_px) ** 2, 0.0, 1.0), 0.0)
-    scores = np.where(believed, support @ table.n_points, 0.0)
-    best = int(np.argmax(scores))
-    if scores[best] <= 0.0:
-        return None
-    plane, mine = Plane(normals[best], float(offsets[best])), np.zeros(0, np.int64)
-    for _ in range(_N_FITS):
-        worst_now = table.worst_px(plane.normal[None], np.array([plane.offset]))[0]
-        mine = np.flatnonzero(free & (worst_now <= tolerance_px))
-        if not _on_two_surfaces(pooled, table.patch[mine]):
-            return None
-        members = np.concatenate([lines[int(i)].members for i in mine])
-        plane = fitted_plane(pooled.placed, members, plane)
-    return plane, mine
-
-
-def _pairs(pooled: PooledStripes, table: _LineTable, free: BoolArray) -> IntArray:
-    """Return pairs of free lines (H, 2) that lie on different surfaces."""
-    different = ~_same_surfaces(pooled.patch_planes)
-    i, j = np.triu_indices(len(free), 1)
-    keep = free[i] & free[j] & different[table.patch[i], table.patch[j]]
-    return np.stack([i[keep], j[keep]], axis=-1)
-
-
-def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:
-    """Return which patches (P, P) lie in one plane of `dome`, nearly."""
-    normals = np.array([p.normal for p in planes]).reshape(-1, 3)
-    offsets = np.array([p.offset for p in planes])
-    sine = np.linalg.norm(np.cross(normals[:, None], normals[None]), axis=2)
-    apart = np.abs(np.abs(offsets[:, None]) - np.abs(offsets[None]))
-    same: BoolArray = (sine < _SAME_NORMAL) & (apart < _SAME_OFFSET)
-    return same
-
-
-def _on_two_surfaces(pooled: PooledStripes, patches: IntArray) -> bool:
-    some = np.unique(patches)
-    if len(some) < 2:
-        return False
-    return not bool(np.all(_same_surfaces([pooled.patch_planes[i] for i in some])))
-
-
-def _planes_of_pairs(table: _LineTable, pairs: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return planes (H, 3), (H,) through two lines each, by their ends."""
-    ends = table.points[pairs][:, :, [0, 2]].reshape(len(pairs), 4, 3)
-    middle = ends.mean(axis=1)
-    normals = np.linalg.svd(ends - middle[:, None], full_matrices=False)[2][:, 2]
-    offsets: FloatArray = np.einsum("hi,hi->h", normals, middle)
-    return normals, offsets
-
-
-def fitted_plane(placed: PlacedStripes, members: IntArray, start: Plane) -> Plane:
-    """Fit a plane to some of the points, each weighed as the image measures it."""
-    points = placed.points_in_dome[members]
-    gain = np.abs(placed.by_across[members] @ start.normal)
-    weight = 1.0 / np.maximum(gain, 1e-9) ** 2
-    middle = weight @ points / weight.sum()
-    offsets = points - middle
-    normal = np.linalg.eigh((weight[:, None] * offsets).T @ offsets)[1][:, 0]
-    normal = normal if normal @ start.normal > 0.0 else -normal
-    return Plane(normal, float(normal @ middle))
+def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArray) -> float:
+    """Return which share of its chains' points a line holds, the mean over its points."""
+    chains, place = np.unique(pooled.chain[line.members], return_inverse=True)
+    mine = np.bincount(place, minlength=len(chains))[place]
+    return float(np.mean(mine / n_of_chain[line.members]))
 
 
 def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) -> list[Plane]:

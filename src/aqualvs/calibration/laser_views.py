@@ -6,9 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aqualvs.calibration.box_pose import SpatialPose, planes_with_points, spatial_pose
-from aqualvs.calibration.laser_split import PooledStripes
 from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import PlacedStripes, Surfaces, place_stripes
+from aqualvs.calibration.stripes_on_planes import (
+    PlacedStripes,
+    PooledStripes,
+    Surfaces,
+    place_stripes,
+)
 from aqualvs.calibration.target_pose import target_pose
 from aqualvs.calibration.view import View
 from aqualvs.errors import CalibrationError
@@ -178,9 +182,27 @@ def pooled(views: Sequence[PlacedView], surfaces: Surfaces) -> PooledStripes:
     )
     patch = [p.surface + n_surfaces * i for i, p in enumerate(parts)]
     planes: list[Plane] = []
+    chain, first = [], 0
     for view in views:
         planes += [surfaces.placed(i, view.dome_from_target) for i in range(n_surfaces)]
-    return PooledStripes(placed, np.concatenate(patch), tuple(planes))
+        chain.append(view.stripes.chain[view.placed.index] + first)
+        first += int(view.stripes.chain.max(initial=-1)) + 1
+    in_target = np.concatenate(
+        [v.dome_from_target.inverse().apply(v.placed.points_in_dome) for v in views]
+    )
+    corners = np.concatenate([v.view.points for v in views])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # A flat target has bounds along its face only.
+    inside = np.all((in_target >= low) & (in_target <= high) | (high <= low), axis=1)
+    return PooledStripes(
+        placed,
+        np.concatenate(patch),
+        tuple(planes),
+        np.repeat(np.arange(len(views)), [len(p) for p in parts]),
+        in_target,
+        inside,
+        np.concatenate(chain),
+    )
 
 
 def split_by_view(values: IntArray, views: Sequence[PlacedView]) -> list[IntArray]:

@@ -188,20 +188,20 @@ def _split(
 ) -> tuple[LaserSplit, list[str]]:
     """Split the stripes, leniently if a board that leans may have torn lasers apart."""
     expected = options.n_lasers or len(rig.lasers) or None
-    stripes, tolerance = pooled(views, surfaces), tolerance_px(rig.lasers)
-    split = split_lasers(stripes, n_lasers=expected, tolerance_px=tolerance)
-    try:
-        return split, check_count(split, expected, rig, views, surfaces)
-    except CalibrationError:
-        if len(surfaces.planes) > 1:
-            raise
-        lenient = split_lasers(stripes, n_lasers=expected, tolerance_px=BENT_TOLERANCE_PX)
+    stripes, lens = pooled(views, surfaces), rig.dome_from_cam.translation
+
+    def split_within(tolerance: float) -> LaserSplit:
+        return split_lasers(stripes, lens, n_lasers=expected, tolerance_px=tolerance)
+
+    split = split_within(tolerance_px(rig.lasers))
+    if len(surfaces.planes) == 1 and (split.torn or len(split.planes) < (expected or 1)):
+        lenient = split_within(BENT_TOLERANCE_PX)
         try:
             return lenient, check_count(lenient, expected, rig, views, surfaces)
         except CalibrationError:
-            # The first complaint is the plainer one.
+            # What can be said of the stricter split is the plainer complaint.
             pass
-        raise
+    return split, check_count(split, expected, rig, views, surfaces)
 
 
 def _result_rig(

@@ -16,7 +16,15 @@ from aqualvs.calibration.blocks import Block, NormalEquations, cost, normal_equa
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 
-__all__ = ["Block", "Problem", "Solution", "information_of", "inverse", "solve"]
+__all__ = [
+    "Block",
+    "FreeParameterError",
+    "Problem",
+    "Solution",
+    "information_of",
+    "inverse",
+    "solve",
+]
 
 _MAX_ROUNDS = 20
 _MAX_ITERATIONS = 60
@@ -32,6 +40,23 @@ _LOST = 1e3
 _RANK = 1e-13
 
 State = TypeVar("State")
+
+
+class FreeParameterError(CalibrationError):
+    """A parameter that neither measurements nor priors say anything about.
+
+    Attributes
+    ----------
+    parameter : int
+        Its place among those of the problem.
+    """
+
+    def __init__(self, parameter: int) -> None:
+        super().__init__(
+            f"parameter {parameter} of the solve is entirely free: no picture says anything about "
+            "it; take more pictures, from other distances and angles"
+        )
+        self.parameter = parameter
 
 
 class Problem(Protocol[State]):
@@ -89,7 +114,13 @@ class Solution(Generic[State]):
     n_iterations: int
 
 
-def solve(problem: Problem[State], start: State, *, reject: bool = True) -> Solution[State]:
+def solve(
+    problem: Problem[State],
+    start: State,
+    *,
+    reject: bool = True,
+    remedy: Callable[[int], str] | None = None,
+) -> Solution[State]:
     """Minimise the residuals of a problem.
 
     Parameters
@@ -100,6 +131,8 @@ def solve(problem: Problem[State], start: State, *, reject: bool = True) -> Solu
         Near enough to the solution for Newton's method.
     reject : bool
         Whether observations beyond five scales are left out.
+    remedy : callable, optional
+        Gives the message, with what the user should do, for a parameter that nothing is known of.
 
     Returns
     -------
@@ -110,7 +143,15 @@ def solve(problem: Problem[State], start: State, *, reject: bool = True) -> Solu
     CalibrationError
         If nothing is known about one of the parameters, or nothing can be seen from the start.
     """
-    run = _Run(problem, start, reject)
+    try:
+        return _solved(_Run(problem, start, reject))
+    except FreeParameterError as fault:
+        if remedy is None:
+            raise
+        raise CalibrationError(remedy(fault.parameter)) from fault
+
+
+def _solved(run: "_Run[State]") -> Solution[State]:
     run.descend(_NEAR)
     for _ in range(_MAX_ROUNDS):
         if not run.rescale():
@@ -265,9 +306,5 @@ def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
 def _sizes(information: FloatArray) -> FloatArray:
     size: FloatArray = np.sqrt(np.diag(information))
     if not np.all(size > 0.0):
-        i = int(np.argmin(size))
-        raise CalibrationError(
-            f"parameter {i} of the solve is entirely free: no view and no prior says anything "
-            "about it; fix it or give it a prior"
-        )
+        raise FreeParameterError(int(np.argmin(size)))
     return size

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aqualvs.calibration.stripes_on_planes import PlacedStripes
+from aqualvs.calibration.stripes_on_planes import PooledStripes
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 
 # Points this near to a line, in pixels across their stripe, belong to it.
@@ -16,7 +16,7 @@ _ALIGNED = 0.35
 _MIN_POINTS = 12
 _MIN_LENGTH_PX = 20.0
 _MAX_LINES = 40
-_N_GUESSES, _N_SAMPLED, _N_FITS = 1500, 1000, 3
+_N_GUESSES, _N_SAMPLED, _N_FITS = 800, 600, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +35,13 @@ class StripeLine:
     members: IntArray
 
 
-def lines_on_patch(
-    placed: PlacedStripes, normal: FloatArray, members: IntArray, patch: int
-) -> list[StripeLine]:
+def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list[StripeLine]:
     """Find the straight stripes among points of one surface.
 
     Parameters
     ----------
-    placed : PlacedStripes
+    pooled : PooledStripes
         Points of all patches.
-    normal : array, shape (3,)
-        Of the surface, in `dome`.
     members : int array, shape (M,)
         Which points lie on the surface.
     patch : int
@@ -56,15 +52,20 @@ def lines_on_patch(
     list of StripeLine
         The longest first; no point belongs to two.
     """
+    placed, normal = pooled.placed, pooled.patch_planes[patch].normal
     points, across = placed.points_in_dome[members], placed.by_across[members]
     along = placed.by_along[members]
     some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
-    guessed, offsets = _guesses(points, normal, patch)
+    i, j = _pairs(pooled.chain[members], patch)
+    guessed, offsets = _guesses(points, normal, i, j)
+    # Most pairs are of two stripes, which do not run along the line through both points.
+    good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
+    guessed, offsets = guessed[good], offsets[good]
     votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
+    counts = np.count_nonzero(votes, axis=0)
     lines: list[StripeLine] = []
     free = np.ones(len(members), np.bool_)
     while len(lines) < _MAX_LINES and len(guessed):
-        counts = np.count_nonzero(votes[free[some]], axis=0)
         best = int(np.argmax(counts))
         m, c = guessed[best], float(offsets[best])
         for _ in range(_N_FITS):
@@ -75,21 +76,42 @@ def lines_on_patch(
         near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
         if _length_px(points[near], along[near]) >= _MIN_LENGTH_PX:
             lines.append(StripeLine(patch, members[near]))
-        free &= ~near & ~_near(points, across, along, m[None], c, _HALO_PX)[:, 0]
+        taken = free & (near | _near(points, across, along, m[None], c, _HALO_PX)[:, 0])
+        free &= ~taken
+        counts -= np.count_nonzero(votes[taken[some]], axis=0)
     return lines
 
 
-def _guesses(points: FloatArray, normal: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Lines m·X = c through pairs of points, m in the surface."""
-    n = len(points)
+def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
+    """Return random pairs of points (N), half of them within a chain."""
+    n = len(chain)
     if n < 2:
-        return np.zeros((0, 3)), np.zeros(0)
-    i, j = np.random.default_rng(seed).integers(0, n, (2, _N_GUESSES))
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    rng = np.random.default_rng(seed)
+    i, j = rng.integers(0, n, (2, _N_GUESSES))
+    half = slice(0, _N_GUESSES // 2)
+    order = np.argsort(chain, kind="stable")
+    first = np.searchsorted(chain[order], chain[i[half]], "left")
+    last = np.searchsorted(chain[order], chain[i[half]], "right")
+    j[half] = order[rng.integers(first, last)]
+    return i, j
+
+
+def _guesses(
+    points: FloatArray, normal: FloatArray, i: IntArray, j: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return lines m·X = c through pairs of points, m in the surface; NaN for equal points."""
     m = np.cross(normal, points[j] - points[i])
     length = np.linalg.norm(m, axis=1)
-    apart = length > 1e-6
-    m = m[apart] / length[apart, None]
-    return m, np.einsum("ni,ni->n", m, points[i[apart]])
+    m /= np.where(length > 1e-6, length, np.nan)[:, None]
+    return m, np.einsum("ni,ni->n", m, points[i])
+
+
+def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
+    """Return which points (N) have a stripe that runs along their line (N)."""
+    gain = np.abs(np.einsum("ni,ni->n", across, m))
+    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _ALIGNED * gain
+    return aligned
 
 
 def _near(

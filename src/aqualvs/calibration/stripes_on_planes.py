@@ -165,6 +165,37 @@ class PlacedStripes:
         return len(self.index)
 
 
+@dataclass(frozen=True, slots=True)
+class PooledStripes:
+    """Stripe points of all views, on all surfaces.
+
+    Attributes
+    ----------
+    placed : PlacedStripes
+        N points of all views; `index` counts within each view.
+    patch : int array, shape (N,)
+        Which surface of which view a point lies on, counted through.
+    patch_planes : tuple of Plane
+        Surface of every patch, in `dome`.
+    view : int array, shape (N,)
+        Which view a point is of.
+    points_in_target : array, shape (N, 3)
+        In metres.
+    on_target : bool array, shape (N,)
+        Whether a point lies within the bounds of the target's corners, and not beside them.
+    chain : int array, shape (N,)
+        Unbroken piece of a stripe, counted through all views.
+    """
+
+    placed: PlacedStripes
+    patch: IntArray
+    patch_planes: tuple[Plane, ...]
+    view: IntArray
+    points_in_target: FloatArray
+    on_target: BoolArray
+    chain: IntArray
+
+
 def place_stripes(
     camera: Camera, stripes: StripePoints, dome_from_target: SE3, surfaces: Surfaces
 ) -> PlacedStripes:

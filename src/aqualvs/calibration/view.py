@@ -1,6 +1,6 @@
 """What one picture of a target says: known points of the target and the pixels they are seen at."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,12 +23,15 @@ class View:
         metres.
     pixels : array, shape (N, 2)
         Where they were found, in `image`.
+    notes : tuple of str
+        What a user should know of how they were found.
     """
 
     name: str
     ids: IntArray
     points: FloatArray
     pixels: FloatArray
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -42,4 +45,4 @@ class View:
 
     def where(self, keep: BoolArray) -> "View":
         """Return the points that `keep` (N,) marks."""
-        return View(self.name, self.ids[keep], self.points[keep], self.pixels[keep])
+        return replace(self, ids=self.ids[keep], points=self.points[keep], pixels=self.pixels[keep])

@@ -1,7 +1,7 @@
 """Smoothing of range, pitch and yaw over time; optional, raw values stay available."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,12 +24,15 @@ class FilteredPosture:
     rates : array, shape (3,)
         Their time derivatives, in m/s and rad/s.
     covariance : array, shape (6, 6)
-        Of (range, pitch, yaw) and the rates.
+        Of (range, pitch, yaw) and the rates, by the noise of the frames and the unknown motion.
     age_s : float
         Time since the last measurement that entered.
     accepted : bool
         Whether this frame's measurement entered; False where it was refused by the gate, or there
         was none.
+    rig_covariance : array, shape (3, 3)
+        Of (range, pitch, yaw) by the uncertainty of the rig, as the last measurement that entered
+        had it: common to all frames, so no filter reduces it.
     """
 
     range: float
@@ -39,6 +42,13 @@ class FilteredPosture:
     covariance: FloatArray
     age_s: float
     accepted: bool
+    rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @property
+    def total_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of (range, pitch, yaw) by noise, motion and rig together."""
+        total: FloatArray = self.covariance[:3, :3] + self.rig_covariance
+        return total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,8 +150,10 @@ class PostureFilter:
         self._rival = self._still_known(self._rival, time_s)
         accepted = False
         measured = _measurement(posture) if math.isfinite(time_s) else None
-        if measured is not None:
+        if measured is not None and isinstance(posture, Posture):
             accepted = self._take(time_s, *measured)
+            if accepted and self._track is not None:
+                self._track = replace(self._track, rig_covariance=posture.rig_covariance)
         if self._track is None:
             return None
         return self._motion.forecast(self._track, time_s).as_filtered(self._track, time_s, accepted)
@@ -186,13 +198,21 @@ class _Track:
     state: FloatArray
     cov: FloatArray
     n_measurements: int
+    rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     def as_filtered(self, known: "_Track", time_s: float, accepted: bool) -> FilteredPosture:
         """Return this forecast in the words of the outputs."""
         distance, pitch, yaw = self.state[:3].tolist()
         age_s = max(0.0, time_s - known.time_s)
         return FilteredPosture(
-            distance, pitch, yaw, self.state[3:].copy(), self.cov.copy(), age_s, accepted
+            distance,
+            pitch,
+            yaw,
+            self.state[3:].copy(),
+            self.cov.copy(),
+            age_s,
+            accepted,
+            known.rig_covariance,
         )
 
 

@@ -13,9 +13,10 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.stripe_view import StripeView, point_per_pixel, see_stripe
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
+from aqualvs.optics.uncertainty import RigUncertainty
 
 SIGMA_PX = 0.1
 """Standard deviation of a stripe point across the stripe, in pixels."""
@@ -26,8 +27,6 @@ USUAL_RANGES = (0.3, 0.6, 1.0)
 
 # Points on one line leave one direction of m·X = 1 to rounding.
 _SINGULAR = 1e-10
-# Central differences: this share of a sigma, and no more than this in any unit.
-_STEP_SHARE, _LARGEST_STEP = 0.1, 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,23 +85,16 @@ def expected_posture_errors(
     ranges : sequence of float
         Walls square to the forward axis, metres.
     """
+    errors = PostureErrors(rig, rig.camera(), uncertainty)
     walls = [WallView.ahead(rig, wall_range) for wall_range in ranges]
-    slopes = [np.zeros((3, len(uncertainty.names))) for _ in walls]
-    for i, (name, sigma) in enumerate(uncertainty.sigmas.items()):
-        step = min(_STEP_SHARE * sigma, _LARGEST_STEP)
-        if step > 0.0:
-            rigs = [rig_moved_by(rig, [name], np.array([h])) for h in (step, -step)]
-            for wall, slope in zip(walls, slopes, strict=True):
-                ahead, behind = (wall.read_by(moved) for moved in rigs)
-                slope[:, i] = (ahead - behind) / (2.0 * step)
     return tuple(
         ExpectedError(
             wall_range=wall.wall_range,
             per_pixel=wall.per_pixel,
             noise=wall.noise(),
-            calibration=slope @ uncertainty.covariance @ slope.T,
+            calibration=wall.calibration(errors),
         )
-        for wall, slope in zip(walls, slopes, strict=True)
+        for wall in walls
     )
 
 
@@ -179,17 +171,39 @@ class WallView:
         covariance: FloatArray = by_m @ np.linalg.inv(points.T @ points) @ by_m.T
         return covariance
 
+    def calibration(self, errors: PostureErrors) -> FloatArray:
+        """Return the covariance (3, 3) by a rig's uncertainty; NaN where there is no posture."""
+        if not self.determined:
+            return np.full((3, 3), np.nan)
+        seen = [i for i, stripe in enumerate(self.stripes) if stripe.visible]
+        pixels = np.concatenate([self.stripes[i].pixels for i in seen])
+        laser = np.concatenate([np.full(len(self.stripes[i].pixels), i) for i in seen])
+        sigma, points = self._sigma(), self._points()
+        good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)
+        wall = fitted_plane(np.array([0.0, 1.0 / self.wall_range, 0.0]), points[good])
+        sums = errors.sums(
+            wall, pixels[good], laser[good], points[good], sigma[good] ** -2.0, N_POINTS
+        )
+        slope = errors.jacobian(wall, sums)
+        covariance: FloatArray = slope @ errors.covariance @ slope.T
+        return covariance
+
     def _points(self) -> FloatArray:
         seen = [stripe.points_in_dome for stripe in self.stripes if stripe.visible]
         return np.concatenate([np.empty((0, 3)), *seen])
 
     def _weighed(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the points (N, 3) that are seen, times their weights (N,), and the weights."""
-        # With m = (0, 1/range, 0) an error of a point changes m·X by its y part over the range.
-        sigma = np.abs(np.concatenate([np.empty(0), *self.slopes])) * SIGMA_PX / self.wall_range
+        sigma = self._sigma()
         good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)
         weights = 1.0 / sigma[good]
         return points[good] * weights[:, None], weights
+
+    def _sigma(self) -> FloatArray:
+        """Return what `SIGMA_PX` makes of m·X, for every point (N,)."""
+        # With m = (0, 1/range, 0) an error of a point changes m·X by its y part over the range.
+        sigma: FloatArray = np.abs(np.concatenate([np.empty(0), *self.slopes]))
+        return sigma * SIGMA_PX / self.wall_range
 
 
 def _sigmas(covariance: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
 from aqualvs.optics.rigschema import VERSION, LaserPart, RigFile, WaterPart, parse_rig
 from aqualvs.optics.rigtext import read_yaml, rig_text
+from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
 
 __all__ = ["load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
@@ -124,6 +125,8 @@ def rig_from_mapping(
     try:
         rig = _rig(file)
         _check_whole(file, need_lasers)
+        # Whatever measures with the rig asks for it.
+        rig_uncertainty(rig)
     except AqualvsError as error:
         raise RigError(f"{source_name}: {error}") from None
     return rig

@@ -10,6 +10,8 @@ It stands in `Rig.solved_from`, and so in the rig file, in millimetres and degre
         correlation:            # below the diagonal: of the second with the first, and so on
         - [0.93]
         - [-0.2, 0.1]
+
+Of a rig whose numbers are the truth because something was rendered with it: `uncertainty: exact`.
 """
 
 import difflib
@@ -27,19 +29,28 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.uncertainty import RigUncertainty, combined, merged, rig_parameter_names
 
 __all__ = [
+    "ASSUMED",
+    "EXACT",
     "STEPS",
     "SolvedStep",
     "combined",
     "file_parameter_name",
+    "is_exact",
     "merged",
     "rig_uncertainty",
     "solved_steps",
+    "with_exact_numbers",
     "with_step",
     "with_uncertainty",
 ]
 
 STEPS = ("camera", "dome", "lasers", "water")
 """Keys of `solved_from` under which calibrations leave a `SolvedStep`."""
+
+ASSUMED = "assumed"
+"""Extra of a `SolvedStep`: numbers that it took with a default uncertainty, by their file names."""
+EXACT = "exact"
+"""What stands in place of an uncertainty where a rig's numbers are exact."""
 
 _UNCERTAINTY = "uncertainty"
 _PLACE = f"solved_from.{_UNCERTAINTY}"
@@ -153,8 +164,18 @@ def with_uncertainty(rig: Rig, uncertainty: RigUncertainty) -> Rig:
     return _noting(rig, {_UNCERTAINTY: _to_mapping(kept) if kept.names else None})
 
 
+def with_exact_numbers(rig: Rig) -> Rig:
+    """Return the rig with the note that its numbers are exact, as of what simulations see."""
+    return _noting(rig, {_UNCERTAINTY: EXACT})
+
+
+def is_exact(rig: Rig) -> bool:
+    """Return whether the rig carries the note of `with_exact_numbers`."""
+    return bool(rig.solved_from.get(_UNCERTAINTY) == EXACT)
+
+
 def rig_uncertainty(rig: Rig) -> RigUncertainty:
-    """Return the uncertainty that is written down in a rig, or none.
+    """Return the uncertainty that is written down in a rig, or none; zero for one that is exact.
 
     Raises
     ------
@@ -164,6 +185,9 @@ def rig_uncertainty(rig: Rig) -> RigUncertainty:
     content = rig.solved_from.get(_UNCERTAINTY)
     if content is None:
         return RigUncertainty.none()
+    if is_exact(rig):
+        names = rig_parameter_names(rig)
+        return RigUncertainty(names, np.zeros((len(names), len(names))))
     if not isinstance(content, Mapping) or set(content) != set(_KEYS):
         raise RigError(
             f"{_PLACE} does not have the keys {', '.join(_KEYS)}; take it out, or calibrate again"

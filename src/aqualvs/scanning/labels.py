@@ -26,7 +26,7 @@ def label_readings(
     target: Surface | None,
     found: Measurement,
     working_range: tuple[float, float],
-) -> ScanPoints:
+) -> tuple[ScanPoints, IntArray]:
     """Label every return once, as the laser that explains it best.
 
     Parameters
@@ -46,10 +46,12 @@ def label_readings(
 
     Returns
     -------
-    ScanPoints
+    points : ScanPoints
         Readings of a return that another reading explains are left out. A return that nothing
         explains is told by its shape, and ambiguous where that says nothing and several lasers
         could have made it.
+    listed : int array, shape (P,)
+        Row of each point's reading.
     """
     n, shapes = len(readings), readings.shapes()
     label, explained = np.empty(n, np.uint8), np.zeros(n, np.bool_)
@@ -95,7 +97,8 @@ def label_readings(
         label,
         rows,
     )
-    return _scan_points(readings, label, found.rests_on, rows[:n_listed])
+    listed = rows[:n_listed]
+    return _scan_points(readings, label, found.rests_on, listed), listed
 
 
 def _facing(target: Surface | None, found: Measurement) -> FloatArray:

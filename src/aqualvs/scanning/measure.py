@@ -20,6 +20,7 @@ from aqualvs.scanning.measure_kernels import (
     mark_rested_on,
     places_along,
     select_pieces,
+    weigh_readings,
 )
 from aqualvs.scanning.net_growth import follow_net
 from aqualvs.scanning.net_labels import SOME, much_beside
@@ -94,6 +95,8 @@ class Measurement:
         The curved surface, where the net is none that a plane describes.
     whole : bool array, shape (N,), or None
         Readings on the net, also where its folds leave the surface; None for what is no net.
+    weights : array, shape (N,), or None
+        What each reading weighs in the fit, as 1 over the variance of m·X; None without a posture.
     folded : bool
         Whether the posture is that of a folded net's mean plane.
     """
@@ -102,6 +105,7 @@ class Measurement:
     rests_on: BoolArray
     patch: Patch | None = None
     whole: BoolArray | None = None
+    weights: FloatArray | None = None
     folded: bool = False
 
 
@@ -300,7 +304,7 @@ class PostureMeter:
         along = fit.patch.coefficients[[3, 5]].tolist()
         sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
         bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
-        return Measurement(bent, found.rests_on, fit.patch)
+        return replace(found, posture=bent, patch=fit.patch)
 
     def _observe(
         self,
@@ -359,7 +363,14 @@ class PostureMeter:
         )
         if second < _MIN_PIECES:
             return None
-        return Measurement(posture_of(fit, nearest, n_points, self._axis_in_dome), rests_on)
+        weights, pieces = np.empty(len(readings)), seen.pieces
+        # The mean plane of folds and the pseudo-inverse do not look at the errors.
+        alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
+        weigh_readings(
+            seen.group, fit.m, pieces.sensitivity, pieces.sigma_px, fit.weights, alike, weights
+        )
+        posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
+        return Measurement(posture, rests_on, weights=weights)
 
 
 class _Seen(NamedTuple):

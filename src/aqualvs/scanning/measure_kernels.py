@@ -253,3 +253,40 @@ def light_share_near(
             total += trust[i]
             on += trust[i] if abs(height[group[i]]) < near else 0.0
     return on / max(total, 1e-12)
+
+
+@kernel
+def weigh_readings(
+    group: IntArray,
+    m: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    fit_weights: FloatArray,
+    alike: bool,
+    weights: FloatArray,
+) -> None:
+    """Write what each reading weighs in a fit of m·X = 1, its piece's weight in equal shares.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_pieces`.
+    m : array, shape (3,)
+        Of the plane.
+    sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)
+        Of the observations.
+    alike : bool
+        Whether the fit took all observations alike, and not by their errors.
+    weights : array, shape (N,)
+        Written: 1 over the variance of m·X; 0 where the fit does not rest on a reading.
+    """
+    count, weight = np.zeros(sigma_px.shape[0]), np.empty(sigma_px.shape[0])
+    for i in range(group.shape[0]):
+        if group[i] >= 0:
+            count[group[i]] += 1.0
+    for c in range(sigma_px.shape[0]):
+        per_px = m[0] * sensitivity[c, 0] + m[1] * sensitivity[c, 1] + m[2] * sensitivity[c, 2]
+        sigma = 1.0 if alike else abs(per_px) * sigma_px[c] + 1e-12
+        weight[c] = fit_weights[c] / (sigma * sigma * count[c])
+    for i in range(group.shape[0]):
+        weights[i] = weight[group[i]] if group[i] >= 0 else 0.0

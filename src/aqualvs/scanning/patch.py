@@ -6,20 +6,31 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 from aqualvs.scanning.patch_kernels import (
     COEFFICIENTS,
     PACKED,
     RIGHT,
+    SIGMA_CURVATURE,
+    SIGMA_TWIST,
     UP,
     carry_to_tangent,
     heights_over,
+    tangent_jacobian,
     write_flat,
     write_tangent,
+    write_terms,
 )
 
 FLAT = np.zeros(6)
 """Coefficients (a, b, c, p, q, r) of a plane."""
+CURVATURE_PRIOR: FloatArray = np.array(
+    [0.0, 0.0, 0.0, SIGMA_CURVATURE**-2, SIGMA_TWIST**-2, SIGMA_CURVATURE**-2]
+)
+"""Information on the coefficients that fits add to that of the observations."""
 
+# Coefficients differ by so much where their derivatives are taken: metres, shares, 1/m.
+_ALIKE = np.full(6, 0.1)
 # The nearest point lies at most so far beside what is seen, in shares of its width and height, and
 # its normal no farther off the vehicle's forward axis than 55 degrees.
 _BESIDE_VIEW = 0.6
@@ -133,3 +144,28 @@ def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
     covariance = np.empty((3, 3))
     carry_to_tangent(fit.patch.packed(), fit.covariance, m, covariance)
     return covariance
+
+
+def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
+    """Return a patch as it is fitted to points (N, 3); the posture is that of its tangent.
+
+    Parameters
+    ----------
+    patch : Patch
+    m : array, shape (3,)
+        From `nearest_tangent`.
+    points : array, shape (N, 3)
+        In `dome`, metres.
+    """
+    packed, terms = patch.packed(), np.empty((len(points), len(FLAT)))
+    by_plane, by_terms = np.empty((3, 3)), np.empty((3, len(FLAT)))
+    write_terms(points, packed, terms)
+    posture_by_plane(m, by_plane)
+    if not tangent_jacobian(packed, _ALIKE, m, by_terms):
+        by_terms[:] = np.nan
+    _, b, c, p, q, r = patch.coefficients.tolist()
+    right, up = patch.right, patch.up
+    across = np.outer(right, up)
+    bend = p * np.outer(right, right) + q * (across + across.T) + r * np.outer(up, up)
+    normal = patch.base.normal - b * right - c * up
+    return FittedSurface(terms, CURVATURE_PRIOR, normal, -bend, by_plane @ by_terms)

@@ -12,6 +12,9 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel,
 NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
 """Where what begins, and how many numbers there are."""
 
+SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
+"""What is expected of nets before looking, in 1/m: bent by a metre's radius, hardly twisted."""
+
 # The nearest point is looked for in so many Newton steps, and only where they are downhill.
 _FOOT_STEPS = 12
 _LEAST_CURVED = 0.05
@@ -85,6 +88,24 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
 
 
 @kernel
+def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: FloatArray) -> bool:
+    """Write the derivatives (3, 6) of m by the coefficients, by differences; False without any.
+
+    `sigma`, shape (6,), are the coefficients' standard deviations.
+    """
+    moved, other = patch.copy(), np.empty(3)
+    for k in range(6):
+        step = 1e-4 * max(sigma[k], 1e-6)
+        moved[COEFFICIENTS + k] = patch[COEFFICIENTS + k] + step
+        if not write_tangent(moved, other):
+            return False
+        moved[COEFFICIENTS + k] = patch[COEFFICIENTS + k]
+        for j in range(3):
+            out[j, k] = (other[j] - m[j]) / step
+    return True
+
+
+@kernel
 def carry_to_tangent(
     patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
 ) -> None:
@@ -92,16 +113,10 @@ def carry_to_tangent(
 
     `covariance`, shape (6, 6), is that of the coefficients.
     """
-    jacobian, moved, other = np.empty((3, 6)), patch.copy(), np.empty(3)
-    for k in range(6):
-        step = 1e-4 * max(np.sqrt(covariance[k, k]), 1e-6)
-        moved[COEFFICIENTS + k] = patch[COEFFICIENTS + k] + step
-        if not write_tangent(moved, other):
-            out[:] = np.inf
-            return
-        moved[COEFFICIENTS + k] = patch[COEFFICIENTS + k]
-        for j in range(3):
-            jacobian[j, k] = (other[j] - m[j]) / step
+    jacobian = np.empty((3, 6))
+    if not tangent_jacobian(patch, np.sqrt(np.diag(covariance)), m, jacobian):
+        out[:] = np.inf
+        return
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -109,3 +124,15 @@ def carry_to_tangent(
                 for n in range(6):
                     total += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
             out[i, j] = total
+
+
+@borrowing_kernel
+def write_terms(points: FloatArray, patch: FloatArray, terms: FloatArray) -> None:
+    """Write what a patch's coefficients are multiplied by at points (N, 3), shape (N, 6)."""
+    for i in range(points.shape[0]):
+        u, v = 0.0, 0.0
+        for k in range(3):
+            u += patch[RIGHT + k] * points[i, k]
+            v += patch[UP + k] * points[i, k]
+        terms[i, 0], terms[i, 1], terms[i, 2] = 1.0, u, v
+        terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v

@@ -1,22 +1,26 @@
 """The main path: a frame in, posture and points out."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from aqualvs.geometry.arrays import BoolArray, IntArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import sheets_of
+from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Verdict, widened
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import MIN_LINES, FitMethod, Measurement, PostureMeter
-from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
-from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.scanning.paper_filter import PaperFilter
+from aqualvs.scanning.patch import fitted_patch
+from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.readings import Readings, read_returns
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.search import SearchAxis, plan_searches, searched_range
 from aqualvs.scanning.stripe import Returns, StripeOptions
 from aqualvs.scanning.surfaces import (
@@ -27,6 +31,7 @@ from aqualvs.scanning.surfaces import (
     surface_on,
 )
 from aqualvs.scanning.target import TargetKind, choose_target, read_as_wanted
+from aqualvs.scanning.threshold import ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 
 
@@ -39,7 +44,8 @@ class ScannerOptions:
     detector : StripeOptions or ThresholdOptions
         Which stripe detector, and how.
     mesh_filter : MeshFilterOptions or None
-        The paper's mesh filter in front of the search for surfaces; off by default.
+        The paper's mesh filter; off by default. What it rejects is dropped, and the frame is
+        measured once more from the rest.
     target : TargetKind
         What the posture is measured to.
     fit : FitMethod
@@ -75,10 +81,11 @@ class Scanner:
         self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
         self._meter = PostureMeter(rig, self._searches, self.options.fit)
+        self._paper_filter = self._make_paper_filter(camera)
+        self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
         self._assignment = AssignmentTest(
             self._searches, self._triangulator, searched_range(rig.working_range)
         )
-        self._planes = [one.best_plane(camera, rig.working_range) for one in sheets_of(rig)]
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -123,7 +130,26 @@ class Scanner:
             From `detect`; as they were recorded, they give what the frame gave.
         """
         # Each return read as a point of every laser that could have made it.
-        readings = self._filtered(read_returns(returns, self._searches, self._triangulator))
+        readings = read_returns(returns, self._searches, self._triangulator)
+        found, points, listed = self._measured(readings)
+        if self._paper_filter is not None:
+            # The paper's filter wants to know the laser of each return, which is known by now.
+            kept = np.zeros(len(readings), np.bool_)
+            kept[listed] = _on_mesh(self._paper_filter, points)
+            readings = readings.where(kept)
+            found, points, _ = self._measured(readings)
+        posture = self._with_rig_covariance(found, readings)
+        return Scan(index, time_s, posture, points, self.rig.n_water)
+
+    def _make_paper_filter(self, camera: Camera) -> PaperFilter | None:
+        options = self.options.mesh_filter
+        if options is None:
+            return None
+        every_pixel = isinstance(self.options.detector, ThresholdOptions)
+        return PaperFilter(self.rig, camera, self._searches, options, every_pixel=every_pixel)
+
+    def _measured(self, readings: Readings) -> tuple[Measurement, ScanPoints, IntArray]:
+        """Return the posture, the labelled points, and the rows of their readings."""
         # Planes that several lasers agree on, and the one that is the target.
         chunks, chunk_index = readings.chunks()
         surfaces = find_surfaces(
@@ -153,10 +179,25 @@ class Scanner:
         else:
             found = self._meter.measure(readings, chunk_index, target)
             found = widened(found, tested)
-        points = label_readings(
+        points, listed = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
-        return Scan(index, time_s, found.posture, points, self.rig.n_water)
+        return found, points, listed
+
+    def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
+        """Return the posture with what the rig's own uncertainty makes of it."""
+        posture = found.posture
+        if not isinstance(posture, Posture) or found.weights is None:
+            return posture
+        m, points, weights = posture.normal_in_dome / posture.range, readings.points, found.weights
+        surface = fitted_plane(m, points)
+        if found.patch is not None:
+            # Heights over a patch are in metres, m·X is in ranges.
+            surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
+        covariance = self._rig_errors.covariance_of(
+            surface, readings.pixels, readings.laser, points, weights
+        )
+        return replace(posture, rig_covariance=covariance)
 
     def _with_rival(
         self, surfaces: list[Surface], target: Surface, other: Plane, chunks: Chunks
@@ -168,19 +209,10 @@ class Scanner:
         ]
         return read_as_wanted([rival, *kept], self.options.target)
 
-    def _filtered(self, readings: Readings) -> Readings:
-        if self.options.mesh_filter is None or not len(readings):
-            return readings
-        kept = np.zeros(len(readings), np.bool_)
-        for i, plane in enumerate(self._planes):
-            mine = readings.laser == i
-            kept[mine] = mesh_filter(
-                readings.points[mine],
-                plane,
-                self.options.mesh_filter,
-                working_range=self.rig.working_range,
-            )
-        return readings.where(kept)
+
+def _on_mesh(paper_filter: PaperFilter, points: ScanPoints) -> BoolArray:
+    laser = points.laser.astype(np.int64)
+    return paper_filter.apply(points.pixels, points.width, laser).returns_on_mesh(len(points))
 
 
 def _by_chance(readings: Readings) -> Measurement:

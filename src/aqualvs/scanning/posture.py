@@ -1,7 +1,7 @@
 """Posture relative to a plane target: range, pitch, yaw and how far to trust them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.scanning.plane_fit import PlaneFit
 
 # Beyond these a posture tells nothing that a pilot could use.
@@ -68,7 +69,11 @@ class Posture:
     range, pitch, yaw : float
         Distance of the dome's centre from the plane in metres, angles in radians.
     covariance : array, shape (3, 3)
-        Of (range, pitch, yaw), in m and rad.
+        Of (range, pitch, yaw) by the noise of this frame alone, in m and rad: what differs from
+        frame to frame, and what averaging lowers. A time filter wants this one.
+    rig_covariance : array, shape (3, 3)
+        Of the same by the uncertainty of the rig (intrinsics, dome, water, lasers): nearly the same
+        error in all frames of a dive. Zero where the rig is exact or was not asked.
     normal_in_dome : array, shape (3,)
         Unit normal of the target plane, pointing away from the vehicle.
     slant_range : float
@@ -97,10 +102,20 @@ class Posture:
     rms: float
     curvature: tuple[float, float] | None = None
     sigma_curvature: tuple[float, float] | None = None
+    rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     def __bool__(self) -> Literal[True]:
         """Return True: a posture is an answer."""
         return True
+
+    @property
+    def total_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of (range, pitch, yaw) by frame and rig together, in m and rad.
+
+        How far the posture may be from the truth: what others should be told.
+        """
+        total: FloatArray = self.covariance + self.rig_covariance
+        return total
 
 
 def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: FloatArray) -> Posture:
@@ -190,16 +205,10 @@ def _carry_over(
     out_normal: FloatArray,
 ) -> float:
     """Write the covariance of (range, pitch, yaw) and the unit normal; returns m along the axis."""
-    x, y, z = m[0], m[1], m[2]
-    yz, xy, square = y * y + z * z, x * x + y * y, x * x + y * y + z * z
-    length = np.sqrt(square)
-    # Derivative of (range, pitch, yaw) by m.
-    jacobian = np.zeros((3, 3))
+    jacobian, length = np.empty((3, 3)), np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    posture_by_plane(m, jacobian)
     for k in range(3):
-        jacobian[0, k] = -m[k] / (length * square)
         out_normal[k] = m[k] / length
-    jacobian[1, 1], jacobian[1, 2] = -z / yz, y / yz
-    jacobian[2, 0], jacobian[2, 1] = y / xy, -x / xy
     for i in range(3):
         for j in range(3):
             out_covariance[i, j] = 0.0

@@ -5,7 +5,15 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.cholesky import factorise, inverse_of, solve_factorised
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
-from aqualvs.scanning.patch_kernels import COEFFICIENTS, NORMAL, OFFSET, RIGHT, UP
+from aqualvs.scanning.patch_kernels import (
+    COEFFICIENTS,
+    NORMAL,
+    OFFSET,
+    RIGHT,
+    SIGMA_CURVATURE,
+    SIGMA_TWIST,
+    UP,
+)
 
 N = 6
 """Coefficients a, b, c, p, q, r."""
@@ -17,9 +25,6 @@ MIN_PIECES = 12
 _STEPS = 16
 _TUKEY = 4.685  # 95 % efficiency for normal errors
 _REWEIGHTS = 6
-# What is expected of nets before looking, in 1/m: bent by a metre's radius, hardly twisted.
-_SIGMA_CURVATURE = 2.0
-_SIGMA_TWIST = 0.5
 # Steeper bends than a radius of half a metre are something else.
 _STRONGEST = 2.0
 # The residual asks for curvature when it gains so much of the light or of the scatter ...
@@ -201,8 +206,8 @@ def _solve(
     right = np.zeros(N)
     factor[:] = 0.0
     for k in (3, 5):
-        factor[k, k] = 1.0 / _SIGMA_CURVATURE**2
-    factor[4, 4] = 1.0 / _SIGMA_TWIST**2
+        factor[k, k] = 1.0 / SIGMA_CURVATURE**2
+    factor[4, 4] = 1.0 / SIGMA_TWIST**2
     for i in range(terms.shape[0]):
         w = weight[i]
         if w == 0.0:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.benchmark_scenarios import BenchmarkDive
 from aqualvs.simulation.lit_points import LitPoints
 from aqualvs.simulation.render import Renderer
@@ -61,7 +62,7 @@ def render_benchmark_dive(
         If the folder or a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    save_rig(renderer.rig, folder / "rig.yaml")
+    save_rig(with_exact_numbers(renderer.rig), folder / "rig.yaml")
     scenario = dive.scenario
     with (
         (folder / "truth.csv").open("w", newline="", encoding="utf-8") as file,

@@ -14,12 +14,15 @@ from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation import calibration_views as views
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenario_file import parse_scenario
+from aqualvs.simulation.video import jpeg
 
 _LASER_POWER = 8.0
 _ROOM = RoomLight(level=0.72)
@@ -31,6 +34,8 @@ _FAR_SQUARE_PX, _FARTHEST = 19.0, 1.2
 _NEAREST = 0.15
 _PLATE_FAR = 0.35
 _FPS = 25.0
+# A person needs this long from one picture to the next; drifts go on meanwhile.
+_BETWEEN_STILLS_S = 4.0
 
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
@@ -102,6 +107,7 @@ class _Job:
     size: SetSize
     seed: int
     tick: Callable[[int, int], None] | None
+    camera: SimulatedCamera
     done: int = 0
 
     def rng(self, part: int) -> np.random.Generator:
@@ -123,14 +129,24 @@ class _Job:
         scenes: Sequence[PanelScene],
         folder: Path,
         rng: np.random.Generator,
-        name: str = "view_{:02d}.png",
+        name: str = "view_{:02d}",
     ) -> list[str]:
         """Render scenes into a folder and return the names of the pictures."""
-        names = [name.format(i) for i in range(len(scenes))]
+        quality = self.camera.still_quality
+        suffix = ".png" if quality is None else ".jpg"
+        names = [name.format(i) + suffix for i in range(len(scenes))]
         for scene, file in zip(scenes, names, strict=True):
-            _write_picture(folder / file, renderer.render(scene, rng))
+            image = renderer.render(scene, rng, _BETWEEN_STILLS_S * self.done)
+            _write_picture(folder / file, image, quality)
+            # Of an earlier set, which another camera took.
+            (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
             self.did_one()
         return names
+
+    def with_lasers(self, rig: Rig) -> PanelRenderer:
+        """Return what takes the pictures of a rig with all lasers on."""
+        sheets = panel_sheets(rig, power=_LASER_POWER, filters=self.camera.filters)
+        return PanelRenderer(rig.camera(), sheets, eye=self.camera)
 
 
 def simulate_calibration(
@@ -140,6 +156,7 @@ def simulate_calibration(
     size: SetSize | None = None,
     progress: Callable[[int, int], None] | None = None,
     seed: int = 0,
+    camera: SimulatedCamera = IDEAL,
 ) -> CalibrationFiles:
     """Render pictures for all steps of a calibration, and the files that go with them.
 
@@ -161,7 +178,9 @@ def simulate_calibration(
     progress : callable, optional
         Called after every picture with the number of pictures done and of all.
     seed : int
-        The same rig, size and seed give the same pictures.
+        The same rig, size, camera and seed give the same pictures.
+    camera : SimulatedCamera
+        Sensor and processing; one that keeps JPEGs writes `.jpg`, the others `.png`.
 
     Raises
     ------
@@ -172,7 +191,7 @@ def simulate_calibration(
     """
     size = SetSize() if size is None else size
     _check(rig, size)
-    job = _Job(rig, out, size, seed, progress)
+    job = _Job(rig, out, size, seed, progress, camera)
     try:
         return _simulate(job)
     except OSError as error:
@@ -200,7 +219,7 @@ def _simulate(job: _Job) -> CalibrationFiles:
     dive, dive_truth = _dive(job)
     nominal, rig = job.out / "nominal.yaml", job.folder("truth") / "rig.yaml"
     targets.write_yaml(nominal, _nominal_mapping(job.rig))
-    save_rig(job.rig, rig)
+    save_rig(with_exact_numbers(job.rig), rig)
     return CalibrationFiles(
         nominal=nominal,
         camera=camera,
@@ -227,7 +246,7 @@ def _camera_air(job: _Job) -> tuple[Path, Path]:
     scenes = [
         PanelScene(panels=[targets.board_panel(board, pose), behind], light=_ROOM) for pose in poses
     ]
-    names = job.shoot(PanelRenderer(rig.bare_camera()), scenes, folder, rng)
+    names = job.shoot(PanelRenderer(rig.bare_camera(), eye=job.camera), scenes, folder, rng)
     _write_poses(job.folder("truth") / "camera_air_poses.csv", names, poses)
     targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
     return folder, folder / "board.yaml"
@@ -244,7 +263,7 @@ def _dome_air(job: _Job) -> tuple[Path, Path, Path]:
     scenes = [
         PanelScene(panels=[targets.board_panel(board, pose), behind], light=_ROOM) for pose in poses
     ]
-    names = job.shoot(PanelRenderer(rig.camera()), scenes, folder, rng)
+    names = job.shoot(PanelRenderer(rig.camera(), eye=job.camera), scenes, folder, rng)
     _write_poses(job.folder("truth") / "dome_air_poses.csv", names, poses)
     rows = [(name, targets.to_mm(far)) for name, far in zip(names, measured, strict=True)]
     _write_table(folder / "poses.csv", ("file", "distance_mm"), rows)
@@ -261,8 +280,7 @@ def _box(job: _Job) -> tuple[Path, Path]:
     for pose in poses:
         inside = [targets.moved(wall, pose.inverse()).panel for wall in walls]
         scenes.append(PanelScene(panels=[*inside, behind], light=_DIM))
-    renderer = PanelRenderer(rig.camera(), panel_sheets(rig, power=_LASER_POWER))
-    names = job.shoot(renderer, scenes, folder, rng)
+    names = job.shoot(job.with_lasers(rig), scenes, folder, rng)
     _write_poses(job.folder("truth") / "box_poses.csv", names, poses)
     targets.write_yaml(folder / "box.yaml", targets.box_mapping(walls, rig.n_water))
     return folder, folder / "box.yaml"
@@ -278,8 +296,7 @@ def _index(job: _Job) -> tuple[Path, Path]:
         wall = SE3.from_rotvec([0.02, 0.0, 0.05], [0.01 * i, 0.80 + 0.004 * i, 0.0])
         behind = targets.ground(wall @ SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)), cell=2e-3, shift=40)
         scenes.append(PanelScene(panels=[plate.panel, behind], light=_WATER))
-    renderer = PanelRenderer(rig.camera(), panel_sheets(rig, power=_LASER_POWER))
-    job.shoot(renderer, scenes, folder, rng, "frame_{:03d}.png")
+    job.shoot(job.with_lasers(rig), scenes, folder, rng, "frame_{:03d}")
     target = folder.parent / "target.yaml"
     targets.write_yaml(target, targets.target_mapping(plate))
     return folder, target
@@ -293,6 +310,7 @@ def _dive(job: _Job) -> tuple[Path | None, Path | None]:
         job.rig,
         job.folder("dive"),
         progress=lambda _done, _all: job.did_one(),
+        camera=job.camera,
     )
     return files.video, files.truth
 
@@ -322,7 +340,10 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
     return {**content, "n_air": float(rig.n_air), "lasers": {"count": len(rig.lasers)}}
 
 
-def _write_picture(path: Path, image: NDArray[np.uint8]) -> None:
+def _write_picture(path: Path, image: NDArray[np.uint8], jpeg_quality: int | None) -> None:
+    if jpeg_quality is not None:
+        path.write_bytes(jpeg(image, jpeg_quality))
+        return
     _, data = cv2.imencode(".png", image[..., ::-1])
     path.write_bytes(data.tobytes())
 

@@ -11,12 +11,13 @@ import numpy as np
 
 from aqualvs.errors import OutputError
 from aqualvs.optics.rig import Rig
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.lit_points import LitPoints
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scene import Label
 from aqualvs.simulation.truth import TRUTH_COLUMNS, truth_row
-from aqualvs.simulation.video import Quality, VideoWriter
+from aqualvs.simulation.video import Recording, VideoWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +47,8 @@ def simulate_dive(
     *,
     progress: Callable[[int, int], None] | None = None,
     point_frames: Collection[int] = (),
-    quality: Quality = "h264",
-    crf: int = 20,
-    bit_rate: int | None = None,
+    camera: SimulatedCamera = IDEAL,
+    recording: Recording | None = None,
     threads: int | None = None,
 ) -> DiveFiles:
     """Render a scenario with a rig and write `dive.mp4`, `truth.csv` and, if asked, lit points.
@@ -69,8 +69,10 @@ def simulate_dive(
     point_frames : collection of int
         Frames whose lit points go to `points_FFFF.npz`: `xyz` in `dome` in mm, `px`, `laser`,
         `label` (index into `labels`) and `labels`.
-    quality, crf, bit_rate
-        See `VideoWriter`.
+    camera : SimulatedCamera
+        Sensor and processing; see `aqualvs.simulation.cameras`.
+    recording : Recording, optional
+        How the video is compressed; as the camera does it by default.
     threads : int, optional
         Cores to render with; all of them by default. The pictures do not depend on it.
 
@@ -83,13 +85,11 @@ def simulate_dive(
     """
     _make_folder(out_dir)
     video, truth = out_dir / "dive.mp4", out_dir / "truth.csv"
-    renderer = Renderer(rig, threads=threads or os.cpu_count() or 1)
+    renderer = Renderer(rig, threads=threads or os.cpu_count() or 1, camera=camera)
     points: list[Path] = []
     with (
         _open_table(truth) as file,
-        VideoWriter(
-            video, rig.size_px, scenario.fps, quality=quality, crf=crf, bit_rate=bit_rate
-        ) as writer,
+        VideoWriter(video, rig.size_px, scenario.fps, recording or camera.recording) as writer,
     ):
         table = csv.writer(file)
         table.writerow(TRUTH_COLUMNS)

@@ -12,11 +12,20 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import Sheet, packed_sheets, sheet_in, sheets_of
 from aqualvs.optics.sheet_kernels import START, WINDOWED, crossing
-from aqualvs.simulation.vectors import Vec, dot, minus, row3
+from aqualvs.simulation.spectrum import (
+    COLOUR_BALANCED,
+    GREEN_NM,
+    ColourFilters,
+    band_shares,
+    laser_wavelength_nm,
+)
+from aqualvs.simulation.vectors import Vec, along, dot, minus, row3
 
 # Columns of the sheet table.
 SOURCE, NORMAL, CENTRE, SIDE, SIGMA, DIVERGENCE, POWER, REACH = 0, 3, 6, 9, 12, 13, 14, 15
-_COLUMNS = 16
+# What the camera records of the light, and by which of the water's three bands it is dimmed.
+COLOUR, BANDS = 16, 19
+_COLUMNS = 22
 # `LaserSource.power` is stated at this distance.
 _REFERENCE = 0.5
 # Beyond so many sigma a sheet is dark.
@@ -49,6 +58,8 @@ class LaserSource:
     power : float
         Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the
         source, in clear water.
+    wavelength_nm : float
+        In nanometres; the camera's colour filters and the water answer to it.
     """
 
     position: FloatArray
@@ -57,6 +68,7 @@ class LaserSource:
     sigma: float = 0.45e-3
     divergence: float = 0.75e-3
     power: float = 10.0
+    wavelength_nm: float = GREEN_NM
 
 
 class Sheets(NamedTuple):
@@ -64,7 +76,7 @@ class Sheets(NamedTuple):
 
     Attributes
     ----------
-    table : array, shape (n, 16)
+    table : array, shape (n, 22)
         See the column constants of this module.
     fan : array, shape (n, N_FAN)
         Relative power over the tangent of the fan angle, from -reach to reach.
@@ -94,6 +106,7 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
 
     Behind a window the source is where the rig says.
     """
+    wavelength_nm = laser_wavelength_nm(laser)
     normal = laser.plane.normal
     forward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     length = float(np.linalg.norm(forward))
@@ -105,14 +118,18 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
     forward /= length
     if laser.window is not None:
         source = sheet_in(laser, rig.n_air, rig.n_water).source
-        return LaserSource(position=source, direction=forward)
+        return LaserSource(position=source, direction=forward, wavelength_nm=wavelength_nm)
     foot = normal * laser.plane.offset
     back = (foot[1] - 0.01) / forward[1]
-    return LaserSource(position=foot - back * forward, direction=forward)
+    return LaserSource(
+        position=foot - back * forward, direction=forward, wavelength_nm=wavelength_nm
+    )
 
 
-def pack_sheets(rig: Rig, sources: Sequence[LaserSource]) -> Sheets:
-    """Return the tables of a rig's laser sheets that nothing shadows yet.
+def pack_sheets(
+    rig: Rig, sources: Sequence[LaserSource], filters: ColourFilters = COLOUR_BALANCED
+) -> Sheets:
+    """Return the tables of a rig's laser sheets that nothing shadows yet, as a camera sees them.
 
     Raises
     ------
@@ -126,7 +143,7 @@ def pack_sheets(rig: Rig, sources: Sequence[LaserSource]) -> Sheets:
     table = np.zeros((len(lasers), _COLUMNS))
     fan = np.zeros((len(lasers), N_FAN))
     for i, (laser, source) in enumerate(zip(lasers, sources, strict=True)):
-        table[i] = _pack_sheet(laser, sheets[i], source)
+        table[i] = _pack_sheet(laser, sheets[i], source, filters)
         tangents = np.linspace(-table[i, REACH], table[i, REACH], N_FAN)
         past_edge = (np.abs(np.arctan(tangents)) - source.half_angle) / _EDGE
         fan[i] = 1.0 / (1.0 + np.exp(np.clip(8.0 * past_edge, -60.0, 60.0)))
@@ -142,7 +159,9 @@ def pack_sheets(rig: Rig, sources: Sequence[LaserSource]) -> Sheets:
     return packed
 
 
-def _pack_sheet(laser: Laser, sheet: Sheet, source: LaserSource) -> FloatArray:
+def _pack_sheet(
+    laser: Laser, sheet: Sheet, source: LaserSource, filters: ColourFilters
+) -> FloatArray:
     normal = laser.plane.normal
     off = float(laser.plane.signed_distance(source.position))
     tilt = float(normal @ source.direction)
@@ -160,7 +179,8 @@ def _pack_sheet(laser: Laser, sheet: Sheet, source: LaserSource) -> FloatArray:
     side = np.cross(normal, source.direction)
     shape = [source.sigma, source.divergence, source.power]
     reach = np.tan(min(source.half_angle + 2.0 * _EDGE, np.deg2rad(85.0)))
-    return np.concatenate([source.position, normal, source.direction, side, shape, [reach]])
+    light = [filters.laser_colour(source.wavelength_nm), band_shares(source.wavelength_nm)]
+    return np.concatenate([source.position, normal, source.direction, side, shape, [reach], *light])
 
 
 class FanRays(NamedTuple):
@@ -255,22 +275,44 @@ def peak_irradiance(
     return float(row[POWER] * spread * fan * np.exp(-attenuation * distance))
 
 
-def light_on_points(points: FloatArray, sheets: Sheets, attenuation: float) -> FloatArray:
-    """Return the laser light on free-floating points, shape (n, 3) in, (n,) out."""
-    light = np.zeros(len(points))
+@inline_borrowing_kernel
+def laser_attenuation(attenuation: Vec, sheets: Sheets, i: int) -> float:
+    """Return how a sheet's light is dimmed per metre, from what the water does to three bands."""
+    return dot(row3(sheets.table, i, BANDS), attenuation)
+
+
+@inline_borrowing_kernel
+def add_colour(seen: Vec, light: float, sheets: Sheets, i: int) -> Vec:
+    """Return red, green and blue with some more of a sheet's light."""
+    return along(seen, row3(sheets.table, i, COLOUR), light)
+
+
+def light_on_points(points: FloatArray, sheets: Sheets, attenuation: Vec) -> FloatArray:
+    """Return the laser light on free-floating points, shape (n, 3) in, (n, 3) out.
+
+    Parameters
+    ----------
+    points : array, shape (n, 3)
+        In `dome`, in metres.
+    sheets : Sheets
+        With the distances at which surfaces end them.
+    attenuation : (float, float, float)
+        Of the water per metre, for red, green and blue.
+    """
+    light = np.zeros((len(points), 3))
     _light_on_points(np.ascontiguousarray(points), sheets, attenuation, light)
     return light
 
 
 @borrowing_kernel
-def _light_on_points(
-    points: FloatArray, sheets: Sheets, attenuation: float, out: FloatArray
-) -> None:
+def _light_on_points(points: FloatArray, sheets: Sheets, attenuation: Vec, out: FloatArray) -> None:
     for k in range(points.shape[0]):
-        p = row3(points, k, 0)
+        p, seen = row3(points, k, 0), (0.0, 0.0, 0.0)
         for i in range(sheets.table.shape[0]):
             off, distance, place, sigma = sheet_coordinates(p, sheets, i)
             if place < 0.0 or distance > sheets.first[i, int(place + 0.5)]:
                 continue
-            peak = peak_irradiance(distance, sigma, place, attenuation, sheets, i)
-            out[k] += peak * np.exp(-0.5 * (off / sigma) ** 2)
+            dimmed = laser_attenuation(attenuation, sheets, i)
+            peak = peak_irradiance(distance, sigma, place, dimmed, sheets, i)
+            seen = add_colour(seen, peak * np.exp(-0.5 * (off / sigma) ** 2), sheets, i)
+        out[k, 0], out[k, 1], out[k, 2] = seen

@@ -12,6 +12,7 @@ from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Rig
 from aqualvs.simulation.lasers import LaserSource, Sheets, fan_rays, pack_sheets
 from aqualvs.simulation.scene import Label
+from aqualvs.simulation.spectrum import COLOUR_BALANCED, ColourFilters
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 from aqualvs.simulation.vectors import row3
 
@@ -48,9 +49,14 @@ class LitPoints:
         return len(self.laser)
 
 
-def light_sheets(rig: Rig, sources: Sequence[LaserSource], surfaces: Surfaces) -> Sheets:
+def light_sheets(
+    rig: Rig,
+    sources: Sequence[LaserSource],
+    surfaces: Surfaces,
+    filters: ColourFilters = COLOUR_BALANCED,
+) -> Sheets:
     """Return the tables of laser sheets with the distances at which surfaces end them."""
-    sheets = pack_sheets(rig, sources)
+    sheets = pack_sheets(rig, sources, filters)
     for i in range(len(rig.lasers)):
         origins, directions, way = fan_rays(rig, sheets, i)
         sheets.first[i] = way + cast(origins, directions, surfaces).solid

@@ -17,12 +17,12 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.lasers import Sheets, default_sources, pack_sheets
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
+from aqualvs.simulation.lasers import COLOUR, Sheets, default_sources, pack_sheets
 from aqualvs.simulation.panel_kernels import COLUMNS, CornerRays, Lamp, PanelTables, render_panels
 from aqualvs.simulation.panel_textures import Texture
 from aqualvs.simulation.scene import Sensor, Vector, WaterOptics
-from aqualvs.simulation.sensor import expose, spread
-from aqualvs.simulation.shading import LASER_BLUE, LASER_GREEN, LASER_RED
+from aqualvs.simulation.spectrum import COLOUR_BALANCED, ColourFilters
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,20 +98,25 @@ class PanelRenderer:
         The lasers, see `panel_sheets`; None leaves them off.
     samples : int
         Rays along each side of a pixel.
+    eye : SimulatedCamera
+        Sensor and processing; the sheets must be packed with its filters.
     """
 
     camera: Camera
     sheets: Sheets | None = None
     samples: int = 2
+    eye: SimulatedCamera = IDEAL
     _rays: CornerRays = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._rays = _corner_rays(self.camera)
 
     def render(
-        self, scene: PanelScene, rng: np.random.Generator | None = None
+        self, scene: PanelScene, rng: np.random.Generator | None = None, t: float = 0.0
     ) -> NDArray[np.uint8]:
         """Return the picture (height, width, 3), red, green, blue; without `rng` no noise.
+
+        Exposure and white balance of `eye` drift with the time `t`, in seconds.
 
         Raises
         ------
@@ -119,7 +124,7 @@ class PanelRenderer:
             If the scene has no panels.
         """
         clear = WaterOptics(forward_scatter=0.0)
-        return expose(spread(self.radiance(scene), clear, scene.sensor), scene.sensor, rng)
+        return self.eye.picture(self.radiance(scene), clear, scene.sensor, t, rng)
 
     def radiance(self, scene: PanelScene) -> NDArray[np.float32]:
         """Return what reaches the lens, float32 (height, width, 3), before blur and saturation.
@@ -130,17 +135,23 @@ class PanelRenderer:
         if not scene.panels:
             raise OptionError("a picture of no panels; give one at least")
         width, height = self.camera.size_px
-        seen = np.zeros((height, width, 2), dtype=np.float32)
-        light = scene.light
+        light, tables = scene.light, _pack(scene.panels)
         lamp = Lamp(light.lamp, light.level, light.lamp_share)
-        sheets = _dark_sheets() if self.sheets is None else self.sheets
-        render_panels(self._rays, self.samples, _pack(scene.panels), sheets, lamp, seen)
-        laser = np.array([LASER_RED, LASER_GREEN, LASER_BLUE], np.float32)
         room, veil = np.array(light.tint, np.float32), np.array(light.veil, np.float32)
-        return np.asarray(seen[..., :1] * room + seen[..., 1:] * laser + veil)
+        out = np.zeros((height, width, 3), dtype=np.float32)
+        for k, sheets in enumerate(_by_colour(self.sheets)):
+            seen = np.zeros((height, width, 2), dtype=np.float32)
+            render_panels(self._rays, self.samples, tables, sheets, lamp, seen)
+            if k == 0:
+                out += seen[..., :1] * room
+            if len(sheets.table):
+                out += seen[..., 1:] * sheets.table[0, COLOUR : COLOUR + 3].astype(np.float32)
+        return np.asarray(out + veil)
 
 
-def panel_sheets(rig: Rig, *, power: float = 8.0) -> Sheets:
+def panel_sheets(
+    rig: Rig, *, power: float = 8.0, filters: ColourFilters = COLOUR_BALANCED
+) -> Sheets:
     """Return the sheets of a rig's lasers in the rig's medium, all of one power.
 
     Raises
@@ -149,12 +160,16 @@ def panel_sheets(rig: Rig, *, power: float = 8.0) -> Sheets:
         If a laser's plane is square to the view.
     """
     sources = [replace(source, power=power) for source in default_sources(rig)]
-    return pack_sheets(rig, sources)
+    return pack_sheets(rig, sources, filters)
 
 
-def _dark_sheets() -> Sheets:
-    none = np.zeros((0, 1))
-    return Sheets(none, none, none, none, none)
+def _by_colour(sheets: Sheets | None) -> list[Sheets]:
+    """Return the sheets of each colour; one empty table where there are none."""
+    if sheets is None or not len(sheets.table):
+        none = np.zeros((0, 1))
+        return [Sheets(none, none, none, none, none)]
+    _, kind = np.unique(sheets.table[:, COLOUR : COLOUR + 3], axis=0, return_inverse=True)
+    return [Sheets(*(part[kind == k] for part in sheets)) for k in range(int(kind.max()) + 1)]
 
 
 def _corner_rays(camera: Camera) -> CornerRays:

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.optics.rig import Rig
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.culling import TILE, TileMembers, tile_members
 from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources
 from aqualvs.simulation.lit_points import LitPoints, find_lit_points, light_sheets
 from aqualvs.simulation.scene import Scene
-from aqualvs.simulation.sensor import expose, spread
 from aqualvs.simulation.shading import Light, Members, pack_light, radiance
 from aqualvs.simulation.snow import add_snow
 from aqualvs.simulation.surfaces import Surfaces, pack_surfaces
@@ -60,6 +60,8 @@ class Renderer:
         Rays along each side of a pixel: 2 means four rays a pixel.
     threads : int
         Bands of rows that are rendered at the same time; the picture does not depend on it.
+    camera : SimulatedCamera
+        Sensor and processing; where the lens is, the rig says.
 
     Raises
     ------
@@ -71,6 +73,7 @@ class Renderer:
     sources: Sequence[LaserSource] = ()
     samples: int = 2
     threads: int = 1
+    camera: SimulatedCamera = IDEAL
     _corners: "CornerRays" = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -84,7 +87,7 @@ class Renderer:
         """Return the picture at time `t` and its truth; without `rng` there is no noise."""
         surfaces, sheets = self._pack(scene, t)
         light = self._radiance(scene, t, surfaces, sheets)
-        image = expose(spread(light, scene.water, scene.sensor), scene.sensor, rng)
+        image = self.camera.picture(light, scene.water, scene.sensor, t, rng)
         return Picture(image, find_lit_points(self.rig, surfaces, sheets))
 
     def radiance(
@@ -117,7 +120,7 @@ class Renderer:
         surfaces = pack_surfaces(scene, t)
         if not scene.lasers_on:
             return surfaces, light_sheets(replace(self.rig, lasers=()), (), surfaces)
-        return surfaces, light_sheets(self.rig, self.sources, surfaces)
+        return surfaces, light_sheets(self.rig, self.sources, surfaces, self.camera.filters)
 
     def _radiance(
         self,
@@ -132,7 +135,7 @@ class Renderer:
         out = np.zeros((height, width, 3), dtype=np.float32)
         members = tile_members(camera, self.rig.size_px, surfaces)
         everything = np.arange(len(surfaces.ellipsoids), dtype=np.int64)
-        light, rays = pack_light(scene, t), self._corners
+        light, rays = pack_light(self.camera.light(scene), t), self._corners
         if where is not None:
             rays = rays.only(where)
 
@@ -142,7 +145,7 @@ class Renderer:
         edges = np.linspace(0, height, self.threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(render_band, pairwise(edges)))
-        add_snow(out, camera, scene, t, sheets)
+        add_snow(out, camera, self.camera.light(scene), t, sheets)
         return out
 
 

@@ -13,6 +13,8 @@ from aqualvs.simulation.lasers import (
     SIGMA,
     SOURCE,
     Sheets,
+    add_colour,
+    laser_attenuation,
     peak_irradiance,
     sheet_coordinates,
     through_window,
@@ -28,11 +30,10 @@ from aqualvs.simulation.surfaces import (
 from aqualvs.simulation.textures import Tiles, sample
 from aqualvs.simulation.vectors import Vec, along, dot, minus, row3, scaled, unit
 
-# How the colour filters of the sensor answer to 532 nm.
-LASER_RED, LASER_GREEN, LASER_BLUE = 0.40, 1.0, 0.27
 # Light comes down steeply, leaning towards the target.
 _UP = (0.10, -0.42, 0.90)
 _SHADOW_MARGIN = 3e-4
+_DARK = (0.0, 0.0, 0.0)
 _EVERYWHERE = 1e3
 
 
@@ -96,9 +97,9 @@ def radiance(
         p = along(o, d, hit.t)
         sun = _daylight(p, normal, light, s.tiles)
         laser = _laser_light(p, normal, s, everything, sheets, light)
-        red = albedo[0] * (light.colours[2, 0] * sun + LASER_RED * laser)
-        green = albedo[1] * (light.colours[2, 1] * sun + LASER_GREEN * laser)
-        blue = albedo[2] * (light.colours[2, 2] * sun + LASER_BLUE * laser)
+        red = albedo[0] * (light.colours[2, 0] * sun + laser[0])
+        green = albedo[1] * (light.colours[2, 1] * sun + laser[1])
+        blue = albedo[2] * (light.colours[2, 2] * sun + laser[2])
     t, row = np.inf, -1
     if near.last_bubble > near.first_bubble:
         t, row = meet_bubbles(o, d, s, near.bubbles, near.first_bubble, near.last_bubble)
@@ -106,9 +107,9 @@ def radiance(
     veil = _veil(d, light)
     path = min(hit.t, _EVERYWHERE)
     seen = (
-        _through(red, 0, path, veil, light) + LASER_RED * glow,
-        _through(green, 1, path, veil, light) + LASER_GREEN * glow,
-        _through(blue, 2, path, veil, light) + LASER_BLUE * glow,
+        _through(red, 0, path, veil, light) + glow[0],
+        _through(green, 1, path, veil, light) + glow[1],
+        _through(blue, 2, path, veil, light) + glow[2],
     )
     if t < hit.t:
         seen = _over_bubble(seen, o, d, t, row, s, everything, sheets, light)
@@ -149,9 +150,9 @@ def _daylight(p: Vec, normal: Vec, light: Light, tiles: Tiles) -> float:
 @inline_borrowing_kernel
 def _laser_light(
     p: Vec, normal: Vec, s: Surfaces, everything: IntArray, sheets: Sheets, light: Light
-) -> float:
+) -> Vec:
     """Return the laser light that a surface receives, all sheets together."""
-    total = 0.0
+    total = _DARK
     for i in range(sheets.table.shape[0]):
         off, distance, place, sigma = sheet_coordinates(p, sheets, i)
         if place < 0.0 or abs(off) > CUT * sigma:
@@ -160,8 +161,9 @@ def _laser_light(
         facing = -dot(from_source, normal)
         if facing <= 0.0 or _shadowed(p, from_source, slant, s, everything):
             continue
-        peak = peak_irradiance(distance, sigma, place, light.colours[0, 1], sheets, i)
-        total += peak * facing * np.exp(-0.5 * (off / sigma) ** 2)
+        dimmed = laser_attenuation(row3(light.colours, 0, 0), sheets, i)
+        peak = peak_irradiance(distance, sigma, place, dimmed, sheets, i)
+        total = add_colour(total, peak * facing * np.exp(-0.5 * (off / sigma) ** 2), sheets, i)
     return total
 
 
@@ -192,9 +194,9 @@ def _shadowed(p: Vec, from_source: Vec, length: float, s: Surfaces, everything: 
 
 
 @inline_borrowing_kernel
-def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> float:
+def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> Vec:
     """Light that the water in the sheets scatters into the ray, before it ends at `reach`."""
-    glow = 0.0
+    glow = _DARK
     for i in range(sheets.table.shape[0]):
         t, slope = crossing_sheet(o, d, sheets, i)
         if not 0.0 < t < reach:
@@ -202,9 +204,11 @@ def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> f
         _, distance, place, sigma = sheet_coordinates(along(o, d, t), sheets, i)
         if place < 0.0 or distance > sheets.first[i, int(place + 0.5)]:
             continue
-        peak = peak_irradiance(distance, sigma, place, light.colours[0, 1], sheets, i)
+        dimmed = laser_attenuation(row3(light.colours, 0, 0), sheets, i)
+        peak = peak_irradiance(distance, sigma, place, dimmed, sheets, i)
         thickness = np.sqrt(2.0 * np.pi) * sigma / max(abs(slope), 0.02)
-        glow += peak * thickness * light.sheet_scatter * np.exp(-light.colours[0, 1] * t)
+        seen = peak * thickness * light.sheet_scatter * np.exp(-dimmed * t)
+        glow = add_colour(glow, seen, sheets, i)
     return glow
 
 
@@ -246,12 +250,12 @@ def _over_bubble(
     cover = min(0.18 + 1.1 * rim, 0.95)
     mirrored = unit(along(d, normal, 2.0 * facing))
     sky = 0.35 + 0.55 * max(mirrored[2], 0.0) + 2.2 * max(dot(mirrored, _UP), 0.0) ** 60
-    laser = _laser_light(p, normal, s, everything, sheets, light) * (0.35 + 0.5 * rim)
+    laser = scaled(_laser_light(p, normal, s, everything, sheets, light), 0.35 + 0.5 * rim)
     veil = _veil(d, light)
     return (
-        _layer(behind[0], 0, cover, sky, LASER_RED * laser, t, veil, light),
-        _layer(behind[1], 1, cover, sky, LASER_GREEN * laser, t, veil, light),
-        _layer(behind[2], 2, cover, sky, LASER_BLUE * laser, t, veil, light),
+        _layer(behind[0], 0, cover, sky, laser[0], t, veil, light),
+        _layer(behind[1], 1, cover, sky, laser[1], t, veil, light),
+        _layer(behind[2], 2, cover, sky, laser[2], t, veil, light),
     )
 
 

@@ -7,7 +7,6 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.camera import Camera
 from aqualvs.simulation.lasers import Sheets, light_on_points
 from aqualvs.simulation.scene import Scene
-from aqualvs.simulation.shading import LASER_BLUE, LASER_GREEN, LASER_RED
 
 # Particles drift in this box in `dome` and re-enter on the other side, in metres.
 _LOW, _HIGH = np.array([-0.6, 0.12, -0.5]), np.array([0.6, 1.3, 0.5])
@@ -27,10 +26,10 @@ def add_snow(
     ahead = _before_target(points, scene)
     pixels, valid = camera.project(points[ahead])
     points, radii = points[ahead][valid], radii[ahead][valid]
-    lit = light_on_points(points, sheets, scene.water.attenuation[1])
+    lit = light_on_points(points, sheets, scene.water.attenuation)
     distance = np.linalg.norm(points, axis=-1)
     reach = np.exp(-np.outer(distance, scene.water.attenuation))
-    colour = np.array(scene.water.ambient) + np.outer(lit, [LASER_RED, LASER_GREEN, LASER_BLUE])
+    colour = np.array(scene.water.ambient) + lit
     sizes = radii / distance * _pixels_per_radian(camera)
     for pixel, size, light in zip(pixels[valid], sizes, _REFLECTANCE * colour * reach, strict=True):
         _splat(radiance, pixel, float(size), light)

@@ -1,11 +1,14 @@
 """Video files, as an ROV's recorder would write them or without any loss."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self, TypeAlias, cast
+from typing import Any, Literal, Self, TypeAlias, cast
 
 import av
+import cv2
 import numpy as np
 from av.container import OutputContainer
 from av.video.stream import VideoStream
@@ -13,11 +16,51 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError, OutputError
 
-Quality: TypeAlias = Literal["h264", "lossless"]
+Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """How a video is compressed.
+
+    Attributes
+    ----------
+    codec : {"h264", "lossless", "mjpeg"}
+        H.264 with chroma at half resolution (4:2:0), as ROVs record; lossless H.264 in RGB; or
+        every frame as a JPEG of its own (4:2:0, full range), as USB cameras send it.
+    crf : int
+        Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
+    bit_rate : int or None
+        Bits a second of "h264".
+    jpeg_quality : int
+        Of "mjpeg", 1 to 100; larger is better.
+
+    Raises
+    ------
+    OptionError
+        If a value makes no sense.
+    """
+
+    codec: Codec = "h264"
+    crf: int = 20
+    bit_rate: int | None = None
+    jpeg_quality: int = 80
+
+    def __post_init__(self) -> None:
+        if self.codec not in {"h264", "lossless", "mjpeg"}:
+            raise OptionError(f"codec is {self.codec!r}; choose h264, lossless or mjpeg")
+        if not 0 <= self.crf <= 51:
+            raise OptionError(f"crf is {self.crf}; it must lie between 0 and 51")
+        if self.bit_rate is not None and self.bit_rate <= 0:
+            raise OptionError(f"bit rate is {self.bit_rate}; it must be positive")
+        if not 1 <= self.jpeg_quality <= 100:
+            raise OptionError(f"JPEG quality is {self.jpeg_quality}; it must lie between 1 and 100")
+
 
 # First of these that the installed PyAV carries.
 _LOSSY = ("libx264", "libopenh264", "mpeg4")
 _FALLBACK_BIT_RATE = 6_000_000
+_CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 
 
 class VideoWriter:
@@ -31,12 +74,8 @@ class VideoWriter:
         Width and height of every frame.
     fps : float
         Frames a second.
-    quality : {"h264", "lossless"}
-        H.264 with chroma at half resolution (4:2:0), as ROVs record; or lossless H.264 in RGB.
-    crf : int
-        Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
-    bit_rate : int or None
-        Bits a second of "h264".
+    recording : Recording
+        How the frames are compressed.
 
     Raises
     ------
@@ -47,37 +86,33 @@ class VideoWriter:
     """
 
     def __init__(
-        self,
-        path: Path,
-        size_px: tuple[int, int],
-        fps: float,
-        *,
-        quality: Quality = "h264",
-        crf: int = 20,
-        bit_rate: int | None = None,
+        self, path: Path, size_px: tuple[int, int], fps: float, recording: Recording | None = None
     ) -> None:
-        _check(size_px, fps, quality, crf, bit_rate)
-        self._path = path
-        codec = "libx264rgb" if quality == "lossless" else _lossy_codec()
+        self._recording = Recording() if recording is None else recording
+        _check(size_px, fps, self._recording.codec)
+        self._path, self._n_frames = path, 0
+        codec = _CODECS.get(self._recording.codec) or _lossy_codec()
         try:
             self._container = av.open(str(path), "w")
             self._stream = _add_stream(self._container, codec, fps)
             self._stream.width, self._stream.height = size_px
-            self._set_quality(codec, crf, bit_rate)
+            self._set_quality(codec)
             self._container.start_encoding()
         except (OSError, ValueError, av.error.FFmpegError) as error:
             raise OutputError(f"{path}: cannot write video ({error}); {_REMEDY}") from None
 
-    def _set_quality(self, codec: str, crf: int, bit_rate: int | None) -> None:
-        stream = self._stream
+    def _set_quality(self, codec: str) -> None:
+        stream, recording = self._stream, self._recording
         stream.pix_fmt = "yuv420p"
-        if codec == "libx264rgb":
+        if codec == "mjpeg":
+            stream.pix_fmt = "yuvj420p"
+        elif codec == "libx264rgb":
             stream.pix_fmt = "rgb24"
             stream.options = {"qp": "0", "preset": "veryfast"}
-        elif codec == "libx264" and bit_rate is None:
-            stream.options = {"crf": str(crf), "preset": "veryfast"}
+        elif codec == "libx264" and recording.bit_rate is None:
+            stream.options = {"crf": str(recording.crf), "preset": "veryfast"}
         else:
-            stream.bit_rate = bit_rate or _FALLBACK_BIT_RATE
+            stream.bit_rate = recording.bit_rate or _FALLBACK_BIT_RATE
 
     def write(self, image: NDArray[np.uint8]) -> None:
         """Append one frame, uint8 RGB of shape (height, width, 3).
@@ -87,19 +122,40 @@ class VideoWriter:
         OutputError
             If the disk refuses it.
         """
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-        self._encode(frame)
+        if self._recording.codec == "mjpeg":
+            self._mux([self._jpeg_packet(image)])
+        else:
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            self._encode(frame)
+        self._n_frames += 1
 
     def close(self) -> None:
         """Write what the encoder still holds and close the file."""
         try:
-            self._encode(None)
+            if self._recording.codec != "mjpeg":
+                self._encode(None)
         finally:
             self._container.close()
 
+    def _jpeg_packet(self, image: NDArray[np.uint8]) -> "av.Packet[Any]":
+        """Return a frame as a JPEG with the standard tables, as USB cameras make it."""
+        packet = av.Packet(jpeg(image, self._recording.jpeg_quality))
+        packet.stream = self._stream
+        packet.time_base = 1 / cast(Fraction, self._stream.average_rate)
+        packet.pts = packet.dts = self._n_frames
+        packet.is_keyframe = True
+        return packet
+
     def _encode(self, frame: av.VideoFrame | None) -> None:
         try:
-            for packet in self._stream.encode(frame):
+            packets = self._stream.encode(frame)
+        except (OSError, av.error.FFmpegError) as error:
+            raise OutputError(f"{self._path}: cannot write video ({error}); {_REMEDY}") from None
+        self._mux(packets)
+
+    def _mux(self, packets: "Sequence[av.Packet[Any]]") -> None:
+        try:
+            for packet in packets:
                 self._container.mux(packet)
         except (OSError, av.error.FFmpegError) as error:
             raise OutputError(f"{self._path}: cannot write video ({error}); {_REMEDY}") from None
@@ -133,19 +189,26 @@ def _lossy_codec() -> str:
     )
 
 
-def _check(
-    size_px: tuple[int, int], fps: float, quality: str, crf: int, bit_rate: int | None
-) -> None:
-    if quality not in {"h264", "lossless"}:
-        raise OptionError(f"quality is {quality!r}; choose h264 or lossless")
-    if quality == "h264" and any(side % 2 for side in size_px):
+def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Return an RGB picture as a JPEG file with chroma at half resolution (4:2:0).
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width, 3)
+    quality : int
+        1 to 100; larger is better.
+    """
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    how += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    _, data = cv2.imencode(".jpg", image[..., ::-1], how)
+    return data.tobytes()
+
+
+def _check(size_px: tuple[int, int], fps: float, codec: Codec) -> None:
+    if codec == "h264" and any(side % 2 for side in size_px):
         raise OptionError(
             f"size is {size_px[0]}x{size_px[1]} px; 4:2:0 video needs even sides, or choose "
             "lossless"
         )
     if not 0.0 < fps <= 1000.0:
         raise OptionError(f"fps is {fps:g}; it must lie between 0 and 1000")
-    if not 0 <= crf <= 51:
-        raise OptionError(f"crf is {crf}; it must lie between 0 and 51")
-    if bit_rate is not None and bit_rate <= 0:
-        raise OptionError(f"bit rate is {bit_rate}; it must be positive")

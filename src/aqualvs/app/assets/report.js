@@ -50,12 +50,12 @@
       for (const key of keys) out[key].push(...line[key].slice(first, last + 1), null);
     return out;
   }
-  function band(line, k) {
+  function band(line, sigma) {
     const x = [], y = [];
     const middle = (i) => (line.error ? 0 : line.y[i]);
     for (const [first, last] of segments(line)) {
-      for (let i = first; i <= last; i++) { x.push(line.x[i]); y.push(middle(i) + k * line.sigma[i]); }
-      for (let i = last; i >= first; i--) { x.push(line.x[i]); y.push(middle(i) - k * line.sigma[i]); }
+      for (let i = first; i <= last; i++) { x.push(line.x[i]); y.push(middle(i) + sigma[i]); }
+      for (let i = last; i >= first; i--) { x.push(line.x[i]); y.push(middle(i) - sigma[i]); }
       x.push(null); y.push(null);
     }
     return { x, y };
@@ -94,19 +94,20 @@
         traces.push({ ...shading(chart.stretches, strip.axis), yaxis: y, type: "scatter",
           mode: "lines", fill: "toself", fillcolor: "rgba(90,100,106,0.17)", line: { width: 0 },
           hoverinfo: "skip", name: "no posture", showlegend: i === 0, legendrank: 2000 });
-      for (const [k, ink] of [[2, 0.13], [1, 0.22]])
-        traces.push({ ...band(strip, k), yaxis: y, type: "scatter", mode: "lines", fill: "toself",
+      for (const [key, ink, name] of [["total", 0.13, "±σ, frame and rig"], ["sigma", 0.22, "±σ, frame alone"]])
+        traces.push({ ...band(strip, strip[key]), yaxis: y, type: "scatter", mode: "lines", fill: "toself",
           fillcolor: `rgba(0,114,178,${ink})`, line: { width: 0 }, hoverinfo: "skip",
-          name: `±${k} σ`, showlegend: i === 0, legendgroup: `band${k}` });
+          name, showlegend: i === 0, legendgroup: `band-${key}` });
       if (strip.truth)
         traces.push({ ...lifted(strip.truth, ["x", "y"]), yaxis: y, type: "scatter", mode: "lines",
           line: { color: BLACK, width: 1.3, dash: "dash" }, name: "truth", showlegend: i === 0,
           hovertemplate: `%{y} ${strip.unit}<extra>true ${strip.name}</extra>` });
-      const line = lifted(strip, ["x", "y", "sigma", "frame"]);
+      const line = lifted(strip, ["x", "y", "sigma", "total", "frame"]);
+      const told = (s) => (s === null || s === undefined ? "?" : s.toFixed(i ? 2 : 1));
       traces.push({ x: line.x, y: line.y, yaxis: y, type: "scatter", mode: "lines",
         line: { color: BLUE, width: strip.x.length > 1000 ? 0.9 : 1.6 }, name: chart.measured, showlegend: i === 0,
-        customdata: line.sigma.map((s, k) => [s === null ? "?" : s.toFixed(i ? 2 : 1), line.frame[k]]),
-        hovertemplate: `%{y} ± %{customdata[0]} ${strip.unit} (frame %{customdata[1]})` +
+        customdata: line.total.map((s, k) => [told(s), told(line.sigma[k]), line.frame[k]]),
+        hovertemplate: `%{y} ± %{customdata[0]} ${strip.unit}, its noise ± %{customdata[1]} (frame %{customdata[2]})` +
           `<extra>${strip.name}</extra>` });
       traces.push({ ...single(strip), yaxis: y, type: "scatter", mode: "markers", hoverinfo: "skip",
         marker: { color: BLUE, size: 3.5 }, showlegend: false });

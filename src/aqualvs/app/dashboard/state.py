@@ -82,7 +82,7 @@ def _points(points: ScanPoints) -> dict[str, Any]:
 def _filtered(filtered: FilteredPosture | None) -> dict[str, float] | None:
     if filtered is None:
         return None
-    sigma = np.sqrt(filtered.covariance.diagonal()[:3])
+    sigma = np.sqrt(filtered.total_covariance.diagonal())
     return {
         "range_m": filtered.range,
         "pitch_deg": math.degrees(filtered.pitch),

@@ -6,6 +6,7 @@ from aqualvs.app.reproduce.experiment import Experiment, Outcome, Picture
 from aqualvs.app.reproduce.growth_and_sun import scene
 from aqualvs.app.reproduce.laboratory import Dive, Laboratory
 from aqualvs.app.reproduce.variants import Variant, drawn, findings, series
+from aqualvs.simulation.video import Recording
 
 _CRFS = (20, 26, 32, 38)
 _DEFAULT = 20
@@ -14,10 +15,10 @@ _DEFAULT = 20
 def _run(laboratory: Laboratory) -> Outcome:
     # The clear net of the growth experiment, whose H.264 at the default quality is there already.
     course = scene("clear")
-    raw = laboratory.dive(course, quality="lossless")
+    raw = laboratory.dive(course, recording=Recording(codec="lossless"))
     variants = [_variant(laboratory, raw, "uncompressed")]
     for crf in _CRFS:
-        dive = laboratory.dive(course, crf=crf)
+        dive = laboratory.dive(course, recording=Recording(crf=crf))
         variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == _DEFAULT))
     first, last = variants[1], variants[-1]
     return Outcome(

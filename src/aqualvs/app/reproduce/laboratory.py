@@ -22,7 +22,7 @@ from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.scenario import Scenario
-from aqualvs.simulation.video import Quality
+from aqualvs.simulation.video import Recording
 
 _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
@@ -160,8 +160,7 @@ class Laboratory:
         scenario: Scenario,
         rig: Rig | None = None,
         *,
-        quality: Quality = "h264",
-        crf: int = 20,
+        recording: Recording | None = None,
         point_frames: tuple[int, ...] = (),
     ) -> Dive:
         """Return a dive with its truth, rendered where it has not been yet.
@@ -172,14 +171,14 @@ class Laboratory:
             Its name, with a digest of everything that shapes the pictures, names the folder.
         rig : Rig, optional
             `self.rig` by default.
-        quality, crf, point_frames
+        recording, point_frames
             As in `simulate_dive`.
         """
         rig = rig or self.rig
         facts = {
             "scenario": repr(scenario),
             "rig": rig_to_mapping(rig),
-            "video": [quality, crf, list(point_frames)],
+            "video": [repr(recording or Recording()), list(point_frames)],
         }
         digest = _digest(facts)
         folder = self._work / "dives" / f"{scenario.name}-{digest}"
@@ -190,8 +189,7 @@ class Laboratory:
                 folder,
                 progress=self.rendered,
                 point_frames=point_frames,
-                quality=quality,
-                crf=crf,
+                recording=recording,
             )
             save_rig(rig, folder / _RIG)
             (folder / _READY).write_text(json.dumps(facts, default=str), encoding="utf-8")

@@ -1,49 +1,28 @@
-"""Reflections as the paper takes them: above a threshold, divided by laser, mesh-filtered."""
+"""Points as the paper's filter takes them, and reflections that either filter keeps."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from aqualvs.app.reproduce.laboratory import Dive, Laboratory
-from aqualvs.app.reproduce.point_truth import Judged, LitTruth, judge_pixels
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter
+from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.scanning.paper_filter import FilteredPoints, PaperFilter
 from aqualvs.scanning.pipeline import ScannerOptions
-from aqualvs.scanning.scan import ScanPoints
+from aqualvs.scanning.scan import Label, Scan
+from aqualvs.scanning.search import plan_searches
 from aqualvs.scanning.threshold import ThresholdOptions
 
 
-@dataclass(frozen=True, slots=True)
-class PapersPoints:
-    """Middles of bright runs across the stripes of a frame, N of them.
+def papers_pixels(
+    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions, level: int | None = None
+) -> list[FilteredPoints]:
+    """Return the bright pixels of every frame, and what the paper's filter keeps of them.
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-    points_in_dome : array, shape (N, 3)
-        In metres.
-    laser : int array, shape (N,)
-        The paper divides its picture by hand into one area for each laser; here our own
-        classification does it, which is better than such areas.
-    net : bool array, shape (N,)
-        What the paper's filter keeps.
-    """
-
-    pixels: FloatArray
-    points_in_dome: FloatArray
-    laser: IntArray
-    net: BoolArray
-
-    def judged(self, truth: LitTruth) -> Judged:
-        """Return precision and recall of the points kept."""
-        return judge_pixels(self.pixels[self.net], self.laser[self.net], truth)
-
-
-def papers_points(
-    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions
-) -> list[PapersPoints]:
-    """Return the reflections above the paper's threshold, frame by frame.
+    The paper divides its picture by hand into one area for each laser; here our own classification
+    does it, which is better than such areas.
 
     Parameters
     ----------
@@ -51,16 +30,44 @@ def papers_points(
     dive : Dive
     options : MeshFilterOptions
         Of the filter; by default those of section 5.2.
+    level : int, optional
+        Of the threshold, in grey levels.
     """
-    bright = laboratory.measure(dive, ScannerOptions(detector=ThresholdOptions()))
-    return [_filtered(scan.points, dive.rig, options) for scan in bright.scans]
+    detector = ThresholdOptions() if level is None else ThresholdOptions(level=level)
+    scans = laboratory.measure(dive, ScannerOptions(detector=detector)).scans
+    return filtered_points(scans, dive.rig, options, every_pixel=True)
 
 
-def _filtered(points: ScanPoints, rig: Rig, options: MeshFilterOptions) -> PapersPoints:
-    net = np.zeros(len(points), np.bool_)
-    for i, laser in enumerate(rig.lasers):
-        mine = points.laser == i
-        net[mine] = mesh_filter(
-            points.points_in_dome[mine], laser.plane, options, working_range=rig.working_range
-        )
-    return PapersPoints(points.pixels, points.points_in_dome, points.laser.astype(np.int64), net)
+def papers_centres(
+    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions
+) -> list[FilteredPoints]:
+    """Return the pixels of every frame, on the mesh where the paper's filter keeps their return.
+
+    The filter is given one point for each sub-pixel return, as the paper does not do it.
+    """
+    scans = laboratory.measure(dive).scans
+    centres = filtered_points(scans, dive.rig, options, every_pixel=False)
+    return _pixels(scans, dive.rig, [one.on_mesh for one in centres])
+
+
+def adaptive_pixels(scans: Sequence[Scan], rig: Rig) -> list[FilteredPoints]:
+    """Return the pixels of scans, on the mesh where their return is labelled net."""
+    return _pixels(scans, rig, [np.asarray(scan.points.label == Label.NET) for scan in scans])
+
+
+def filtered_points(
+    scans: Sequence[Scan], rig: Rig, options: MeshFilterOptions, *, every_pixel: bool
+) -> list[FilteredPoints]:
+    """Return the points of scans, and what the paper's filter keeps of them."""
+    camera = rig.camera()
+    searches = plan_searches(rig, camera)
+    papers = PaperFilter(rig, camera, searches, options, every_pixel=every_pixel)
+    return [
+        papers.apply(scan.points.pixels, scan.points.width, scan.points.laser.astype(np.int64))
+        for scan in scans
+    ]
+
+
+def _pixels(scans: Sequence[Scan], rig: Rig, kept: Sequence[BoolArray]) -> list[FilteredPoints]:
+    found = filtered_points(scans, rig, MeshFilterOptions(), every_pixel=True)
+    return [replace(one, on_mesh=mine[one.source]) for one, mine in zip(found, kept, strict=True)]

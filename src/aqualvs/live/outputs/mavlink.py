@@ -33,7 +33,8 @@ NAMES = (
     "aq_n",
 )
 """`NAMED_VALUE_FLOAT` of every sample: 1 or 0; range (mm) and angles (degrees), their standard
-deviations, and the water's refractive index. NaN where there is no posture."""
+deviations by frame and rig together, and the water's refractive index. NaN where there is no
+posture."""
 
 FILTERED_NAMES = ("aqf_valid", "aqf_range", "aqf_pitch", "aqf_yaw", "aqf_speed")
 """The same from the time filter, while it is switched on: 1 or 0, mm, degrees, and the rate of the
@@ -165,7 +166,7 @@ def _fill_distance(message: Any, time_boot_ms: int, sample: LiveSample) -> None:
     current_cm = round(100.0 * posture.range) if posture and math.isfinite(posture.range) else 0
     if posture and 0 < current_cm <= _MAX_CM:
         message.current_distance = current_cm
-        message.covariance = variance_cm2(float(posture.covariance[0, 0]))
+        message.covariance = variance_cm2(float(posture.total_covariance[0, 0]))
         message.signal_quality = signal_quality(sample.scan.points)
         return
     message.current_distance = _INVALID_CM
@@ -189,7 +190,7 @@ def _numbers(posture: Posture | Refusal, n_water: float) -> tuple[float, ...]:
     """Return what `NAMES` names."""
     if not isinstance(posture, Posture):
         return (0.0, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, n_water)
-    variance = posture.covariance
+    variance = posture.total_covariance
     return (
         1.0,
         1e3 * posture.range,

@@ -18,7 +18,7 @@ from aqualvs.live.outputs.ros_messages_diagnostics import DiagnosticsMessage, di
 from aqualvs.live.sample import LiveSample
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture, Reason
-from aqualvs.scanning.scan import ScanPoints
+from aqualvs.scanning.scan import Label, ScanPoints
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
@@ -174,11 +174,16 @@ class MessageMaker:
             yield (
                 Topic.POSTURE,
                 _pose_message(
-                    stamp, frame, posture.range, posture.pitch, posture.yaw, posture.covariance
+                    stamp,
+                    frame,
+                    posture.range,
+                    posture.pitch,
+                    posture.yaw,
+                    posture.total_covariance,
                 ),
             )
         if Topic.FILTERED in wanted and filtered is not None:
-            cov = filtered.covariance[:3, :3]
+            cov = filtered.total_covariance
             yield (
                 Topic.FILTERED,
                 _pose_message(stamp, frame, filtered.range, filtered.pitch, filtered.yaw, cov),
@@ -206,7 +211,7 @@ class MessageMaker:
             min_range=near,
             max_range=far,
             range=value,
-            variance=float(posture.covariance[0, 0]) if posture else 0.0,
+            variance=float(posture.total_covariance[0, 0]) if posture else 0.0,
         )
 
     def _diagnostics_are_due(self, sample: LiveSample) -> bool:
@@ -256,8 +261,10 @@ def _no_range(sample: LiveSample) -> float:
     """
     posture, points = sample.scan.posture, sample.scan.points
     assert not isinstance(posture, Posture)
-    if posture.reason is not Reason.OUT_OF_RANGE or not len(points):
+    # A wall behind a net that is too near may well give more points than the net.
+    to_target = points.label != Label.BACKGROUND
+    if posture.reason is not Reason.OUT_OF_RANGE or not to_target.any():
         return float("nan")
     near, far = sample.rig.working_range
-    ahead = float(np.median(points.points_in_dome[:, 1]))
+    ahead = float(np.median(points.points_in_dome[to_target, 1]))
     return float("-inf") if ahead < 0.5 * (near + far) else float("inf")

@@ -64,7 +64,10 @@ def _posture_status(sample: LiveSample) -> Status:
         told = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
         return Status(Level.WARN, name, told, rig, (("reason", str(posture.reason)),))
     pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
-    sigmas = [math.sqrt(posture.covariance[i, i]) for i in range(3)]
+    frame, whole = (
+        [math.sqrt(covariance[i, i]) for i in range(3)]
+        for covariance in (posture.covariance, posture.total_covariance)
+    )
     return Status(
         Level.OK,
         name,
@@ -74,9 +77,12 @@ def _posture_status(sample: LiveSample) -> Status:
             range_m=posture.range,
             pitch_deg=pitch,
             yaw_deg=yaw,
-            sigma_range_m=sigmas[0],
-            sigma_pitch_deg=math.degrees(sigmas[1]),
-            sigma_yaw_deg=math.degrees(sigmas[2]),
+            sigma_range_m=frame[0],
+            sigma_pitch_deg=math.degrees(frame[1]),
+            sigma_yaw_deg=math.degrees(frame[2]),
+            sigma_range_total_m=whole[0],
+            sigma_pitch_total_deg=math.degrees(whole[1]),
+            sigma_yaw_total_deg=math.degrees(whole[2]),
             slant_range_m=posture.slant_range,
             nearest_m=posture.nearest,
             n_points=posture.n_points,

@@ -30,6 +30,12 @@ _POSTURE_KEYS = (
     "curvature_z_per_m",
     "sigma_curvature_x_per_m",
     "sigma_curvature_z_per_m",
+    "sigma_range_rig_m",
+    "sigma_pitch_rig_deg",
+    "sigma_yaw_rig_deg",
+    "sigma_range_total_m",
+    "sigma_pitch_total_deg",
+    "sigma_yaw_total_deg",
 )
 _FILTERED_KEYS = (
     "filtered_range_m",
@@ -43,6 +49,9 @@ _FILTERED_KEYS = (
     "filtered_yaw_rate_deg_per_s",
     "filtered_age_s",
     "filtered_accepted",
+    "filtered_sigma_range_total_m",
+    "filtered_sigma_pitch_total_deg",
+    "filtered_sigma_yaw_total_deg",
 )
 
 
@@ -82,7 +91,6 @@ def json_fields(sample: LiveSample) -> dict[str, Value]:
 def _posture_fields(posture: Posture | None) -> dict[str, Value]:
     if posture is None:
         return dict.fromkeys(_POSTURE_KEYS)
-    sigma_range, sigma_pitch, sigma_yaw = _sigmas(posture.covariance)
     bent = (*(posture.curvature or ()), *(posture.sigma_curvature or ()))
     return dict(
         zip(
@@ -91,13 +99,13 @@ def _posture_fields(posture: Posture | None) -> dict[str, Value]:
                 _fixed(posture.range, 6),
                 _fixed(math.degrees(posture.pitch), 5),
                 _fixed(math.degrees(posture.yaw), 5),
-                _short(sigma_range),
-                _short(math.degrees(sigma_pitch)),
-                _short(math.degrees(sigma_yaw)),
+                *_sigmas(posture.covariance),
                 _fixed(posture.slant_range, 6),
                 _fixed(posture.nearest, 6),
                 posture.n_points,
                 *([_short(value) for value in bent] if len(bent) == 4 else [None] * 4),
+                *_sigmas(posture.rig_covariance),
+                *_sigmas(posture.total_covariance),
             ),
             strict=True,
         )
@@ -107,7 +115,6 @@ def _posture_fields(posture: Posture | None) -> dict[str, Value]:
 def _filtered_fields(filtered: FilteredPosture | None) -> dict[str, Value]:
     if filtered is None:
         return dict.fromkeys(_FILTERED_KEYS)
-    sigma_range, sigma_pitch, sigma_yaw = _sigmas(filtered.covariance)
     speed, pitch_rate, yaw_rate = filtered.rates.tolist()
     return dict(
         zip(
@@ -116,14 +123,13 @@ def _filtered_fields(filtered: FilteredPosture | None) -> dict[str, Value]:
                 _fixed(filtered.range, 6),
                 _fixed(math.degrees(filtered.pitch), 5),
                 _fixed(math.degrees(filtered.yaw), 5),
-                _short(sigma_range),
-                _short(math.degrees(sigma_pitch)),
-                _short(math.degrees(sigma_yaw)),
+                *_sigmas(filtered.covariance),
                 _fixed(speed, 6),
                 _fixed(math.degrees(pitch_rate), 5),
                 _fixed(math.degrees(yaw_rate), 5),
                 _fixed(filtered.age_s, 6),
                 filtered.accepted,
+                *_sigmas(filtered.total_covariance),
             ),
             strict=True,
         )
@@ -137,10 +143,11 @@ def _delay_s(sample: LiveSample) -> Value:
     return _fixed(1e-9 * (sample.instants.scanned_ns - sample.instants.arrived_ns), 6)
 
 
-def _sigmas(cov: FloatArray) -> list[float]:
-    """Return the standard deviations of the first three values; NaN for what is none."""
+def _sigmas(cov: FloatArray) -> list[Value]:
+    """Return the standard deviations of range (m), pitch and yaw (deg); None for what is none."""
     variances = np.diagonal(cov)[:3].tolist()
-    return [math.sqrt(value) if value >= 0.0 else math.nan for value in variances]
+    sigma = [math.sqrt(value) if value >= 0.0 else math.nan for value in variances]
+    return [_short(value) for value in (sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2]))]
 
 
 def _fixed(value: float, digits: int) -> Value:

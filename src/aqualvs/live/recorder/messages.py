@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.live.health import Health, PartHealth, State
 from aqualvs.live.recorder.cdr import CdrReader, CdrWriter
 from aqualvs.live.recorder.rig_record import options_text, rig_exact, rig_yaml
@@ -47,6 +48,7 @@ def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
     to.numbers("d", *_filtered_values(filtered))
     instants = sample.instants
     to.numbers("d", 1e-9 * (instants.scanned_ns - instants.arrived_ns))
+    to.numbers("d", *_rig_values(posture))
     return to.finish()
 
 
@@ -186,18 +188,33 @@ def _posture_values(posture: Posture | Refusal) -> list[float]:
     """Return nine scalars, normal, covariance and curvatures."""
     if not isinstance(posture, Posture):
         return [_NAN] * 25
-    sigma = np.sqrt(np.diagonal(posture.covariance))
     curvature = posture.curvature or (_NAN, _NAN)
     sigma_curvature = posture.sigma_curvature or (_NAN, _NAN)
     return [
         *(posture.range, math.degrees(posture.pitch), math.degrees(posture.yaw)),
-        *(sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2])),
+        *_sigmas(posture.covariance),
         *(posture.slant_range, posture.nearest, posture.rms),
         *posture.normal_in_dome,
         *np.ravel(posture.covariance),
         *curvature,
         *sigma_curvature,
     ]
+
+
+def _rig_values(posture: Posture | Refusal) -> list[float]:
+    """Return standard deviations by the rig and by both, and the covariance by the rig."""
+    if not isinstance(posture, Posture):
+        return [_NAN] * 15
+    return [
+        *_sigmas(posture.rig_covariance),
+        *_sigmas(posture.total_covariance),
+        *np.ravel(posture.rig_covariance),
+    ]
+
+
+def _sigmas(covariance: FloatArray) -> list[float]:
+    sigma = np.sqrt(np.diagonal(covariance))
+    return [sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2])]
 
 
 def _filtered_values(filtered: FilteredPosture | None) -> list[float]:

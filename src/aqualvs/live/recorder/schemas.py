@@ -54,7 +54,7 @@ float64 rms_m
 float64 n_water
 # Unit normal of the target in the frame dome, pointing away from the vehicle.
 float64[3] normal
-# Of range, pitch and yaw, in m and rad, row by row.
+# Of range, pitch and yaw by the noise of the frame, in m and rad, row by row.
 float64[9] covariance
 # Of a curved net, along the horizontal and the vertical.
 float64[2] curvature_per_m
@@ -73,6 +73,14 @@ float64 filtered_yaw_rate_deg_per_s
 float64 filter_age_s
 # From the decoded picture to the measured one.
 float64 delay_s
+# By the uncertainty of the rig, which is common to all frames; and by both together.
+float64 sigma_range_rig_m
+float64 sigma_pitch_rig_deg
+float64 sigma_yaw_rig_deg
+float64 sigma_range_total_m
+float64 sigma_pitch_total_deg
+float64 sigma_yaw_total_deg
+float64[9] rig_covariance
 """
 
 _STRIPES = """\

@@ -82,9 +82,9 @@ function take(message) {
   const valid = posture.valid === "1";
   const time = message.utc_ms / 1000;
   const number = (text) => (valid ? Number(text) : null);
-  strips.range.add(time, number(posture.range_m), Number(posture.sigma_range_m), setpoint && setpoint.range_m);
-  strips.yaw.add(time, number(posture.yaw_deg), Number(posture.sigma_yaw_deg), setpoint && setpoint.yaw_deg);
-  strips.pitch.add(time, number(posture.pitch_deg), Number(posture.sigma_pitch_deg), null);
+  strips.range.add(time, number(posture.range_m), Number(posture.sigma_range_total_m), setpoint && setpoint.range_m);
+  strips.yaw.add(time, number(posture.yaw_deg), Number(posture.sigma_yaw_total_deg), setpoint && setpoint.yaw_deg);
+  strips.pitch.add(time, number(posture.pitch_deg), Number(posture.sigma_pitch_total_deg), null);
   dirty = true;
 }
 
@@ -125,7 +125,7 @@ function numbers(stale) {
   const valid = posture.valid === "1" && !stale;
   const box = $("numbers");
   box.dataset.valid = valid ? "1" : "0";
-  Object.assign(box.dataset, { frame: posture.frame, range: posture.range_m, yaw: posture.yaw_deg, pitch: posture.pitch_deg, sigma: posture.sigma_range_m });
+  Object.assign(box.dataset, { frame: posture.frame, range: posture.range_m, yaw: posture.yaw_deg, pitch: posture.pitch_deg, sigma: posture.sigma_range_total_m });
   const put = (id, text, digits, sign) => {
     const value = Number(text);
     $(id).textContent = valid ? (sign && value >= 0 ? "+" : "") + value.toFixed(digits) : "–";
@@ -133,9 +133,9 @@ function numbers(stale) {
   put("range", posture.range_m, 3, false);
   put("yaw", posture.yaw_deg, 1, true);
   put("pitch", posture.pitch_deg, 1, true);
-  $("sigma-range").textContent = valid ? `± ${(1000 * posture.sigma_range_m).toFixed(1)} mm` : "";
-  $("sigma-yaw").textContent = valid ? `± ${Number(posture.sigma_yaw_deg).toFixed(2)}°` : "";
-  $("sigma-pitch").textContent = valid ? `± ${Number(posture.sigma_pitch_deg).toFixed(2)}°` : "";
+  $("sigma-range").textContent = valid ? `± ${(1000 * posture.sigma_range_total_m).toFixed(1)} mm` : "";
+  $("sigma-yaw").textContent = valid ? `± ${Number(posture.sigma_yaw_total_deg).toFixed(2)}°` : "";
+  $("sigma-pitch").textContent = valid ? `± ${Number(posture.sigma_pitch_total_deg).toFixed(2)}°` : "";
   const words = stale ? "no news from the system" : state.detail || posture.reason;
   $("reason").textContent = valid ? "" : `No posture: ${words}`;
   const dead = stale || posture.reason === "no_frames";

@@ -1,0 +1,455 @@
+"""What a rig's own uncertainty makes of a posture: the part of its error that all frames share.
+
+A surface is fitted by weighted least squares to points on the lasers' sheets. An error of a rig's
+parameter moves the ray of a pixel, or the sheet that it meets, and so the point: by dX, of which
+
+    s·dX = q·(dp + t dv) - (s·v)/(g·v) df,    q = s - (s·v)/(g·v) g,
+
+leads off the surface, where s is the surface's normal, p + t v the ray, f the signed distance from
+the sheet and g its gradient. The fit answers with dc = (sum w a a^T)^-1 sum w a (s·dX), a being the
+terms of its coefficients c (for the plane m·X = 1: X itself), and range, pitch and yaw follow
+(paper, Eq. 23-26). Errors of a rig are smooth over the picture: derivatives of rays are taken once
+per rig on a lattice of pixels, and a few pixels stand for each stripe.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.cholesky import factorise, solve_factorised
+from aqualvs.geometry.compiled import kernel
+from aqualvs.optics.camera import Camera, parameter_names
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import packed_sheets, sheets_of
+from aqualvs.optics.sheet_kernels import sheet_distance, sheet_tangent
+from aqualvs.optics.uncertainty import RigUncertainty
+
+# Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
+_LATTICE = (33, 25)
+# Stretches of stripe that stand for all of it: in all, and of each laser at least.
+_BINS, _LEAST_BINS = 24, 3
+# Points that are summed at least, where there are as many.
+_ENOUGH = 384
+# A pivot below this share of its diagonal is rounding, not information.
+_LEAST_PIVOT = 1e-12
+# Central differences: this share of a sigma, and no more than this in any unit.
+_STEP_SHARE, _LARGEST_STEP = 0.1, 1e-4
+
+
+class FittedSurface(NamedTuple):
+    """A surface with K coefficients that was fitted to N points.
+
+    Attributes
+    ----------
+    terms : array, shape (N, K)
+        What the coefficients are multiplied by at each point.
+    prior : array, shape (K,)
+        Information on each coefficient that is not the points'.
+    normal : array, shape (3,), bend : array, shape (3, 3)
+        The gradient at X of what is fitted to zero is `normal + bend @ X`.
+    posture : array, shape (3, K)
+        Derivatives of range, pitch and yaw by the coefficients.
+    """
+
+    terms: FloatArray
+    prior: FloatArray
+    normal: FloatArray
+    bend: FloatArray
+    posture: FloatArray
+
+
+def fitted_plane(m: FloatArray, points: FloatArray) -> FittedSurface:
+    """Return the plane m·X = 1 as it is fitted to points (N, 3)."""
+    posture = np.empty((3, 3))
+    posture_by_plane(m, posture)
+    # A point that moves along m makes m shorter.
+    return FittedSurface(points, np.zeros(3), m, np.zeros((3, 3)), -posture)
+
+
+class StripeSums(NamedTuple):
+    """Stripes on a surface with K coefficients, summed over short stretches, B of them.
+
+    Attributes
+    ----------
+    pixels, points : array, shape (B, 2), (B, 3)
+        Weighted means.
+    laser : int array, shape (B,)
+        Index of the laser.
+    pulls : array, shape (B, K)
+        Weighted sum of the terms.
+    matrix : array, shape (K, K)
+        Normal matrix of the fit; only its lower half.
+    """
+
+    pixels: FloatArray
+    points: FloatArray
+    laser: IntArray
+    pulls: FloatArray
+    matrix: FloatArray
+
+
+class _SheetMoves(NamedTuple):
+    """Sheets, and where an uncertain parameter moves them; those of laser i are a range of rows."""
+
+    sheets: FloatArray
+    first: IntArray
+    column: IntArray
+    ahead: FloatArray
+    behind: FloatArray
+    step: FloatArray
+
+
+class _Lattice(NamedTuple):
+    """Rays and their derivatives on a lattice.
+
+    `table`, shape (H, W, 1 + C, 6), holds origin and direction of a ray, then their derivatives by
+    the camera's uncertain parameters; `scale`, shape (2,), leads from pixels to places on it.
+    """
+
+    table: FloatArray
+    scale: FloatArray
+
+
+class PostureErrors:
+    """Propagates the uncertainty of one rig to range, pitch and yaw.
+
+    Parameters
+    ----------
+    rig : Rig
+        With lasers.
+    camera : Camera
+        Of the rig, behind its dome or bare.
+    uncertainty : RigUncertainty
+        Numbers that it does not name are exact.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Numbers of the rig that have an uncertainty, P of them.
+    covariance : array, shape (P, P)
+        Theirs.
+    """
+
+    def __init__(self, rig: Rig, camera: Camera, uncertainty: RigUncertainty) -> None:
+        sigmas = uncertainty.sigmas
+        self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
+        self.covariance = uncertainty.of(self.names)
+        steps = {name: min(_STEP_SHARE * sigmas[name], _LARGEST_STEP) for name in self.names}
+        self._camera = camera
+        self._n_lasers = len(rig.lasers)
+        self._moves = _sheet_moves(rig, camera, steps)
+        own = parameter_names(camera)
+        self._camera_columns = np.array(
+            [i for i, name in enumerate(self.names) if name in own], np.int64
+        )
+        self._camera_steps = [(own.index(name), steps[name]) for name in self.names if name in own]
+        self._lattice = self._derivatives_on_lattice()
+
+    def covariance_of(
+        self,
+        surface: FittedSurface,
+        pixels: FloatArray,
+        laser: IntArray,
+        points: FloatArray,
+        weights: FloatArray,
+    ) -> FloatArray:
+        """Return what the rig makes of a posture, shape (3, 3): (range, pitch, yaw) in m and rad.
+
+        Parameters
+        ----------
+        surface : FittedSurface
+            That the posture is of.
+        pixels, laser, points, weights : array, shape (N, 2), (N,), (N, 3), (N,)
+            What it was fitted to, ordered along the stripes; weights are 1 over the variance of
+            what is fitted to zero, or 0.
+        """
+        found = np.zeros((3, 3))
+        if len(self.names):
+            jacobian = self.jacobian(surface, self.sums(surface, pixels, laser, points, weights))
+            _propagate(jacobian, self.covariance, found)
+        return found
+
+    def sums(
+        self,
+        surface: FittedSurface,
+        pixels: FloatArray,
+        laser: IntArray,
+        points: FloatArray,
+        weights: FloatArray,
+        each: int | None = None,
+    ) -> StripeSums:
+        """Return a few stretches that stand for stripes; parameters as in `covariance_of`.
+
+        `each` is how many of them a laser gets at most.
+        """
+        each = each or max(_LEAST_BINS, -(-_BINS // max(self._n_lasers, 1)))
+        room, k = each * self._n_lasers, len(surface.prior)
+        sums = StripeSums(
+            np.zeros((room, 2)),
+            np.zeros((room, 3)),
+            np.zeros(room, np.int64),
+            np.zeros((room, k)),
+            np.diag(surface.prior),
+        )
+        n = _sum_up(pixels, laser, points, weights, surface.terms, self._n_lasers, each, *sums)
+        return StripeSums(
+            sums.pixels[:n], sums.points[:n], sums.laser[:n], sums.pulls[:n], sums.matrix
+        )
+
+    def jacobian(self, surface: FittedSurface, sums: StripeSums) -> FloatArray:
+        """Return the derivatives (3, P) of range, pitch and yaw by the rig's parameters.
+
+        NaN where the points do not determine the surface.
+        """
+        found, moves = np.empty((3, len(self.names))), self._moves
+        _jacobian(
+            surface.normal,
+            surface.bend,
+            surface.posture,
+            *sums,
+            *self._lattice,
+            moves.sheets,
+            moves.first,
+            moves.column,
+            moves.ahead,
+            moves.behind,
+            moves.step,
+            self._camera_columns,
+            found,
+        )
+        return found
+
+    def _derivatives_on_lattice(self) -> "_Lattice":
+        width, height = self._camera.size_px
+        n_x, n_y = _LATTICE
+        x, y = np.meshgrid(np.linspace(0, width - 1, n_x), np.linspace(0, height - 1, n_y))
+        pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+        rays = self._camera.rays(pixels)
+        rows = [np.concatenate([rays.origins, rays.directions], axis=-1)]
+        n_parameters = len(parameter_names(self._camera))
+        for place, h in self._camera_steps:
+            step = np.zeros(n_parameters)
+            step[place] = h
+            ahead, behind = (self._camera.moved_by(s).rays(pixels) for s in (step, -step))
+            by_origin = (ahead.origins - behind.origins) / (2.0 * h)
+            by_direction = (ahead.directions - behind.directions) / (2.0 * h)
+            rows.append(np.concatenate([by_origin, by_direction], axis=-1))
+        table = np.stack(rows, axis=1)
+        _fill_blind(table, pixels)
+        scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
+        return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
+
+
+def _fill_blind(table: FloatArray, pixels: FloatArray) -> None:
+    """Give nodes that see nothing the values of the nearest one that does."""
+    seen = np.isfinite(table).all(axis=(1, 2))
+    if not seen.any():
+        table[:] = 0.0
+        return
+    for i in np.flatnonzero(~seen):
+        nearest = np.argmin(np.sum((pixels[seen] - pixels[i]) ** 2, axis=-1))
+        table[i] = table[np.flatnonzero(seen)[nearest]]
+
+
+def _sheet_moves(rig: Rig, camera: Camera, steps: dict[str, float]) -> _SheetMoves:
+    column = {name: i for i, name in enumerate(steps)}
+    ahead, behind, columns, sizes, first = [], [], [], [], [0]
+    for laser, sheet in zip(rig.lasers, sheets_of(rig), strict=True):
+        own = sheet.parameter_names
+        full = [name if name == "n_water" else f"{laser.name}:{name}" for name in own]
+        for i, name in enumerate(full):
+            if name not in column:
+                continue
+            step = np.zeros(len(own))
+            step[i] = steps[name]
+            ahead.append(sheet.moved_by(step).packed())
+            behind.append(sheet.moved_by(-step).packed())
+            columns.append(column[name])
+            sizes.append(2.0 * steps[name])
+        first.append(len(columns))
+    sheets = packed_sheets(rig, camera)
+    shape = (-1, sheets.shape[1])
+    return _SheetMoves(
+        sheets,
+        np.array(first, np.int64),
+        np.array(columns, np.int64),
+        np.array(ahead, np.float64).reshape(shape),
+        np.array(behind, np.float64).reshape(shape),
+        np.array(sizes, np.float64),
+    )
+
+
+@kernel
+def _sum_up(
+    pixels: FloatArray,
+    laser: IntArray,
+    points: FloatArray,
+    weights: FloatArray,
+    terms: FloatArray,
+    n_lasers: int,
+    each: int,
+    mean_pixels: FloatArray,
+    mean_points: FloatArray,
+    owner: IntArray,
+    pulls: FloatArray,
+    matrix: FloatArray,
+) -> int:
+    """Write sums over runs of equally many points, `each` runs of a laser at most; their count.
+
+    Of many points every second or third speaks for its neighbours.
+    """
+    chosen, n_chosen = np.empty(laser.shape[0], np.int64), 0
+    for i in range(laser.shape[0]):
+        chosen[n_chosen] = i
+        n_chosen += weights[i] > 0.0
+    stride = max(1, n_chosen // _ENOUGH)
+    share, n_terms = np.zeros(n_lasers), terms.shape[1]
+    for c in range(0, n_chosen, stride):
+        share[laser[chosen[c]]] += 1.0
+    for own in range(n_lasers):
+        share[own] = each / share[own] if share[own] > 0.0 else 0.0
+    done, total = np.zeros(n_lasers), np.zeros(owner.shape[0])
+    for c in range(0, n_chosen, stride):
+        i = chosen[c]
+        own, w = laser[i], weights[i]
+        run = own * each + min(int(done[own] * share[own]), each - 1)
+        done[own] += 1.0
+        total[run] += w
+        for j in range(2):
+            mean_pixels[run, j] += w * pixels[i, j]
+        for j in range(3):
+            mean_points[run, j] += w * points[i, j]
+        for j in range(n_terms):
+            part = w * terms[i, j]
+            pulls[run, j] += part
+            for k in range(j + 1):
+                matrix[j, k] += part * terms[i, k]
+    n = 0
+    for run in range(total.shape[0]):
+        if total[run] > 0.0:
+            for j in range(2):
+                mean_pixels[n, j] = mean_pixels[run, j] / total[run]
+            for j in range(3):
+                mean_points[n, j] = mean_points[run, j] / total[run]
+            for j in range(n_terms):
+                pulls[n, j] = pulls[run, j]
+            owner[n] = run // each
+            n += 1
+    return n
+
+
+@kernel
+def _propagate(jacobian: FloatArray, covariance: FloatArray, out: FloatArray) -> None:
+    """Add J C J^T (3, 3) to `out`."""
+    n = covariance.shape[0]
+    for i in range(3):
+        for p in range(n):
+            passed = 0.0
+            for k in range(n):
+                passed += jacobian[i, k] * covariance[k, p]
+            for j in range(3):
+                out[i, j] += passed * jacobian[j, p]
+
+
+@kernel
+def _jacobian(
+    normal: FloatArray,
+    bend: FloatArray,
+    posture: FloatArray,
+    pixels: FloatArray,
+    points: FloatArray,
+    laser: IntArray,
+    pulls: FloatArray,
+    matrix: FloatArray,
+    table: FloatArray,
+    scale: FloatArray,
+    sheets: FloatArray,
+    first: IntArray,
+    column: IntArray,
+    ahead: FloatArray,
+    behind: FloatArray,
+    step: FloatArray,
+    camera_columns: IntArray,
+    out: FloatArray,
+) -> None:
+    """Write the derivatives (3, P) of range, pitch and yaw by the rig's parameters."""
+    # Bundled here: every call from outside with a named tuple would keep some memory for good.
+    sums, lattice = StripeSums(pixels, points, laser, pulls, matrix), _Lattice(table, scale)
+    moves = _SheetMoves(sheets, first, column, ahead, behind, step)
+    n, n_terms = out.shape[1], sums.pulls.shape[1]
+    factor, gain, slopes = np.empty((n_terms, n_terms)), posture.copy(), np.empty(n)
+    scratch = np.empty(15)
+    if not factorise(sums.matrix, 0.0, _LEAST_PIVOT, factor):
+        out[:] = np.nan
+        return
+    out[:] = 0.0
+    for i in range(3):
+        solve_factorised(factor, gain[i], gain[i])
+    for b in range(sums.laser.shape[0]):
+        _write_slopes(normal, bend, sums, b, lattice, moves, camera_columns, scratch, slopes)
+        for i in range(3):
+            pull = 0.0
+            for j in range(n_terms):
+                pull += gain[i, j] * sums.pulls[b, j]
+            for p in range(n):
+                out[i, p] += pull * slopes[p]
+
+
+@kernel
+def _write_slopes(
+    normal: FloatArray,
+    bend: FloatArray,
+    sums: StripeSums,
+    b: int,
+    lattice: _Lattice,
+    moves: _SheetMoves,
+    camera_columns: IntArray,
+    scratch: FloatArray,
+    slopes: FloatArray,
+) -> None:
+    """Write by how much each parameter moves one stretch of stripe off the surface, s·dX."""
+    table, own = lattice.table, sums.laser[b]
+    place_x = min(max(sums.pixels[b, 0] * lattice.scale[0], 0.0), table.shape[1] - 1.0)
+    place_y = min(max(sums.pixels[b, 1] * lattice.scale[1], 0.0), table.shape[0] - 1.0)
+    ix, iy = min(int(place_x), table.shape[1] - 2), min(int(place_y), table.shape[0] - 2)
+    sx, sy = place_x - ix, place_y - iy
+    w00, w01, w10, w11 = (1 - sy) * (1 - sx), (1 - sy) * sx, sy * (1 - sx), sy * sx
+    a00, a01, a10, a11 = table[iy, ix], table[iy, ix + 1], table[iy + 1, ix], table[iy + 1, ix + 1]
+    ray, s, lever = scratch[:6], scratch[6:9], scratch[9:]
+    for j in range(6):
+        ray[j] = w00 * a00[0, j] + w01 * a01[0, j] + w10 * a10[0, j] + w11 * a11[0, j]
+    x, y, z = sums.points[b, 0], sums.points[b, 1], sums.points[b, 2]
+    for j in range(3):
+        s[j] = normal[j] + bend[j, 0] * x + bend[j, 1] * y + bend[j, 2] * z
+    t = (x - ray[0]) * ray[3] + (y - ray[1]) * ray[4] + (z - ray[2]) * ray[5]
+    _, gx, gy, gz = sheet_tangent(moves.sheets[own], x, y, z)
+    approach = s[0] * ray[3] + s[1] * ray[4] + s[2] * ray[5]
+    ratio = approach / (gx * ray[3] + gy * ray[4] + gz * ray[5])
+    lever[0], lever[1], lever[2] = s[0] - ratio * gx, s[1] - ratio * gy, s[2] - ratio * gz
+    for j in range(3):
+        lever[3 + j] = t * lever[j]
+    slopes[:] = 0.0
+    for c in range(camera_columns.shape[0]):
+        slope = 0.0
+        for j in range(6):
+            moved = w00 * a00[c + 1, j] + w01 * a01[c + 1, j]
+            moved += w10 * a10[c + 1, j] + w11 * a11[c + 1, j]
+            slope += lever[j] * moved
+        slopes[camera_columns[c]] = slope
+    for k in range(moves.first[own], moves.first[own + 1]):
+        ahead = sheet_distance(moves.ahead[k], x, y, z)
+        behind = sheet_distance(moves.behind[k], x, y, z)
+        slopes[moves.column[k]] -= ratio * (ahead - behind) / moves.step[k]
+
+
+@kernel
+def posture_by_plane(m: FloatArray, out: FloatArray) -> None:
+    """Write the derivatives (3, 3) of (range, pitch, yaw) by m (paper, Eq. 25-26)."""
+    x, y, z = m[0], m[1], m[2]
+    yz, xy, square = y * y + z * z, x * x + y * y, x * x + y * y + z * z
+    out[:] = 0.0
+    for k in range(3):
+        out[0, k] = -m[k] / (np.sqrt(square) * square)
+    out[1, 1], out[1, 2] = -z / yz, y / yz
+    out[2, 0], out[2, 1] = y / xy, -x / xy

@@ -1,0 +1,385 @@
+"""Cameras by name: what a real one makes of the light, from the lens to the recorded frame.
+
+`ideal` is a camera without faults: daylight as it is, a tone curve, noise, H.264 at high quality.
+The others add what real pictures of laser lines have and rendered ones lack: filters that let a
+green laser into red and blue, cores that clip to cyan and white inside a green halo, a mosaic of
+colours, sharpening, exposure and white balance that drift, and little room in the file.
+
+The order of the steps is that of a camera: lens, exposure, noise, full scale of the pixels, mosaic,
+white balance, colour correction, tone curve, sharpening, chroma, compression.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.simulation.scene import Scene, Sensor, Vector, WaterOptics
+from aqualvs.simulation.sensor import expose, spread
+from aqualvs.simulation.spectrum import COLOUR_BALANCED, LUMA, ColourFilters
+from aqualvs.simulation.video import Recording
+
+Rgb = NDArray[np.float32]
+
+# Full scale of the sensor in counts, as its converter has it (12 bits).
+_COUNTS = 4095.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drift:
+    """A control loop that is never quite still: a slow swing and a faster, smaller one.
+
+    Attributes
+    ----------
+    swing : float
+        Relative amplitude of the gain, 0.1 for 10 %.
+    period_s : float
+        Of the slow swing, in seconds.
+    phase : float
+        Of the slow swing at time 0, in turns.
+    """
+
+    swing: float = 0.0
+    period_s: float = 10.0
+    phase: float = 0.0
+
+    def at(self, t: float) -> float:
+        """Return the factor on the gain at a time in seconds."""
+        turns = t / self.period_s + self.phase
+        slow, fast = np.sin(2.0 * np.pi * turns), np.sin(2.0 * np.pi * 3.7 * turns)
+        return float(1.0 + self.swing * (0.8 * slow + 0.2 * fast))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Development:
+    """What happens between the lens and the recorder of a camera that is not ideal.
+
+    Attributes
+    ----------
+    lamp : (float, float, float)
+        Radiance of a white surface in the light of the camera's own lamps, which lights the whole
+        view evenly: added to the daylight of the water.
+    defocus_px : float
+        Standard deviation of the blur of lens and pixels, in pixels.
+    flare : float
+        Share of the light that the lens spreads over a halo.
+    flare_px : float
+        Standard deviation of that halo, in pixels.
+    exposure : float
+        Mean grey (0 to 1, linear) that automatic exposure aims at.
+    gains : (float, float)
+        Least and greatest gain that it sets.
+    exposure_drift, red_drift, blue_drift : Drift
+        How the gain of all and the balance of red and of blue wander.
+    white_balance : float
+        How far automatic white balance goes towards a picture whose mean is grey, 0 to 1.
+    read_noise : float
+        Standard deviation in the dark, of full scale at gain 1.
+    shot_noise : float
+        Variance of the noise per unit of light, of full scale squared at gain 1.
+    mosaic : bool
+        One colour a pixel (Bayer, red top left), the others interpolated between neighbours.
+    gamma : float
+        Grey level = light**(1 / gamma), before `contrast`.
+    contrast : float
+        Strength of an S over that, 0 to 1: darker shadows, lights that reach white earlier.
+    black : float
+        Grey level of no light, of full scale.
+    sharpening : float
+        Strength of the unsharp mask on luma.
+    sharpening_px : (float, float)
+        Its standard deviations along x and y, in pixels; 0 leaves a direction alone.
+    chroma_px : (float, float)
+        Blur of chroma along x and y, in pixels: noise reduction, or bandwidth.
+    """
+
+    lamp: Vector = (0.0, 0.0, 0.0)
+    defocus_px: float = 0.75
+    flare: float = 0.02
+    flare_px: float = 12.0
+    exposure: float = 0.22
+    gains: tuple[float, float] = (0.25, 4.0)
+    exposure_drift: Drift = Drift()
+    red_drift: Drift = Drift()
+    blue_drift: Drift = Drift()
+    white_balance: float = 0.6
+    read_noise: float = 0.004
+    shot_noise: float = 1.5e-4
+    mosaic: bool = True
+    gamma: float = 2.0
+    contrast: float = 0.0
+    black: float = 0.0
+    sharpening: float = 0.0
+    sharpening_px: tuple[float, float] = (1.0, 1.0)
+    chroma_px: tuple[float, float] = (0.0, 0.0)
+
+    def develop(
+        self,
+        radiance: Rgb,
+        water: WaterOptics,
+        filters: ColourFilters,
+        t: float,
+        rng: np.random.Generator | None,
+    ) -> NDArray[np.uint8]:
+        """Return the picture (height, width, 3), red, green, blue, before it is compressed.
+
+        Parameters
+        ----------
+        radiance : float32 array, shape (height, width, 3)
+            Before the lens, in the bands of `ColourFilters`; black where no light comes through.
+        water : WaterOptics
+            Its halo.
+        filters : ColourFilters
+            Of the sensor.
+        t : float
+            In seconds; exposure and white balance drift with it.
+        rng : Generator or None
+            None leaves noise out.
+        """
+        lens = Sensor(defocus_px=self.defocus_px)
+        light = spread(radiance, water, lens)
+        flare = WaterOptics(forward_scatter=self.flare, halo_px=self.flare_px)
+        light = spread(light, flare, replace(lens, defocus_px=0.0))
+        raw = _mixed(light, filters.crosstalk)
+        gain, balance = self._gains(raw, t)
+        raw = self._read_out(raw, gain, rng)
+        if self.mosaic:
+            raw = _through_mosaic(raw)
+        # The least of the three gains is 1, so that a clipped pixel is white.
+        raw = np.minimum(raw * (balance / balance.min()), 1.0).astype(np.float32)
+        raw = np.clip(_mixed(raw, filters.correcting), 0.0, 1.0)
+        return self._finish(self._toned(raw))
+
+    def _gains(self, raw: Rgb, t: float) -> tuple[float, FloatArray]:
+        """Return the gain of all colours and those of red, green and blue, from the mean picture.
+
+        What is far above full scale counts as full scale: a meter sees no more.
+        """
+        lit = raw.max(axis=2) > 0.0
+        means = np.minimum(raw[lit], 1.0).mean(axis=0) if lit.any() else np.ones(3)
+        means = np.maximum(means, 1e-3).astype(np.float64)
+        gain = np.clip(self.exposure / means.mean(), *self.gains) * self.exposure_drift.at(t)
+        balance = (means[1] / means) ** self.white_balance
+        balance *= [self.red_drift.at(t), 1.0, self.blue_drift.at(t)]
+        return float(gain), balance
+
+    def _read_out(self, raw: Rgb, gain: float, rng: np.random.Generator | None) -> Rgb:
+        """Return light times gain with its noise, cut at the full scale of the pixels."""
+        if rng is not None:
+            variance = np.maximum(raw, 0.0) * np.float32(self.shot_noise)
+            variance += np.float32(self.read_noise**2)
+            noise = np.sqrt(variance) * rng.standard_normal(raw.shape, dtype=np.float32)
+            raw = np.asarray(raw + noise, dtype=np.float32)
+        return np.asarray(np.clip(raw * np.float32(gain), 0.0, 1.0), dtype=np.float32)
+
+    def _toned(self, linear: Rgb) -> Rgb:
+        grey = linear ** np.float32(1.0 / self.gamma)
+        grey += np.float32(self.contrast) * (grey * grey * (3.0 - 2.0 * grey) - grey)
+        return np.asarray(self.black + (1.0 - self.black) * grey, dtype=np.float32)
+
+    def _finish(self, grey: Rgb) -> NDArray[np.uint8]:
+        """Sharpen the luma, blur the chroma, and round to 8 bits."""
+        luma = cv2.transform(grey, LUMA[None].astype(np.float32))
+        chroma = _blurred(grey - luma[..., None], self.chroma_px)
+        if self.sharpening > 0.0:
+            luma = luma + np.float32(self.sharpening) * (luma - _blurred(luma, self.sharpening_px))
+        return np.asarray(np.rint(255.0 * np.clip(chroma + luma[..., None], 0.0, 1.0)), np.uint8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedCamera:
+    """A camera to take simulated pictures with.
+
+    Attributes
+    ----------
+    name : str
+        As `aqualvs simulate --camera` takes it.
+    about : str
+        One line for lists.
+    filters : ColourFilters
+        How its sensor answers to daylight and lasers.
+    development : Development or None
+        None takes what the scene says of its sensor, and nothing else.
+    recording : Recording
+        How its videos are compressed.
+    still_quality : int or None
+        JPEG quality (0 to 100) of its single pictures; None writes them as PNG.
+    """
+
+    name: str
+    about: str
+    filters: ColourFilters = COLOUR_BALANCED
+    development: Development | None = None
+    recording: Recording = field(default_factory=Recording)
+    still_quality: int | None = None
+
+    def light(self, scene: Scene) -> Scene:
+        """Return a scene with the camera's own lamps on."""
+        if self.development is None or not any(self.development.lamp):
+            return scene
+        both = np.add(scene.water.ambient, self.development.lamp)
+        ambient = float(both[0]), float(both[1]), float(both[2])
+        return replace(scene, water=replace(scene.water, ambient=ambient))
+
+    def picture(
+        self,
+        radiance: Rgb,
+        water: WaterOptics,
+        sensor: Sensor,
+        t: float = 0.0,
+        rng: np.random.Generator | None = None,
+    ) -> NDArray[np.uint8]:
+        """Return the picture (height, width, 3), red, green, blue, before it is compressed.
+
+        Parameters
+        ----------
+        radiance : float32 array, shape (height, width, 3)
+            What reaches the lens, rendered with this camera's `filters`.
+        water : WaterOptics
+            Its halo.
+        sensor : Sensor
+            The scene's; only the ideal camera has it.
+        t : float
+            Time in seconds.
+        rng : Generator, optional
+            Source of noise; none without it.
+        """
+        if self.development is None:
+            return expose(spread(radiance, water, sensor), sensor, rng)
+        return self.development.develop(radiance, water, self.filters, t, rng)
+
+
+def _mixed(image: Rgb, matrix: FloatArray) -> Rgb:
+    return np.asarray(cv2.transform(image, matrix.astype(np.float32)))
+
+
+def _blurred(image: Rgb, sigmas: tuple[float, float]) -> Rgb:
+    """Return a picture blurred along x and y; a sigma of 0 leaves a direction alone."""
+    if not any(sigmas):
+        return image
+    kernels = [_bell(sigma) for sigma in sigmas]
+    return np.asarray(cv2.sepFilter2D(image, -1, kernels[0], kernels[1]))
+
+
+def _bell(sigma: float) -> NDArray[np.float32]:
+    if sigma <= 0.0:
+        return np.ones(1, np.float32)
+    return np.asarray(cv2.getGaussianKernel(2 * int(np.ceil(3.0 * sigma)) + 1, sigma, cv2.CV_32F))
+
+
+def _through_mosaic(raw: Rgb) -> Rgb:
+    """Keep one colour a pixel, and interpolate the others (OpenCV's bilinear demosaicing)."""
+    counts = np.rint(raw * np.float32(_COUNTS)).astype(np.uint16)
+    mosaic = counts[..., 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = counts[::2, ::2, 0], counts[1::2, 1::2, 2]
+    # OpenCV names the pattern by the second row's second and third pixel.
+    colours = cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB)
+    return np.asarray(colours.astype(np.float32) / np.float32(_COUNTS))
+
+
+IDEAL = SimulatedCamera(
+    name="ideal", about="no faults but blur, noise and a full scale; H.264 at high quality"
+)
+
+WEBCAM = SimulatedCamera(
+    name="webcam",
+    about="cheap USB camera: crosstalk, sharpening, drifting white balance and exposure, MJPEG",
+    filters=ColourFilters(at_green=(0.02, 1.0, 0.63), saturation=0.5),
+    development=Development(
+        defocus_px=0.7,
+        flare=0.015,
+        exposure=0.20,
+        exposure_drift=Drift(swing=0.12, period_s=7.0),
+        red_drift=Drift(swing=0.10, period_s=11.0, phase=0.2),
+        blue_drift=Drift(swing=0.08, period_s=17.0, phase=0.6),
+        white_balance=0.7,
+        read_noise=0.006,
+        shot_noise=3e-4,
+        gamma=2.0,
+        contrast=0.25,
+        sharpening=0.9,
+        sharpening_px=(1.2, 1.2),
+        chroma_px=(1.0, 1.0),
+    ),
+    recording=Recording(codec="mjpeg", jpeg_quality=80),
+    still_quality=80,
+)
+
+ACTION = SimulatedCamera(
+    name="action",
+    about="action camera with lamps: strong tone curve, white cores in a halo, H.264 at a low rate",
+    filters=ColourFilters(at_green=(0.37, 1.0, 0.76), saturation=0.6),
+    development=Development(
+        lamp=(0.30, 0.30, 0.28),
+        defocus_px=0.6,
+        flare=0.08,
+        flare_px=6.0,
+        exposure=0.15,
+        exposure_drift=Drift(swing=0.06, period_s=9.0),
+        red_drift=Drift(swing=0.05, period_s=13.0, phase=0.4),
+        blue_drift=Drift(swing=0.05, period_s=19.0, phase=0.1),
+        white_balance=0.8,
+        read_noise=0.004,
+        shot_noise=2e-4,
+        gamma=2.2,
+        contrast=0.7,
+        sharpening=0.7,
+        sharpening_px=(0.9, 0.9),
+        chroma_px=(0.8, 0.8),
+    ),
+    recording=Recording(crf=28),
+    still_quality=85,
+)
+
+PAL = SimulatedCamera(
+    name="pal",
+    about="analogue video, captured: soft, narrow chroma, noise, edges overshoot sideways, H.264",
+    filters=ColourFilters(at_green=(0.34, 1.0, 0.55), saturation=0.2),
+    development=Development(
+        defocus_px=0.9,
+        flare=0.03,
+        exposure=0.14,
+        exposure_drift=Drift(swing=0.05, period_s=8.0),
+        red_drift=Drift(swing=0.04, period_s=15.0),
+        blue_drift=Drift(swing=0.04, period_s=21.0, phase=0.5),
+        white_balance=0.6,
+        read_noise=0.010,
+        shot_noise=4e-4,
+        mosaic=False,
+        gamma=1.8,
+        contrast=0.1,
+        black=0.04,
+        sharpening=1.0,
+        sharpening_px=(1.6, 0.0),
+        chroma_px=(3.0, 0.7),
+    ),
+    recording=Recording(crf=23),
+    still_quality=92,
+)
+
+_CAMERAS: Mapping[str, SimulatedCamera] = MappingProxyType(
+    {camera.name: camera for camera in (IDEAL, WEBCAM, ACTION, PAL)}
+)
+
+
+def list_cameras() -> dict[str, str]:
+    """Return the names of the cameras, each with one line about it."""
+    return {name: camera.about for name, camera in _CAMERAS.items()}
+
+
+def simulated_camera(name: str) -> SimulatedCamera:
+    """Return a camera by its name.
+
+    Raises
+    ------
+    OptionError
+        If there is none of that name.
+    """
+    if name not in _CAMERAS:
+        raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(_CAMERAS)}")
+    return _CAMERAS[name]

@@ -1,0 +1,86 @@
+"""Planes of light that are no lasers, or may be none."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from aqualvs.calibration.laser_split import LaserSplit, split_lasers
+from aqualvs.calibration.laser_verdicts import JudgedPlane, Verdict
+from aqualvs.calibration.laser_views import pooled
+from aqualvs.calibration.stripes_on_planes import board_surface, place_stripes
+from aqualvs.geometry.arrays import FloatArray
+from laser_scenes import Clutter, Scene, joined, scene
+
+RAIL = [(0.02, 0.01, 0.0)] * 6
+QUIET = Clutter()
+
+
+def split(made: Scene, n_lasers: int | None = None) -> LaserSplit:
+    stripes = pooled(made.views, board_surface())
+    return split_lasers(stripes, made.rig.dome_from_cam.translation, n_lasers=n_lasers)
+
+
+def only(planes: tuple[JudgedPlane, ...]) -> JudgedPlane:
+    assert len(planes) == 1
+    return planes[0]
+
+
+def with_points(made: Scene, add: FloatArray) -> Scene:
+    """The scene with one more chain, in the same place of every picture."""
+    camera, views = made.rig.camera(), []
+    for view in made.views:
+        stripes = joined(view.stripes, add)
+        placed = place_stripes(camera, stripes, view.dome_from_target, board_surface())
+        views.append(replace(view, stripes=stripes, placed=placed))
+    return replace(made, views=views)
+
+
+def test_a_scratch_in_the_picture_is_no_laser() -> None:
+    made = scene(7, 1, 6, clutter=QUIET, noise_px=0.1)
+    line = np.stack([np.arange(250.0, 450.0, 2.0), np.arange(200.0, 300.0, 1.0)], axis=-1)
+    found = split(with_points(made, line))
+    assert len(found.planes) == 1
+    assert "one place of the picture" in only(found.spare).why
+
+
+def test_light_on_a_wall_behind_is_not_another_laser() -> None:
+    others = []
+    for seed in range(12):
+        made = scene(seed, 1, 8, clutter=Clutter(behind=0.11), noise_px=0.1, margin=0.02)
+        found = split(made)
+        assert len(found.planes) == 1
+        others += [plane.why for plane in found.spare if plane.verdict is Verdict.OTHER]
+    assert any("begins where another stripe ends" in why for why in others)
+
+
+def test_print_on_a_board_that_comes_nearer_is_asked_about() -> None:
+    """Along a rail every edge of the print sweeps a plane in space, as a laser's light does."""
+    made = scene(3, 1, 8, clutter=Clutter(edges=0.6), noise_px=0.1, rail=True)
+    found = split(made)
+    assert len(found.undecided) >= 1
+    assert all("stays in one place of the target" in plane.why for plane in found.undecided)
+    assert len(split(made, 1).planes) == 1
+
+
+def test_a_board_that_bends_tears_a_laser() -> None:
+    """Half of the pictures put the laser 2 mm, about 8 px, beside where the others put it."""
+    made = scene(11, 1, 10, clutter=QUIET, noise_px=0.1)
+    away = scene(11, 1, 10, clutter=QUIET, noise_px=0.1, shift=4e-3)
+    mixed = replace(made, views=[*made.views[:5], *away.views[5:]])
+    found = split(mixed)
+    assert found.torn
+    assert any("seen in other pictures" in plane.why for plane in found.spare)
+
+
+def test_light_that_no_plane_explains_is_asked_about() -> None:
+    """A second stripe that wanders by a pixel or two, beside one that fits to a tenth of it."""
+    steady = scene(5, 1, 10, clutter=QUIET, noise_px=0.05)
+    unsteady = scene(5, 1, 10, clutter=QUIET, noise_px=0.05, shift=0.06, wander=1.2e-3)
+    camera, views = steady.rig.camera(), []
+    for view, other in zip(steady.views, unsteady.views, strict=True):
+        stripes = joined(view.stripes, other.stripes.pixels)
+        placed = place_stripes(camera, stripes, view.dome_from_target, board_surface())
+        views.append(replace(view, stripes=stripes, placed=placed))
+    found = split(replace(steady, views=views))
+    assert len(found.planes) == 1
+    assert "those of another laser" in only(found.undecided).why

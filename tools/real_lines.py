@@ -1,0 +1,377 @@
+"""Score the stripes that are found in real photographs of laser lines, when no rig is known.
+
+    python tools/real_lines.py ../shared/samples/real-laser-lines --page /tmp/lines.html
+
+Each picture is read as it is, as JPEG (quality 80) and as H.264 (crf 23), by `find_stripes`, the
+way `aqualvs calibrate lasers` finds stripes. Four questions are asked:
+
+- pictures with lines: the share of each line's length that has a point nearby. The lines are those
+  of real_lines.csv, which says how they were traced;
+- pictures without laser: the number of points, which should be 0;
+- pairs without and with a red line: the share of the line's columns with a point within 1 px of
+  the line that the difference of the pair shows;
+- everywhere: the share of points far from any line.
+
+--page writes the pictures with their points as one HTML file, --sheets one JPEG file for each set.
+"""
+
+import argparse
+import base64
+import csv
+import dataclasses
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.live.sources import open_source
+from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
+
+Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
+
+TRACED = Path(__file__).with_name("real_lines.csv")
+FORMATS = ("png", "jpg80", "crf23")
+# A point belongs to a traced line within this distance; lines in the dark pictures are up to 15 px
+# wide, and the trace of such a line is good to a third of that.
+NEAR_PX = {"green15-bright": 2.0, "green15-dark": 5.0, "red-charuco": 2.0}
+PAIR_PX = 1.0
+RED_NM, GREEN_NM = 650.0, 532.0
+# Weights of B, G, R when a line of a pair is centred: mostly red, but red alone saturates.
+_WEIGHTS = (0.2, 0.2, 0.6)
+# Drawing: pictures darker than this on average are brightened; space around lines, in widths;
+# width of a sheet in pixels.
+_DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1440
+_ON_GREEN_BGR, _ON_RED_BGR, _WHITE = (255, 0, 255), (255, 255, 0), (255, 255, 255)
+
+
+@dataclass(frozen=True)
+class Score:
+    """One picture in one format.
+
+    Attributes
+    ----------
+    picture, format, group : str
+        `group` is that of the traced lines, `pair`, or `off532` and `off650` for pictures without
+        laser, searched for light of that wavelength.
+    n_points : int
+        Points found in the picture.
+    found : float
+        Share of the line's length (columns, for pairs) that was found; NaN without lines.
+    weakest : float
+        The same of the line that was found least.
+    elsewhere : int
+        Points far from every line.
+    """
+
+    picture: str
+    format: str
+    group: str
+    n_points: int
+    found: float
+    weakest: float
+    elsewhere: int
+
+
+def options_for(wavelength_nm: float) -> WholePictureOptions:
+    """Return options for a colour, where this version of the package knows colours."""
+    names = {field.name for field in dataclasses.fields(WholePictureOptions)}
+    if "wavelength_nm" in names:
+        return WholePictureOptions(wavelength_nm=wavelength_nm)  # type: ignore[arg-type]
+    return WholePictureOptions()
+
+
+def encoded(image: Image, fmt: str) -> Image | Frame:
+    """Return a picture as it is after JPEG (BGR) or H.264 (a decoded frame)."""
+    if fmt == "png":
+        return image
+    if fmt.startswith("jpg"):
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(fmt.removeprefix("jpg"))]
+        return cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.mp4"
+        _write_video(image, path, int(fmt.removeprefix("crf")))
+        with open_source(str(path)) as source:
+            return next(iter(source))
+
+
+def _write_video(image: Image, path: Path, crf: int) -> None:
+    """Write one frame, 4:2:0; an odd last row or column is left out."""
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(25))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": str(crf)}
+        picture = np.ascontiguousarray(image[:height, :width])
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+
+
+def traced_lines(path: Path = TRACED) -> dict[str, list[tuple[str, Array]]]:
+    """Return (group, polyline (N, 2)) of every traced line, by picture."""
+    points: dict[tuple[str, str, str], list[tuple[float, float]]] = defaultdict(list)
+    with path.open() as file:
+        for row in csv.DictReader(line for line in file if not line.startswith("#")):
+            key = row["picture"], row["group"], row["line"]
+            points[key].append((float(row["x_px"]), float(row["y_px"])))
+    lines: dict[str, list[tuple[str, Array]]] = defaultdict(list)
+    for (picture, group, _), polyline in points.items():
+        lines[picture].append((group, np.array(polyline)))
+    return lines
+
+
+def walk(polyline: Array) -> Array:
+    """Return points (N, 2) every pixel along a polyline."""
+    step = np.hypot(*np.diff(polyline, axis=0).T)
+    way = np.concatenate([[0.0], np.cumsum(step)])
+    at = np.arange(0.0, way[-1], 1.0)
+    return np.stack([np.interp(at, way, polyline[:, i]) for i in (0, 1)], axis=-1)
+
+
+def near(
+    points: Array, others: Array, distance_px: float, size: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Return which points (N,) have one of the others within a distance, to 0.25 px."""
+    if len(others) == 0 or len(points) == 0:
+        return np.zeros(len(points), bool)
+    scale = 4
+    clear = np.full((size[0] * scale, size[1] * scale), 255, np.uint8)
+    at = np.clip(np.rint(others * scale), 0, np.array(size[::-1]) * scale - 1).astype(int)
+    clear[at[:, 1], at[:, 0]] = 0
+    distance = cv2.distanceTransform(clear, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    at = np.clip(np.rint(points * scale), 0, np.array(size[::-1]) * scale - 1).astype(int)
+    return distance[at[:, 1], at[:, 0]] <= distance_px * scale
+
+
+def score_lines(
+    name: str, fmt: str, found: Array, lines: Sequence[tuple[str, Array]], size: tuple[int, int]
+) -> list[Score]:
+    """Return a score for each group of a picture's lines."""
+    reach = NEAR_PX[name.split("/")[0]]
+    everything = np.concatenate([walk(polyline) for _, polyline in lines])
+    elsewhere = int((~near(found, everything, 2.0 * reach, size)).sum())
+    scores = []
+    for group in dict.fromkeys(group for group, _ in lines):
+        walks = [walk(polyline) for of, polyline in lines if of == group]
+        # Along the line a point counts for its neighbours too: fast lines have one every row.
+        seen = near(np.concatenate(walks), found, reach, size)
+        parts = np.split(seen, np.cumsum([len(w) for w in walks])[:-1])
+        weakest = min(float(part.mean()) for part in parts)
+        scores.append(Score(name, fmt, group, len(found), float(seen.mean()), weakest, elsewhere))
+    return scores
+
+
+def pair_line(off: Image, on: Image) -> Array:
+    """Return the row (width,) of a near-horizontal red line in each column, NaN where unseen.
+
+    Found where red rises against green by most, centred where light of any colour rises.
+    """
+    a, b = off.astype(np.float32), on.astype(np.float32)
+    red = (b[..., 2] - a[..., 2]) - 0.5 * (b[..., 1] - a[..., 1])
+    light = sum(w * (b[..., i] - a[..., i]) for i, w in enumerate(_WEIGHTS))
+    red, light = (cv2.GaussianBlur(_high(d), (0, 0), 2.5, sigmaY=0.8) for d in (red, light))
+    noise = 1.4826 * float(np.median(np.abs(red - np.median(red))))
+    row, peak = red.argmax(axis=0), red.max(axis=0)
+    strong = peak > max(6.0 * noise, 8.0)
+    line = np.full(len(row), np.nan)
+    for x in np.flatnonzero(strong):
+        around = slice(max(0, x - 6), x + 7)
+        if (strong[around] & (np.abs(row[around] - row[x]) <= 2)).sum() < 7:
+            continue
+        first, last = max(0, row[x] - 3), min(len(red), row[x] + 4)
+        weight = np.clip(light[first:last, x] - 0.3 * light[first:last, x].max(), 0.0, None)
+        if weight.sum() > 0.0:
+            line[x] = (weight * np.arange(first, last)).sum() / weight.sum()
+    return line
+
+
+def _high(difference: Array) -> Array:
+    """Return a difference (height, width) without what is wider than a line."""
+    padded = np.pad(difference, ((15, 15), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 31, axis=0)
+    return difference - np.median(windows, axis=-1)
+
+
+def score_pair(name: str, fmt: str, found: Array, line: Array) -> Score:
+    """Return the share of a pair's columns with a point within `PAIR_PX` of its line."""
+    columns = np.flatnonzero(np.isfinite(line))
+    hit = np.zeros(len(columns), bool)
+    for i, x in enumerate(columns):
+        here = np.abs(found[:, 0] - x) <= 0.5
+        hit[i] = bool((np.abs(found[here, 1] - line[x]) <= PAIR_PX).any())
+    at = np.clip(np.rint(found[:, 0]), 0, len(line) - 1).astype(int)
+    off_line = ~(np.abs(found[:, 1] - line[at]) <= 2.0 * PAIR_PX)
+    share = float(hit.mean()) if len(hit) else float("nan")
+    return Score(name, fmt, "pair", len(found), share, share, int(off_line.sum()))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture in a format, its points, and what they are worth."""
+
+    image: Image
+    points: Array
+    scores: list[Score]
+
+
+def shots(samples: Path, formats: Sequence[str]) -> Iterator[Shot]:
+    """Read, search and score every picture in every format."""
+    traced = traced_lines()
+    pictures = [p for p in sorted(samples.glob("*/*")) if p.suffix in (".png", ".jpg")]
+    for path in pictures:
+        name = f"{path.parent.name}/{path.name}"
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        red = path.parent.name.startswith("red")
+        is_on = name in traced or "-b-" in path.name
+        line = None
+        if "-b-" in path.name:
+            off = cv2.imread(str(path).replace("-b-", "-a-"), cv2.IMREAD_COLOR)
+            line = pair_line(off, image)
+        for fmt in formats:
+            given = encoded(image, fmt)
+            # Without a laser, nothing may be found whatever the colour of the rig's lasers.
+            for nm in [RED_NM if red else GREEN_NM] if is_on else [GREEN_NM, RED_NM]:
+                points = find_stripes(given, options_for(nm)).pixels
+                if line is not None:
+                    scores = [score_pair(name, fmt, points, line)]
+                elif name in traced:
+                    scores = score_lines(name, fmt, points, traced[name], image.shape[:2])
+                else:
+                    n, none = len(points), float("nan")
+                    scores = [Score(name, fmt, f"off{nm:.0f}", n, none, none, n)]
+                yield Shot(image, points, scores)
+
+
+def text_line(score: Score) -> str:
+    """Return one line of the table."""
+    name = score.picture.split("/")[1].rsplit(".", 1)[0].removeprefix("docs_images_")
+    share = "" if np.isnan(score.found) else f"{score.found:7.1%} weakest {score.weakest:6.1%}"
+    return (
+        f"{name[-28:]:28} {score.format:5} {score.group:6} {share:23} points {score.n_points:6} "
+        f"elsewhere {score.elsewhere:5}"
+    )
+
+
+def summary(scores: Sequence[Score]) -> list[str]:
+    """Return a Markdown table, one row for each set and group, as docs/real-light.md has it."""
+    formats = list(dict.fromkeys(s.format for s in scores))
+    lines = [f"| pictures | lines | {' | '.join(formats)} |", "|---|---|" + "---|" * len(formats)]
+    for folder, group in sorted({(s.picture.split("/")[0], s.group) for s in scores}):
+        of = [s for s in scores if s.picture.startswith(f"{folder}/") and s.group == group]
+        cells = [_cell(group, [s for s in of if s.format == fmt]) for fmt in formats]
+        lines.append(f"| {folder} | {group} | {' | '.join(cells)} |")
+    return lines
+
+
+def _cell(group: str, scores: Sequence[Score]) -> str:
+    """Return what one group of lines of a set came to in one format."""
+    if group.startswith("off"):
+        clean = sum(s.n_points == 0 for s in scores)
+        return f"{clean} of {len(scores)} without points, {sum(s.n_points for s in scores)} in all"
+    found = [s.found for s in scores]
+    if group == "pair":
+        good = sum(share >= 0.9 for share in found)
+        return f"{good} of {len(scores)} pairs by 90 %, median {np.median(found):.0%}"
+    return (
+        f"{min(found):.0%} to {max(found):.0%}, weakest line {min(s.weakest for s in scores):.0%}"
+    )
+
+
+def drawn(shot: Shot, width: int = 800) -> Image:
+    """Return the picture, brightened where it is dark, and beside it the same with its points."""
+    scale = width / shot.image.shape[1]
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    plain = cv2.resize(shot.image, None, fx=scale, fy=scale, interpolation=how)
+    if plain.mean() < _DARK:
+        plain = np.rint(255.0 * np.sqrt(plain / 255.0)).astype(np.uint8)
+    picture = plain.copy()
+    red = shot.scores[0].picture.startswith("red")
+    for x, y in np.rint((shot.points + 0.5) * scale - 0.5).astype(int):
+        cv2.circle(picture, (int(x), int(y)), 1, _ON_RED_BGR if red else _ON_GREEN_BGR, -1)
+    both: Image = np.hstack([plain, picture])
+    return both
+
+
+def around_lines(shot: Shot, lines: Sequence[tuple[str, Array]]) -> Shot:
+    """Return a shot cut to where its lines are."""
+    height, width = shot.image.shape[:2]
+    everything = np.concatenate([polyline for _, polyline in lines])
+    margin = _MARGIN * width
+    x0, y0 = np.clip(everything.min(axis=0) - margin, 0, (width, height)).astype(int)
+    x1, y1 = np.clip(everything.max(axis=0) + margin, 0, (width, height)).astype(int)
+    inside = ((shot.points >= (x0, y0)) & (shot.points < (x1, y1))).all(axis=1)
+    points = shot.points[inside] - (x0, y0)
+    return dataclasses.replace(shot, image=shot.image[y0:y1, x0:x1], points=points)
+
+
+def sheets(found: Sequence[Shot]) -> dict[str, Image]:
+    """Return one picture for each set: all its shots with lines, green ones cut to these."""
+    traced = traced_lines()
+    shots_of: dict[str, list[Shot]] = defaultdict(list)
+    for shot in found:
+        name, group = shot.scores[0].picture, shot.scores[0].group
+        if not group.startswith("off"):
+            cut = around_lines(shot, traced[name]) if name.startswith("green") else shot
+            shots_of[name.split("/")[0]].append(cut)
+    return {folder: _in_columns(of) for folder, of in shots_of.items()}
+
+
+def _in_columns(of: Sequence[Shot]) -> Image:
+    """Return shots as one picture, two in a row unless there is but one."""
+    columns = 1 if len(of) == 1 else 2
+    tiles = [drawn(shot, _SHEET_WIDTH // (2 * columns)) for shot in of]
+    rows = []
+    for row in (tiles[i : i + columns] for i in range(0, len(tiles), columns)):
+        height = max(len(tile) for tile in row)
+        filled = [cv2.copyMakeBorder(t, 0, height - len(t), 0, 0, 0, value=_WHITE) for t in row]
+        missing = [np.full_like(filled[0], 255)] * (columns - len(row))
+        rows.append(np.hstack([*filled, *missing]))
+    return np.vstack(rows)
+
+
+def page(found: Sequence[Shot]) -> str:
+    """Return one HTML page: every picture beside itself with the points drawn."""
+    parts = ["<!doctype html><meta charset=utf-8><title>Real laser lines</title>"]
+    parts.append("<style>body{font:14px sans-serif}img{max-width:100%}pre{margin:4px 0}</style>")
+    for shot in found:
+        jpg = cv2.imencode(".jpg", drawn(shot), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+        words = "\n".join(text_line(score) for score in shot.scores)
+        code = base64.b64encode(jpg).decode()
+        parts.append(f"<pre>{words}</pre><img src='data:image/jpeg;base64,{code}'>")
+    return "\n".join(parts)
+
+
+def main() -> int:
+    """Print the table, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("samples", type=Path, help="folder of the photographs")
+    parser.add_argument("--formats", default=",".join(FORMATS), help="such as png,jpg80,crf23")
+    parser.add_argument("--page", type=Path, help="HTML page of all pictures, to write")
+    parser.add_argument("--sheets", type=Path, help="folder for a JPEG file of each set's lines")
+    given = parser.parse_args()
+    found = []
+    for shot in shots(given.samples, given.formats.split(",")):
+        found.append(shot)
+        print("\n".join(text_line(score) for score in shot.scores), flush=True)
+    print("\n".join(["", *summary([score for shot in found for score in shot.scores])]))
+    if given.page:
+        given.page.write_text(page(found))
+    if given.sheets:
+        given.sheets.mkdir(parents=True, exist_ok=True)
+        for folder, sheet in sheets(found).items():
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 70]
+            cv2.imwrite(str(given.sheets / f"real-{folder}.jpg"), sheet, quality)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
