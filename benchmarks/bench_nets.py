@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.sources.planes import planes_of_image
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.measure import FitMethod, PostureMeter
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.readings import Readings, read_returns
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.search import plan_searches, searched_range
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.surfaces import find_surfaces

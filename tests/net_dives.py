@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.live.sources.opening import open_source
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.clutter import random_bubbles, random_fish
 from aqualvs.simulation.lit_points import cast
 from aqualvs.simulation.random_scenes import Difficulty, random_scene

@@ -12,10 +12,9 @@ from aqualvs.app.design.command import designed_rig
 from aqualvs.app.design.file import EXAMPLE, design_of_rig
 from aqualvs.app.design.predict import predict
 from aqualvs.geometry.transforms import SE3
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario

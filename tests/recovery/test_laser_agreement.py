@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from aqualvs.live.sources import open_source
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.uncertainty import rig_moved_by
 from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
 from aqualvs.scanning.pipeline import Scanner
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario

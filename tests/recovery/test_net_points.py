@@ -13,10 +13,9 @@ from scipy.spatial import cKDTree
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.live.sources import open_source
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
-from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.random_scenes import Difficulty, random_scene

@@ -9,11 +9,10 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario

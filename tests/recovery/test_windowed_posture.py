@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.scan import planes_of_image
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import load_scenario

@@ -51,7 +51,7 @@ def test_runs_come_in_order_with_middle_width_and_peak() -> None:
     np.testing.assert_array_equal(found.position, [21.5, 40.0, 8.0])
     np.testing.assert_array_equal(found.width, [4.0, 1.0, 3.0])
     np.testing.assert_array_equal(found.height, [200.0, 141.0, 255.0])
-    assert np.isnan(found.green_fall).all()
+    np.testing.assert_array_equal(found.likelihood, 1.0)
     assert len(found) == 3
 
 
