@@ -57,6 +57,8 @@ class FrameDetector:
         One for each laser.
     options : StripeOptions or ThresholdOptions
         Which detector, and how.
+    are_lasers : bool
+        Whether each search is that of one laser; else it may hold any number of them.
     """
 
     def __init__(
@@ -64,11 +66,16 @@ class FrameDetector:
         size_px: tuple[int, int],
         searches: Sequence[StripeSearch],
         options: DetectorOptions,
+        *,
+        are_lasers: bool = True,
     ) -> None:
         self._size_px = size_px
         self._options = options
         seen = [search for search in searches if search.visible]
         self._colours = sorted({one.colour for one in seen}, key=lambda colour: colour.name)
+        # Each laser shows about once on a search line; in a whole picture nobody knows how many do.
+        lines = sum(np.count_nonzero(one.lowest <= one.highest) for one in seen)
+        self._n_possible = float(lines) if are_lasers else np.inf
         self._line_px = max((one.line_px for one in seen), default=1)
         self._bands = {
             axis: _band([one for one in seen if one.axis is axis])
@@ -184,7 +191,10 @@ class FrameDetector:
         Where there is no colour to tell by, as many peaks are looked at as lasers may make.
         """
         if has_colour:
-            colours = [learn_colour(sample, colour) for colour in self._colours]
+            colours = [
+                learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY, is_sample=True)
+                for colour in self._colours
+            ]
             return useful_height(sample[HEIGHT], self._likelihood(sample, colours)), colours
         n_lines = sum(len(lowest) for lowest, _ in self._bands.values())
         most = _PEAKS_PER_LINE * n_lines // _SAMPLE_EVERY
@@ -199,7 +209,9 @@ class FrameDetector:
         found = [
             laser_likelihood(
                 table,
-                line or learn_colour(table, colour) or expected_colour(table, colour),
+                line
+                or learn_colour(table, colour, self._n_possible)
+                or expected_colour(table, colour),
                 _WIDEST_WHITE * self._size_px[0],
             )
             for line, colour in zip(known, self._colours, strict=True)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
@@ -30,11 +30,15 @@ _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # many standard deviations and so many levels, within an angle of this cosine to the wavelength's
 # direction, and at least this share of the largest for their height; and how many of them it takes.
 _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.3
-_BEST_SHARE, _MIN_LEARNED = 0.6, 16
+# They scatter by no more than this share of their mean step, half of them.
+_BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
+# So tall peaks, so many times as many as the lasers can make, are mostly paint. Lines then lie so
+# many standard deviations off it, and it spreads by so much at least, as chroma for each level.
+_TALL, _CROWD, _CLEAR_OF_PAINT, _LEAST_SPREAD, _MAD_TO_SIGMA = 20.0, 2.0, 4.0, 0.02, 1.4826
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least that a learned one counts with, and how far paint and glare spread
 # about none. Lines of nine cameras show 0.15 to 0.7, rendered ones 0.5.
-_RATIO_EXPECTED, _RATIO_LEAST, _RATIO_OF_PAINT = 0.25, 0.1, 0.05
+_RATIO_EXPECTED, _RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
 # One frame's lines spread about their ratio by this share, and by the second one across their
 # direction: overexposed ones show less and differ in hue, faint ones more.
 _RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
@@ -54,6 +58,8 @@ _FEW_LINES, _USEFUL_SHARE, _CLEARLY, _HIGHEST_USEFUL = 4, 0.05, 0.8, 32
 _WHITE = 225.0
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
+# The largest of three normal numbers is so many standard deviations above their mean.
+_LARGEST_OF_THREE = 0.85
 # Nothing is more certain than e to this power.
 _MAX_LOG_ODDS = 12.0
 
@@ -117,28 +123,55 @@ class LineColour(NamedTuple):
         Levels along it for each grey level of a line's height.
     sigma : float
         Standard deviation of a step that nothing but noise makes, in levels.
+    paint_u, paint_v : float
+        What the frame's paint shows for each grey level of height, where it was learned.
+    spread_u, spread_v : float
+        Standard deviations of that; 0 where it was not learned.
+    along, across : float
+        How lines spread about their mean, as shares of `ratio`, along their direction and across.
     """
 
     u: float
     v: float
     ratio: float
     sigma: float
+    paint_u: float = 0.0
+    paint_v: float = 0.0
+    spread_u: float = 0.0
+    spread_v: float = 0.0
+    along: float = _RATIO_SPREAD
+    across: float = _ACROSS_SPREAD
 
 
-def learn_colour(table: FloatArray, colour: LaserColour) -> LineColour | None:
+def learn_colour(
+    table: FloatArray, colour: LaserColour, n_possible: float, *, is_sample: bool = False
+) -> LineColour | None:
     """Learn from a frame's peaks what its lines do to the chroma.
+
+    Where there are many more tall peaks than the lasers can make, most are something else, such as
+    twine in the sun: then its colour is learned too, and lines are what differs from it.
 
     Parameters
     ----------
     table : array, shape (9, N)
         Measures of peaks, rows as `stripe` names them.
     colour : LaserColour
+    n_possible : float
+        Peaks that the lasers can make.
+    is_sample : bool
+        Whether there are more peaks to learn from.
 
     Returns
     -------
     LineColour or None
         None where too few peaks are clearly of the laser's colour.
     """
+    tall = np.flatnonzero(table[HEIGHT] >= _TALL)
+    if len(tall) > _CROWD * n_possible:
+        crowded = LineColour(*_learn_from_crowd(table[:, tall], *colour.value))
+        # A sample may hold too few lines to find them in a crowd, where all peaks do not.
+        if crowded.ratio > 0.0 or is_sample:
+            return crowded if crowded.ratio > 0.0 else None
     found = LineColour(*_learn(table, *colour.value))
     return found if found.ratio > 0.0 else None
 
@@ -211,18 +244,20 @@ def _noise(table: FloatArray) -> float:
 
 
 @inline_kernel
-def _beyond_paint(table: FloatArray, i: int, most: float) -> tuple[float, float]:
-    """Return what paint leaves unexplained of a peak's chroma step, as U and V.
+def _beyond_paint(
+    table: FloatArray, i: int, left: float, tint_share: float, most: float
+) -> tuple[float, float]:
+    """Return what paint leaves unexplained of a share `left` of a peak's chroma step, as U and V.
 
-    Brighter paint shows up to a share of the tint that its flanks have; `most` bounds its size.
+    Brighter paint shows up to `tint_share` of the tint that its flanks have, and at most `most`.
     """
-    u, v, height = table[STEP_U, i], table[STEP_V, i], table[HEIGHT, i]
+    u, v, height = left * table[STEP_U, i], left * table[STEP_V, i], table[HEIGHT, i]
     tint_u, tint_v = height * table[TINT_U, i], height * table[TINT_V, i]
     size = math.hypot(tint_u, tint_v)
     if size < 1e-9:
         return u, v
     share = (u * tint_u + v * tint_v) / (size * size)
-    share = min(max(share, 0.0), min(_TINT_SHARE, most / size))
+    share = min(max(share, 0.0), min(tint_share, most / size))
     return u - share * tint_u, v - share * tint_v
 
 
@@ -230,28 +265,73 @@ def _beyond_paint(table: FloatArray, i: int, most: float) -> tuple[float, float]
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
-    # Chosen by their chroma beyond that of paint, for their height: the highest peaks may be paper.
+    # What differs from all that paint may show is the surest; a line as green as the water is not.
+    for tint_share in (1.0, _TINT_SHARE):
+        best = _best_stripes(table, u, v, sigma, tint_share)
+        if best.shape[0] < _MIN_LEARNED:
+            continue
+        height = table[HEIGHT][best]
+        of_u, of_v = table[STEP_U][best] / height, table[STEP_V][best] / height
+        line_u, line_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+        size = math.hypot(line_u, line_v)
+        if element_at(np.hypot(of_u - line_u, of_v - line_v), 0.5) > _MOST_SCATTER * size:
+            continue
+        line_u, line_v = line_u / size, line_v / size
+        ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
+        return line_u, line_v, max(ratio, _RATIO_LEAST), sigma
+    return u, v, 0.0, sigma
+
+
+@kernel
+def _learn_from_crowd(
+    table: FloatArray, u: float, v: float
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:
+    """Return the fields of a `LineColour`, given that most peaks are paint; a ratio of 0 if unknown."""
+    sigma = _noise(table)
+    height = table[HEIGHT]
+    of_u, of_v = table[STEP_U] / height, table[STEP_V] / height
+    paint_u, paint_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+    spread_u = max(_MAD_TO_SIGMA * element_at(np.abs(of_u - paint_u), 0.5), _LEAST_SPREAD)
+    spread_v = max(_MAD_TO_SIGMA * element_at(np.abs(of_v - paint_v), 0.5), _LEAST_SPREAD)
+    off_u = (of_u - paint_u) / np.hypot(spread_u, sigma / height)
+    off_v = (of_v - paint_v) / np.hypot(spread_v, sigma / height)
+    is_near = u * of_u + v * of_v > _LEAST_COSINE * np.hypot(of_u, of_v)
+    best = np.flatnonzero(is_near & (np.hypot(off_u, off_v) > _CLEAR_OF_PAINT))
+    nothing = (u, v, 0.0, sigma, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+    if best.shape[0] < _MIN_LEARNED:
+        return nothing
+    line_u, line_v = element_at(of_u[best], 0.5), element_at(of_v[best], 0.5)
+    size = math.hypot(line_u, line_v)
+    if element_at(np.hypot(of_u[best] - line_u, of_v[best] - line_v), 0.5) > _MOST_SCATTER * size:
+        return nothing
+    if size > _RATIO_MOST:
+        return nothing
+    line_u, line_v, ratio = line_u / size, line_v / size, max(size, _RATIO_LEAST)
+    off_along = np.abs(line_u * of_u[best] + line_v * of_v[best] - size)
+    off_across = np.abs(line_v * of_u[best] - line_u * of_v[best])
+    along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _LEAST_SCATTER)
+    across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _LEAST_SCATTER)
+    return line_u, line_v, ratio, sigma, paint_u, paint_v, spread_u, spread_v, along, across
+
+
+@kernel
+def _best_stripes(
+    table: FloatArray, u: float, v: float, sigma: float, tint_share: float
+) -> IntArray:
+    """Return the peaks with the most chroma beyond that of paint, for their height.
+
+    The highest peaks may be paper.
+    """
     share = np.zeros(table.shape[1])
     for i in range(table.shape[1]):
-        beyond_u, beyond_v = _beyond_paint(table, i, np.inf)
+        beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
         size = math.hypot(beyond_u, beyond_v)
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         near = u * step_u + v * step_v > _LEAST_COSINE * math.hypot(step_u, step_v)
         is_clear = size > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
         if near and is_clear and table[HEIGHT, i] >= _MIN_HEIGHT:
             share[i] = size / table[HEIGHT, i]
-    best = np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
-    if best.shape[0] < _MIN_LEARNED:
-        return u, v, 0.0, sigma
-    of_u, of_v = (
-        table[STEP_U][best] / table[HEIGHT][best],
-        table[STEP_V][best] / table[HEIGHT][best],
-    )
-    u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
-    size = math.hypot(u, v)
-    u, v = u / size, v / size
-    ratio = element_at(u * of_u + v * of_v, _LEARNED_QUANTILE)
-    return u, v, max(ratio, _RATIO_LEAST), sigma
+    return np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
 
 
 @kernel
@@ -276,6 +356,12 @@ def _weigh(
     v: float,
     ratio: float,
     sigma: float,
+    paint_u: float,
+    paint_v: float,
+    spread_u: float,
+    spread_v: float,
+    along_spread: float,
+    across_spread: float,
     widest_white_px: float,
     likelihood: FloatArray,
 ) -> None:
@@ -285,19 +371,24 @@ def _weigh(
     for i in range(n):
         height = table[HEIGHT, i]
         line = ratio * height
-        along = u * table[STEP_U, i] + v * table[STEP_V, i]
-        across = v * table[STEP_U, i] - u * table[STEP_V, i]
+        step_u, step_v = table[STEP_U, i], table[STEP_V, i]
+        size = math.hypot(step_u, step_v)
+        # A step is the largest of three, so that noise alone has one.
+        left = max(1.0 - _LARGEST_OF_THREE * sigma / size, 0.0) if size > 0.0 else 0.0
+        step_u, step_v = left * step_u, left * step_v
+        along, across = u * step_u + v * step_v, v * step_u - u * step_v
         # More of the colour than expected is no evidence against a line.
         off_line = min(along - line, 0.0)
-        var_along = sigma**2 + (_RATIO_SPREAD * line) ** 2
-        var_across = sigma**2 + (_ACROSS_SPREAD * line) ** 2
-        beyond_u, beyond_v = _beyond_paint(table, i, _PAINT_SHARE * line)
-        var_paint = sigma**2 + (_RATIO_OF_PAINT * height) ** 2
-        log_odds = 0.5 * (
-            (beyond_u**2 + beyond_v**2) / var_paint
-            - off_line**2 / var_along
-            - across**2 / var_across
-        )
+        var_along = sigma**2 + (along_spread * line) ** 2
+        var_across = sigma**2 + (across_spread * line) ** 2
+        if spread_u > 0.0:
+            off_u = (step_u - paint_u * height) / math.hypot(sigma, spread_u * height)
+            off_v = (step_v - paint_v * height) / math.hypot(sigma, spread_v * height)
+            off_paint = off_u**2 + off_v**2
+        else:
+            beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
+            off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
+        log_odds = 0.5 * (off_paint - off_line**2 / var_along - across**2 / var_across)
         odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))
         kind[i] = _kind_of(height)
     share = np.full(_N_KINDS, 0.5)

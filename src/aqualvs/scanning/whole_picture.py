@@ -114,7 +114,9 @@ def find_stripes(
     colour = LaserColour.of(options.wavelength_nm)
     searches = [_whole_search((width, height), axis, colour) for axis in SearchAxis]
     most = _RETURNS_PER_LINE * max(len(search.lowest) for search in searches)
-    detector = FrameDetector((width, height), searches, StripeOptions(max_returns=most))
+    detector = FrameDetector(
+        (width, height), searches, StripeOptions(max_returns=most), are_lasers=False
+    )
     returns = detector.detect(frame)
     found = _joined([_pieces(search, returns[search.axis], width, options) for search in searches])
     return replace(found, sigma_px=_sigma_px(frame.luma, found))
