@@ -32,7 +32,6 @@ from aqualvs.scanning.threshold import ThresholdDetector, ThresholdOptions
 
 DetectorOptions = StripeOptions | ThresholdOptions
 
-
 # One search line of so many is looked at first. In a grey picture so many peaks on a search line
 # are looked at, more of them than stripes and clutter make.
 _SAMPLE_EVERY, _PEAKS_PER_LINE = 48, 12
@@ -128,9 +127,10 @@ class FrameDetector:
         if not self._bands:
             return {}
         if isinstance(self._options, ThresholdOptions):
+            np.copyto(self._luma, frame.luma)
             return {
                 axis: ThresholdDetector(axis, self._size_px, *band, self._options).detect(
-                    self._lines[axis].of(frame.luma)
+                    self._lines[axis].of(self._luma)
                 )
                 for axis, band in self._bands.items()
             }

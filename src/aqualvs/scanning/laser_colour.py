@@ -26,18 +26,20 @@ from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, T
 _BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
 # R and B by V and U, in the scale of limited-range luma (BT.601).
 _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
+# The thresholds of learning were tuned on the rendered sample and benchmark dives, the photographs
+# of the sample folders and dives of the simulated cameras.
 # Stripes to learn from: peaks of so many grey levels, with a chroma step beyond that of paint of so
 # many standard deviations and so many levels, within an angle of this cosine to the wavelength's
-# direction, and at least this share of the largest for their height; and how many of them it takes.
+# direction, and at least a share of the largest for their height; how many of them it takes, and
+# by what shares of their mean step half of them scatter at most, and are taken to at least.
 _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.3
-# They scatter by no more than this share of their mean step, half of them.
 _BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
 # So tall peaks, so many times as many as the lasers can make, are mostly paint. Lines then lie so
 # many standard deviations off it, and it spreads by so much at least, as chroma for each level.
 _TALL, _CROWD, _CLEAR_OF_PAINT, _LEAST_SPREAD, _MAD_TO_SIGMA = 20.0, 2.0, 4.0, 0.02, 1.4826
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
-# enough to learn from, the least that a learned one counts with, and how far paint and glare spread
-# about none. Lines of nine cameras show 0.15 to 0.7, rendered ones 0.5.
+# enough to learn from, the least and the most that is believed of a learned one, and how far paint
+# and glare spread about none. Lines of nine cameras show 0.15 to 0.7.
 _RATIO_EXPECTED, _RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
 # One frame's lines spread about their ratio by this share, and by the second one across their
 # direction: overexposed ones show less and differ in hue, faint ones more.
@@ -58,8 +60,9 @@ _FEW_LINES, _USEFUL_SHARE, _CLEARLY, _HIGHEST_USEFUL = 4, 0.05, 0.8, 32
 _WHITE = 225.0
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
-# The largest of three normal numbers is so many standard deviations above their mean.
-_LARGEST_OF_THREE = 0.85
+# The largest of three normal numbers is so many standard deviations above their mean; up to so many
+# levels of noise the lines' own differences are larger.
+_LARGEST_OF_THREE, _QUIET = 0.85, 1.4
 # Nothing is more certain than e to this power.
 _MAX_LOG_ODDS = 12.0
 
@@ -374,7 +377,11 @@ def _weigh(
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         size = math.hypot(step_u, step_v)
         # A step is the largest of three, so that noise alone has one.
-        left = max(1.0 - _LARGEST_OF_THREE * sigma / size, 0.0) if size > 0.0 else 0.0
+        left = (
+            max(1.0 - _LARGEST_OF_THREE * max(sigma - _QUIET, 0.0) / size, 0.0)
+            if size > 0.0
+            else 0.0
+        )
         step_u, step_v = left * step_u, left * step_v
         along, across = u * step_u + v * step_v, v * step_u - u * step_v
         # More of the colour than expected is no evidence against a line.
