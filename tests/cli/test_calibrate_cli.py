@@ -3,14 +3,16 @@
 import contextlib
 import io
 import re
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from aqualvs.app.cli import main
 from aqualvs.app.simulate import calibration_commands
 from aqualvs.geometry.transforms import rotvec_from_rotation
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
 from panel_cases import small_rig
 
@@ -75,7 +77,10 @@ def test_the_lens_is_where_it_is_in_the_dome(calibrated):
 def test_the_planes_of_the_lasers_are_the_true_ones(calibrated):
     """Seen from the camera: what its rotation is off turns all planes with it, and no range."""
     out, files, _, _ = calibrated
-    rig, truth = load_rig(out / "rig.yaml"), load_rig(files.rig)
+    assert_true_planes(load_rig(out / "rig.yaml"), load_rig(files.rig))
+
+
+def assert_true_planes(rig, truth, offset_mm=0.5):
     assert len(rig.lasers) == 3
     for true in truth.lasers:
         expected = true.plane.normal @ truth.dome_from_cam.rotation
@@ -84,7 +89,7 @@ def test_the_planes_of_the_lasers_are_the_true_ones(calibrated):
         i = int(np.argmax(alike))
         assert np.rad2deg(np.arccos(min(alike[i], 1.0))) < 0.1
         offset = abs(rig.lasers[i].plane.offset)
-        assert offset == pytest.approx(abs(true.plane.offset), abs=0.5e-3)
+        assert offset == pytest.approx(abs(true.plane.offset), abs=1e-3 * offset_mm)
 
 
 def test_the_rig_is_sane_and_has_not_moved_from_the_truth(calibrated, capsys):
@@ -94,6 +99,50 @@ def test_the_rig_is_sane_and_has_not_moved_from_the_truth(calibrated, capsys):
     compare = next(command for command in commands if command[0] == "check")
     assert main(compare) == 0
     assert "lens_x_mm" in capsys.readouterr().out
+
+
+# Channels as OpenCV has them (blue, green, red) of which two change places.
+_SWAPPED = {650.0: [0, 2, 1], 450.0: [1, 0, 2]}
+
+
+@pytest.fixture(scope="module", params=_SWAPPED)
+def in_colour(request, calibrated, tmp_path_factory):
+    """The box with its green lasers turned red or blue, calibrated without word of lasers."""
+    out, files, commands, _ = calibrated
+    folder = tmp_path_factory.mktemp("colour")
+    for path in sorted(files.box.glob("*.png")):
+        swapped = cv2.imread(str(path))[..., _SWAPPED[request.param]]
+        cv2.imwrite(str(folder / path.name), np.ascontiguousarray(swapped))
+    command = [str(folder) if part == str(files.box) else part for part in commands[2]]
+    before = replace(load_rig(out / "rig.yaml"), lasers=(), solved_from={})
+    save_rig(before, folder / "before.yaml")
+    place = command.index(str(out / "rig.yaml"))
+    command[place] = str(folder / "before.yaml")
+    command[command.index(str(out / "rig.yaml"))] = str(folder / "rig.yaml")
+    return folder, command, request.param
+
+
+def test_red_and_blue_lasers_are_calibrated_and_keep_their_wavelength(in_colour, calibrated):
+    folder, command, wavelength = in_colour
+    assert main([*command, f"--wavelength-nm={wavelength:g}", "--names=a,b,c"]) == 0
+    found = load_rig(folder / "rig.yaml")
+    assert [laser.name for laser in found.lasers] == ["a", "b", "c"]
+    assert [laser.wavelength_nm for laser in found.lasers] == [wavelength] * 3
+    # Red and blue are half made of chroma of half the size; the worst laser's sigma is 0.5 mm.
+    assert_true_planes(found, load_rig(calibrated[1].rig), offset_mm=1.0)
+    assert main(["check", str(folder / "rig.yaml"), "--against", str(folder / "rig.yaml")]) == 0
+    # A second time the rig knows, and the wavelength stays.
+    command[command.index(str(folder / "before.yaml"))] = str(folder / "rig.yaml")
+    assert main(command) == 0
+    assert [laser.wavelength_nm for laser in load_rig(folder / "rig.yaml").lasers] == [
+        wavelength
+    ] * 3
+
+
+def test_lasers_of_which_nothing_is_said_stay_so(calibrated):
+    assert [laser.wavelength_nm for laser in load_rig(calibrated[0] / "rig.yaml").lasers] == [
+        None
+    ] * 3
 
 
 def test_a_damaged_set_changes_the_result(calibrated, tmp_path):

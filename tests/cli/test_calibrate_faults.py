@@ -153,6 +153,25 @@ def test_lasers_need_one_target_of_two_planes(folder, capsys, tmp_path):
     assert "the box has 1 plane" in said
 
 
+@pytest.mark.parametrize("wavelength", ["5320", "0.532", "nan"])
+def test_a_wavelength_that_no_camera_sees(folder, capsys, tmp_path, wavelength):
+    said = fault(
+        capsys,
+        "lasers",
+        folder,
+        "--board",
+        folder / "board.yaml",
+        "--rig",
+        folder / "rig.yaml",
+        "--wavelength-nm",
+        wavelength,
+        "-o",
+        tmp_path / "rig.yaml",
+    )
+    assert f"--wavelength-nm is {wavelength}; write the wavelength in nanometres" in said
+    assert not (tmp_path / "rig.yaml").exists()
+
+
 def test_pictures_of_another_size_than_the_rig(folder, capsys, tmp_path):
     rig = replace(example_rig(), lasers=())
     save_rig(rig, tmp_path / "large.yaml")

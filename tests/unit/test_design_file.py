@@ -1,7 +1,7 @@
 """`design.yaml`: strict, in millimetres and degrees, with faults that name the remedy."""
 
 import math
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +84,9 @@ def test_a_rig_that_exists_is_a_design_with_its_own_lasers():
         assert abs(plane.normal @ laser.plane.normal) == pytest.approx(1.0)
         assert abs(plane.offset) == pytest.approx(abs(laser.plane.offset))
     assert design.mounts[0].fan == pytest.approx(math.pi / 2.0)
+    red = replace(rig, lasers=tuple(replace(one, wavelength_nm=650.0) for one in rig.lasers))
+    kept = design_of_rig(red, 90.0).nominal_rig().lasers
+    assert [laser.wavelength_nm for laser in kept] == [650.0] * len(rig.lasers)
 
 
 @pytest.mark.parametrize(

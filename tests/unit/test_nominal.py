@@ -1,5 +1,7 @@
 """What is known of a rig before any calibration."""
 
+from dataclasses import replace
+
 import pytest
 
 from aqualvs.app.nominal import load_nominal
@@ -13,9 +15,10 @@ def test_a_nominal_file(tmp_path):
     path.write_text(
         "name: blue\nimage: {width: 720, height: 576}\nn_air: 1.0002\nfps: 25\n"
         "dome: {inner_radius_mm: 44.25, thickness_mm: 5.75, n_acrylic: 1.48}\n"
-        "lasers: {count: 3, wavelength_nm: 532}\n"
+        "lasers: {count: 3, wavelength_nm: 650}\n"
     )
     nominal = load_nominal(path)
+    assert nominal.wavelength_nm == 650.0
     assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("blue", (720, 576), 3)
     assert nominal.n_air == 1.0002
     assert nominal.dome is not None
@@ -31,6 +34,19 @@ def test_a_rig_file_serves_too(tmp_path):
     assert nominal.dome == rig.dome
     assert nominal.n_lasers == len(rig.lasers)
     assert nominal.n_water == rig.n_water
+    assert nominal.wavelength_nm is None
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "common"), [((450.0, 450.0, 450.0), 450.0), ((450.0, 450.0, 532.0), None)]
+)
+def test_a_rig_says_what_its_lasers_agree_on(tmp_path, wavelengths, common):
+    rig = example_rig()
+    lasers = tuple(
+        replace(laser, wavelength_nm=nm) for laser, nm in zip(rig.lasers, wavelengths, strict=True)
+    )
+    save_rig(replace(rig, lasers=lasers), tmp_path / "rig.yaml")
+    assert load_nominal(tmp_path / "rig.yaml").wavelength_nm == common
 
 
 @pytest.mark.parametrize(
@@ -38,6 +54,7 @@ def test_a_rig_file_serves_too(tmp_path):
     [
         ("dome: {inner_radius_mm: -3, thickness_mm: 5}", "dome.inner_radius_mm is -3"),
         ("lasers: {cuont: 3}", "lasers"),
+        ("lasers: {count: 3, wavelength_nm: 5320}", "lasers.wavelength_nm is 5320"),
         ("just words", "is not a nominal rig"),
     ],
 )

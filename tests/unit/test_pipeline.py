@@ -15,7 +15,7 @@ from aqualvs.scanning.measure import FitMethod
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Frame, Label, Scan
+from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
@@ -124,6 +124,23 @@ def test_a_wall(target: Plane, grey: bool) -> None:
     assert found.posture.nearest >= 0.99 * found.posture.range
     assert (found.index, found.time_s) == (3, 0.12)
     assert found.n_water == example_rig().n_water
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "bgr"), [(450.0, (1.0, 0.2, 0.1)), (650.0, (0.1, 0.2, 1.0))]
+)
+@pytest.mark.parametrize("make", [example_rig, bluerov2_rig])
+def test_a_wall_under_blue_and_red_lasers(
+    make: Callable[[], Rig], wavelength: float, bgr: tuple[float, float, float]
+) -> None:
+    target, rig = plane(0.55, 6.0, -9.0), make()
+    light = light_on(rig, [(target, everywhere)], ALL)[..., None] * np.array(bgr)
+    light += BACKGROUND + np.random.default_rng(9).normal(0.0, 2.0, light.shape)
+    image = np.clip(np.rint(light), 0, 255).astype(np.uint8)
+    frame = Frame(3, 0.12, *planes_of_image(image))
+    lasers = tuple(replace(laser, wavelength_nm=wavelength) for laser in rig.lasers)
+    # Half of what is searched is chroma of half the size.
+    assert_posture(Scanner(replace(rig, lasers=lasers)).process(frame).posture, target, 0.002, 0.2)
 
 
 @pytest.mark.parametrize("target", [plane(0.5, 5.0, -8.0), plane(1.0, -10.0, 14.0)], ids=str)

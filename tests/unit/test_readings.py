@@ -90,7 +90,7 @@ def test_sigma_grows_with_width_over_height() -> None:
     rig = example_rig()
     plain = returns_of(rig, [(WALL, everywhere)])
     faint = {
-        axis: Returns(found.line, found.position, found.height / 4.0, found.width, found.green_fall)
+        axis: Returns(found.line, found.position, found.height / 4.0, found.width, found.likelihood)
         for axis, found in plain.items()
     }
     one, other = read(rig, plain), read(rig, faint)

@@ -117,7 +117,7 @@ def test_rosbags_understands_every_message(tmp_path, samples):
         for (axis, stripes), part in zip(sample.returns.items(), message.returns, strict=True):
             assert part.axis == axis.value
             assert np.array_equal(part.line, stripes.line)
-            for name in ("position", "height", "width", "green_fall"):
+            for name in ("position", "height", "width", "likelihood"):
                 assert same_bits(getattr(part, name), getattr(stripes, name))
 
 
@@ -209,7 +209,13 @@ def test_the_rig_comes_back_to_the_last_bit(tmp_path, samples):
     # A rotation that no rounded rotation vector leads back to.
     c, s = math.cos(1e-3 / 3), math.sin(1e-3 / 3)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ turn.rotation
-    rig = replace(demo_rig(), dome_from_cam=replace(turn, rotation=rotation), n_water=1 / 0.7477)
+    lasers = tuple(replace(one, wavelength_nm=450.1) for one in demo_rig().lasers)
+    rig = replace(
+        demo_rig(),
+        dome_from_cam=replace(turn, rotation=rotation),
+        n_water=1 / 0.7477,
+        lasers=(demo_rig().lasers[0], *lasers[1:]),
+    )
     path = recorded(tmp_path / "dive.mcap", [replace(samples[0], rig=rig)])
     found = DiveRecording(path).rig
     assert same_bits(found.dome_from_cam.rotation, rotation)
@@ -218,6 +224,7 @@ def test_the_rig_comes_back_to_the_last_bit(tmp_path, samples):
         assert left.name == right.name
         assert same_bits(left.plane.normal, right.plane.normal)
         assert left.plane.offset == right.plane.offset
+        assert left.wavelength_nm == right.wavelength_nm
     assert found.lens == rig.lens
     assert found.dome == rig.dome
     assert (found.n_air, found.n_water) == (rig.n_air, rig.n_water)

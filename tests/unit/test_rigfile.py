@@ -76,7 +76,9 @@ def same(one: Rig, other: Rig, *, rotation_atol: float = 0.0) -> bool:
         == (other.n_air, other.n_water, other.working_range)
         and [laser.name for laser in one.lasers] == [laser.name for laser in other.lasers]
         and all(
-            np.array_equal(a.plane.normal, b.plane.normal) and a.plane.offset == b.plane.offset
+            np.array_equal(a.plane.normal, b.plane.normal)
+            and a.plane.offset == b.plane.offset
+            and a.wavelength_nm == b.wavelength_nm
             for a, b in zip(one.lasers, other.lasers, strict=True)
         )
         and dict(one.solved_from) == dict(other.solved_from)
@@ -207,6 +209,14 @@ def test_lasers_may_be_missing_only_before_their_calibration() -> None:
         ({"lasers__0__offset_mm": ...}, ("lasers[0].offset_mm is missing", "offset_mm: -140")),
         ({"lasers__1__name": "horizontal"}, ("lasers[1].name is 'horizontal'", "lasers[0]")),
         ({"lasers__1__name": ""}, ("lasers[1].name is ''", "name")),
+        (
+            {"lasers__1__wavelength_nm": 5320},
+            ("lasers[1].wavelength_nm is 5320;", "in nanometres, 380 to 780, for example 532"),
+        ),
+        ({"lasers__0__wavelength_nm": 0.532}, ("lasers[0].wavelength_nm is 0.532;", "nanometres")),
+        ({"lasers__0__wavelength_nm": float("nan")}, ("lasers[0].wavelength_nm is nan", "nanom")),
+        ({"lasers__0__wavelength_nm": "red"}, ("lasers[0].wavelength_nm is 'red'", "nanometres")),
+        ({"lasers__0__wave_nm": 532}, ("lasers[0].wave_nm is not a key", "'wavelength_nm'")),
         ({"working_range_mm": [1300, 250]}, ("working_range_mm is [1300, 250]", "nearest")),
         ({"working_range_mm": [0, 250]}, ("working_range_mm[0] is 0", "greater than 0")),
         ({"working_range_mm": [250, 500, 800]}, ("working_range_mm", "2 values")),
@@ -287,6 +297,8 @@ def files(draw: st.DrawFn) -> dict[str, Any]:
         normal = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)
         laser["normal"] = draw(normal.filter(lambda n: np.linalg.norm(n) > 1e-3))
         laser["offset_mm"] = draw(finite)
+        if draw(st.booleans()):
+            laser["wavelength_nm"] = draw(st.floats(380.0, 780.0))
     if draw(st.booleans()):
         content["solved_from"] = {"views": draw(st.integers(0, 99)), "rms_px": draw(finite)}
     return content
@@ -446,6 +458,21 @@ def test_a_window_becomes_si_and_comes_back(tmp_path: Path) -> None:
     assert rig_from_mapping(hand_written(), source_name="x").lasers[0].window is None
     plain = rig_to_mapping(rig_from_mapping(hand_written(), source_name="x"))
     assert all("window" not in laser for laser in plain["lasers"])
+
+
+def test_a_wavelength_is_kept_and_none_is_needed(tmp_path: Path) -> None:
+    rig = rig_from_mapping(hand_written(lasers__0__wavelength_nm=650), source_name="x")
+    assert [laser.wavelength_nm for laser in rig.lasers] == [650.0, None]
+    save_rig(rig, tmp_path / "rig.yaml")
+    written = yaml.safe_load((tmp_path / "rig.yaml").read_text())["lasers"]
+    assert written[0]["wavelength_nm"] == 650.0
+    assert "wavelength_nm" not in written[1]
+    assert same(load_rig(tmp_path / "rig.yaml"), rig)
+    bent = behind_window()
+    bent["lasers"][0]["wavelength_nm"] = 450
+    laser = rig_from_mapping(bent, source_name="x").lasers[0]
+    assert laser.window is not None
+    assert laser.wavelength_nm == 450.0
 
 
 def test_a_windows_normal_may_have_any_length_and_way_round() -> None:

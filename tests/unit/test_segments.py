@@ -38,7 +38,7 @@ def returns_at(*stripes: tuple[IntArray, FloatArray]) -> Returns:
         position=position[order],
         height=np.full(n, 80.0),
         width=np.full(n, 5.0),
-        green_fall=np.full(n, 20.0),
+        likelihood=np.full(n, 20.0),
     )
 
 

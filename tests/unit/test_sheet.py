@@ -12,7 +12,7 @@ from aqualvs.geometry.rays import Rays
 from aqualvs.optics.rig import Laser, Window
 from aqualvs.optics.sheet import Sheet, packed_sheets, sheet_in, sheets_of
 from aqualvs.optics.sheet_kernels import COLUMNS, START
-from aqualvs.optics.uncertainty import tangent_basis
+from aqualvs.optics.uncertainty import moved_plane, tangent_basis
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from optics_cases import central_difference
 from windowed_cases import windowed
@@ -195,7 +195,8 @@ def test_a_plane_is_its_own_best_plane() -> None:
         assert sheet.is_plane
         assert sheet.best_plane(rig.camera(), rig.working_range) is laser.plane
         assert sheet.tangent_plane([0.0, 1.0, 0.0]) is laser.plane
-        assert sheet.laser("x") == Laser("x", laser.plane)
+        red = Laser("x", moved_plane(laser.plane, 0.1, 0.0, 0.0), wavelength_nm=650.0)
+        assert sheet.laser(red) == Laser("x", laser.plane, wavelength_nm=650.0)
 
 
 def test_a_sheet_out_of_sight_has_a_plane_all_the_same() -> None:

@@ -293,6 +293,14 @@ def test_colour_images_become_420_with_rounded_up_chroma(size):
     weights = np.array([24.966, 128.553, 65.481]) / 255  # BT.601 of B, G, R
     # Integer arithmetic inside OpenCV rounds to a grey level.
     np.testing.assert_allclose(luma, 16 + image @ weights, atol=1.0)
+    rows, columns = (2 * side for side in chroma[0].shape)
+    even = np.pad(image, ((0, rows - size[1]), (0, columns - size[0]), (0, 0)), mode="edge")
+    mean = even.reshape(rows // 2, 2, columns // 2, 2, 3).mean(axis=(1, 3))
+    for plane, of in zip(
+        chroma, ((112.0, -74.203, -37.797), (-18.214, -93.786, 112.0)), strict=True
+    ):
+        # The mean is rounded, and what is made of it.
+        np.testing.assert_allclose(plane, 128.0 + mean @ np.array(of) / 255.0, atol=1.01)
 
 
 def test_an_unreadable_image_leaves_a_gap_and_is_named_at_the_end(tmp_path, capfd):

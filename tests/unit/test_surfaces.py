@@ -199,7 +199,7 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
             position=rng.uniform(10.0, length - 10.0, 300),
             height=np.full(300, 30.0),
             width=np.full(300, 4.0),
-            green_fall=np.full(300, 10.0),
+            likelihood=np.full(300, 10.0),
         )
     camera = rig.camera()
     readings = read_returns(returns, plan_searches(rig, camera), Triangulator(rig, camera))

@@ -8,7 +8,7 @@ import numpy as np
 from aqualvs.app.calibrate_common import Found, Tell, find_targets, finish
 from aqualvs.app.calibration_material import Page, ViewRow
 from aqualvs.app.calibration_parts import facts, missed_rows, parameter_rows, residual_map
-from aqualvs.app.nominal import N_LASERS, Nominal, load_nominal
+from aqualvs.app.nominal import N_LASERS, WAVELENGTH_NM, Nominal, load_nominal
 from aqualvs.app.report_findings import Card
 from aqualvs.calibration.camera import CameraCalibration, camera
 from aqualvs.calibration.detection import detect_board
@@ -91,9 +91,9 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
     step = SolvedStep(
         pictures=len(result.views), points=result.n_points, rms_px=result.rms_px, extras={}
     )
-    if nominal.n_lasers is not None:
-        # The lasers' own calibration looks for as many.
-        rig = replace(rig, solved_from={N_LASERS: nominal.n_lasers})
+    # The lasers' own calibration looks for as many, of this colour.
+    said = {N_LASERS: nominal.n_lasers, WAVELENGTH_NM: nominal.wavelength_nm}
+    rig = replace(rig, solved_from={key: value for key, value in said.items() if value is not None})
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)
 
 

@@ -31,7 +31,7 @@ from aqualvs.app.calibration_parts import (
     parameter_rows,
     residual_map,
 )
-from aqualvs.app.nominal import N_LASERS
+from aqualvs.app.nominal import N_LASERS, WAVELENGTH_NM, common_wavelength
 from aqualvs.app.report_findings import Card
 from aqualvs.app.report_words import laser_colour
 from aqualvs.calibration.detection import detect_board, detect_markers
@@ -49,6 +49,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
 from aqualvs.optics.solved import (
     ASSUMED,
     SolvedStep,
@@ -59,7 +60,7 @@ from aqualvs.optics.solved import (
     with_uncertainty,
 )
 from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.scanning.whole_picture import find_stripes
+from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
 
 _DEG = 180.0 / math.pi
 _SHOTS = 6
@@ -79,6 +80,7 @@ class LasersRequest:
     names: tuple[str, ...] | None
     board_offset_mm: float
     refine: bool
+    wavelength_nm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +101,12 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
     AqualvsError
         If a file, a picture or what they say cannot be used.
     """
-    before = load_rig(request.rig, need_lasers=False)
+    before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
+    wavelength_nm = _wavelength(request, before)
     target = _target(request, before)
     check_same_size(before, target.found)
     views = [
-        LaserView(view, _stripes(path, view.name))
+        LaserView(view, _stripes(path, view.name, wavelength_nm))
         for view, path in zip(target.found.views, target.found.paths, strict=True)
     ]
     in_air = abs(target.n_medium - before.n_air) < 1e-3
@@ -118,6 +121,8 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
         ),
         uncertainty=_known(before, request, in_air=in_air),
     )
+    if len(result.lasers) != len(before.lasers):
+        result = replace(result, rig=_coloured(result.rig, wavelength_nm))
     rig = _noted(before, result, request, target)
     for warning in result.warnings:
         tell(f"note: {warning}")
@@ -139,6 +144,26 @@ def _known(rig: Rig, request: LasersRequest, *, in_air: bool) -> RigUncertainty:
     elsewhere = in_air or request.medium is not None
     left_out = {"n_water"} - set(own.names) if elsewhere else set()
     return known.only([name for name in known.names if name not in left_out])
+
+
+def _coloured(rig: Rig, wavelength_nm: float | None) -> Rig:
+    """Return the rig with lasers of this wavelength; as it is where none is given."""
+    if wavelength_nm is None:
+        return rig
+    return replace(
+        rig, lasers=tuple(replace(laser, wavelength_nm=wavelength_nm) for laser in rig.lasers)
+    )
+
+
+def _wavelength(request: LasersRequest, rig: Rig) -> float | None:
+    """Return the lasers' wavelength as far as anybody has said, in nanometres."""
+    given = request.wavelength_nm
+    if given is not None and not LASER_NM[0] <= given <= LASER_NM[1]:
+        raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
+    noted = rig.solved_from.get(WAVELENGTH_NM)
+    if given is None and not rig.lasers and isinstance(noted, int | float):
+        return float(noted)
+    return common_wavelength(rig.lasers) if given is None else given
 
 
 def _expected(request: LasersRequest, rig: Rig) -> int | None:
@@ -179,8 +204,8 @@ def _nearer(n_nominal: float, rig: Rig) -> float:
     return min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
 
 
-def _stripes(path: Path, name: str) -> StripePoints:
-    found = find_stripes(read_colour(path))
+def _stripes(path: Path, name: str, wavelength_nm: float | None) -> StripePoints:
+    found = find_stripes(read_colour(path), WholePictureOptions(wavelength_nm=wavelength_nm))
     return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
 
 

@@ -192,6 +192,14 @@ def lasers(
         str | None,
         typer.Option(metavar="A,B,C", help="Names, left to right by image.", show_default=False),
     ] = None,
+    wavelength_nm: Annotated[
+        float | None,
+        typer.Option(
+            help="Wavelength of the lasers, for example 650 for red ones; without it that of the "
+            "rig's lasers, or else green.",
+            show_default=False,
+        ),
+    ] = None,
     board_offset_mm: Annotated[
         float, typer.Option(help="How far the board stands before the stripes' plane.")
     ] = 0.0,
@@ -215,6 +223,7 @@ def lasers(
             names=None if names is None else tuple(name.strip() for name in names.split(",")),
             board_offset_mm=board_offset_mm,
             refine=refine,
+            wavelength_nm=wavelength_nm,
         ),
         typer.echo,
     )

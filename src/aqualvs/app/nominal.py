@@ -1,6 +1,6 @@
 """What is known of a rig before any calibration: its name, pictures, dome and lasers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,13 +9,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aqualvs.errors import RigError
 from aqualvs.optics.camera import Dome
+from aqualvs.optics.rig import Laser
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigschema import LaserWavelength
 from aqualvs.optics.rigtext import read_yaml
 
 WATER_N = 1.3340
 """Index assumed until something better is known: fresh water of 15 °C under green light."""
 N_LASERS = "n_lasers"
 """Key of `Rig.solved_from` under which a rig without lasers keeps how many it will have."""
+WAVELENGTH_NM = "wavelength_nm"
+"""Likewise for their wavelength, in nanometres."""
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
@@ -34,6 +38,8 @@ class Nominal:
     dome : Dome or None
     n_air, n_water : float
     n_lasers : int or None
+    wavelength_nm : float or None
+        Of the lasers; None if nothing is said, or if they differ.
     working_range : (float, float)
         Metres.
     """
@@ -44,6 +50,7 @@ class Nominal:
     n_air: float = 1.0003
     n_water: float = WATER_N
     n_lasers: int | None = None
+    wavelength_nm: float | None = None
     working_range: tuple[float, float] = (0.25, 1.3)
 
 
@@ -64,7 +71,7 @@ class _Dome(_Part):
 
 class _Lasers(_Part):
     count: _Count
-    wavelength_nm: _Positive = 532.0
+    wavelength_nm: LaserWavelength | None = None
 
 
 class _File(_Part):
@@ -90,6 +97,12 @@ def load_nominal(path: Path) -> Nominal:
     return _of_rig_file(path) if "aqualvs_rig" in content else _of_mapping(content, path)
 
 
+def common_wavelength(lasers: Sequence[Laser]) -> float | None:
+    """Return the wavelength of lasers (nm); None if they differ, or nothing is said of it."""
+    found = {laser.wavelength_nm for laser in lasers}
+    return found.pop() if len(found) == 1 else None
+
+
 def _of_rig_file(path: Path) -> Nominal:
     rig = load_rig(path, need_lasers=False)
     return Nominal(
@@ -99,6 +112,7 @@ def _of_rig_file(path: Path) -> Nominal:
         n_air=rig.n_air,
         n_water=rig.n_water,
         n_lasers=len(rig.lasers) or None,
+        wavelength_nm=common_wavelength(rig.lasers),
         working_range=rig.working_range,
     )
 
@@ -122,4 +136,5 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
         else Dome(part.inner_radius_mm / 1e3, part.thickness_mm / 1e3, part.n_acrylic),
         n_air=file.n_air,
         n_lasers=None if file.lasers is None else file.lasers.count,
+        wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
     )

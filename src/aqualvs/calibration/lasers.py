@@ -208,9 +208,7 @@ def _result_rig(
     rig: Rig, solved: Solved, lasers: Sequence[Laser], doubt: CameraDoubt | None
 ) -> Rig:
     state = solved.state
-    found = tuple(
-        sheet.laser(laser.name) for laser, sheet in zip(lasers, state.sheets, strict=True)
-    )
+    found = tuple(sheet.laser(laser) for laser, sheet in zip(lasers, state.sheets, strict=True))
     if doubt is None:
         return replace(rig, lasers=found)
     n_water = float(state.bundle.media[0]) if doubt.medium_is_water else rig.n_water

@@ -24,8 +24,10 @@ Pixels = Annotated[int, Field(gt=0)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 Name = Annotated[str, Field(min_length=1)]
-# What a silicon camera sees of a laser.
-LaserWavelength = Annotated[float, Field(ge=380.0, le=780.0, allow_inf_nan=False)]
+LASER_NM = (380.0, 780.0)
+"""Least and greatest wavelength of a laser that a silicon camera sees well, in nanometres."""
+LASER_NM_REMEDY = "write the wavelength in nanometres, 380 to 780, for example 532"
+LaserWavelength = Annotated[float, Field(ge=LASER_NM[0], le=LASER_NM[1], allow_inf_nan=False)]
 
 
 class _Part(BaseModel):
@@ -163,6 +165,8 @@ def _sentence(fault: ErrorDetails) -> str:
 
 def _remedy(fault: ErrorDetails) -> str:
     limits = fault.get("ctx", {})
+    if fault["loc"][0] == "lasers" and fault["loc"][-1] == "wavelength_nm":
+        return LASER_NM_REMEDY
     if fault["type"] in _LIMITS:
         return _LIMITS[fault["type"]].format(**limits)
     if fault["type"] in _TYPES:

@@ -99,9 +99,9 @@ class Sheet:
         """What `signed_distance_with_parameter_jacobian` and `moved_by` call parameters."""
         return LASER_PARAMETERS + (() if self.window is None else WINDOW_PARAMETERS)
 
-    def laser(self, name: str) -> Laser:
-        """Return the laser of this sheet, for a rig."""
-        return Laser(name, self.plane, self.window)
+    def laser(self, like: Laser) -> Laser:
+        """Return a laser with this sheet, for a rig; the rest is another's."""
+        return replace(like, plane=self.plane, window=self.window)
 
     def signed_distance(self, points: ArrayLike) -> FloatArray:
         """Return the signed distance (...) of points (..., 3) from the sheet, in metres.

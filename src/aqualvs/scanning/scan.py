@@ -14,6 +14,9 @@ from aqualvs.scanning.posture import Posture, Refusal
 ImagePlane: TypeAlias = NDArray[np.uint8]
 Planes: TypeAlias = tuple[ImagePlane, tuple[ImagePlane, ImagePlane] | None]
 
+# U and V by blue, green, red and 1 (BT.601, limited range).
+_UV_OF_BGR = np.array([[0.4392, -0.2910, -0.1482, 128.0], [-0.0714, -0.3678, 0.4392, 128.0]])
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -47,16 +50,18 @@ def planes_of_image(image: ImagePlane) -> Planes:
     Returns
     -------
     luma, chroma
-        As in `Frame`; BT.601 limited range, as videos have it.
+        As in `Frame`; BT.601 limited range, as videos have it. Chroma is the mean over its four
+        pixels: OpenCV's conversion takes that of one of them, which moves it by half a pixel.
     """
     if image.ndim == 2:
         return image, None
     height, width = image.shape[:2]
     padded = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
     i420: ImagePlane = np.asarray(cv2.cvtColor(padded, cv2.COLOR_BGR2YUV_I420), np.uint8)
-    rows, columns = padded.shape[:2]
-    chroma = i420[rows:].reshape(2, rows // 2, columns // 2)
-    return i420[:height, :width], (chroma[0], chroma[1])
+    half_size = (padded.shape[1] // 2, padded.shape[0] // 2)
+    half = cv2.resize(padded, half_size, interpolation=cv2.INTER_AREA)
+    u, v = (np.asarray(one, np.uint8) for one in cv2.split(cv2.transform(half, _UV_OF_BGR)))
+    return i420[:height, :width], (u, v)
 
 
 class Label(IntEnum):

@@ -105,7 +105,7 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     if any(sum(map(len, points)) < _LEAST_POINTS for points in lit):
         return None
     lasers = (
-        Laser(laser.name, _fitted(np.concatenate(points)))
+        replace(laser, plane=_fitted(np.concatenate(points)), window=None)
         for laser, points in zip(true.lasers, lit, strict=True)
     )
     return replace(believed, lasers=tuple(lasers))

@@ -40,6 +40,8 @@ class Mount:
         Turn of the fan's middle within its sheet, along the stripe's direction, in radians.
     free_tilt, free_stripe : bool
         Whether the best angles are to be found, or these are given.
+    wavelength_nm : float or None
+        As `Laser.wavelength_nm`.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Mount:
     swing: float = 0.0
     free_tilt: bool = True
     free_stripe: bool = False
+    wavelength_nm: float | None = None
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -81,7 +84,7 @@ class Mount:
 
     def laser(self) -> Laser:
         """Return the laser as a rig has it."""
-        return Laser(self.name, self.plane)
+        return Laser(self.name, self.plane, wavelength_nm=self.wavelength_nm)
 
     def aimed_at(self, wall_range: float) -> "Mount":
         """Return the mount with its fan swung so that its middle is abreast of the forward axis."""
@@ -172,6 +175,7 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
         stripe=stripe,
         tilt=0.0,
         fan=fan,
+        wavelength_nm=laser.wavelength_nm,
     )
     beam = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     lean = -float(beam @ mount.axes[1])

@@ -91,7 +91,7 @@ def _behind_window(laser: Laser, source: LaserSource, tilt: float) -> Laser:
 def _with_best_planes(rig: Rig) -> Rig:
     camera = rig.camera()
     lasers = tuple(
-        Laser(laser.name, sheet.best_plane(camera, rig.working_range))
+        replace(laser, plane=sheet.best_plane(camera, rig.working_range), window=None)
         for laser, sheet in zip(rig.lasers, sheets_of(rig), strict=True)
     )
     return replace(rig, lasers=lasers)

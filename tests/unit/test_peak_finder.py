@@ -1,0 +1,222 @@
+"""`PeakFinder` against a slow reference in plain Python, on random pictures."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.scanning.stripe import (
+    HEIGHT,
+    POSITION,
+    STEP_U,
+    STEP_V,
+    TOP,
+    WIDTH,
+    PeakFinder,
+    SearchImage,
+)
+
+U8 = NDArray[np.uint8]
+GREEN = np.array([[-0.29, -0.957]])
+NO_CHROMA = np.empty((0, 0), np.uint8)
+
+
+class Peak(NamedTuple):
+    """What the reference says of a peak."""
+
+    line: int
+    position: float
+    height: float
+    width: float
+    top: int
+
+
+def background_of(row: list[int], reach: int) -> list[int]:
+    """The higher of the least values of `reach` pixels to either side, the pixel's own included."""
+    return [
+        max(min(row[max(i - reach + 1, 0) : i + 1]), min(row[i : i + reach]))
+        for i in range(len(row))
+    ]
+
+
+def pieces(run: list[int], base: int) -> list[tuple[int, int]]:
+    """Part a run where a valley has less than 0.6 of the lower of two peaks above the base."""
+    start, found = 0, []
+    while start < len(run):
+        peak, end = start, len(run)
+        for at in range(start + 1, len(run)):
+            behind = run[peak:at]
+            valley, lower = min(behind), min(run[at], run[peak])
+            place = peak + behind.index(valley)
+            if place > start and run[at] >= valley and 10 * (valley - base) < 6 * (lower - base):
+                end = place
+                break
+            peak = at if run[at] > run[peak] else peak
+        found.append((start, end))
+        start = end
+    return found
+
+
+def peaks_of(row: list[int], x: int, low: int, high: int, contrast: int, reach: int) -> list[Peak]:
+    n, background = len(row), background_of(row, reach)
+    first, end = max(low - reach, 0), min(high + reach + 1, n)
+    above = [first <= i < end and row[i] - background[i] >= contrast for i in range(n)] + [False]
+    found, i = [], first
+    while i < end:
+        if not above[i]:
+            i += 1
+            continue
+        stop = above.index(False, i)
+        if i <= high and stop > low:
+            found += _peaks_of_run(row, background, x, i, stop, reach)
+        i = stop
+    return found
+
+
+def _peaks_of_run(
+    row: list[int], background: list[int], x: int, start: int, stop: int, reach: int
+) -> list[Peak]:
+    found = []
+    parts = pieces(row[start:stop], background[start])
+    for k, (one, other) in enumerate(parts):
+        mine = row[start + one : start + other]
+        peak = start + one + mine.index(max(mine))
+        # Feet are looked for as far as the valleys beside the peak, or beyond the run's ends.
+        least = max(start - reach, 0) if k == 0 else start + one
+        most = min(stop + reach, len(row)) - 1 if k == len(parts) - 1 else start + other
+        level = (row[peak] + background[peak]) / 2
+        a = next((i for i in range(peak, least - 1, -1) if row[i] <= level), None)
+        b = next((i for i in range(peak, most + 1) if row[i] <= level), None)
+        if a is None or b is None or max(row[a : b + 1]) > row[peak]:
+            continue
+        left = a + (level - row[a]) / (row[a + 1] - row[a])
+        right = b - (level - row[b]) / (row[b - 1] - row[b])
+        if right - left > reach:
+            continue
+        over = [(i, row[i] - level) for i in range(a + 1, b)]
+        centre = sum(i * value for i, value in over) / sum(value for _, value in over)
+        height = row[peak] - background[peak]
+        found.append(Peak(x, centre, height, right - left, row[peak]))
+    return found
+
+
+def finder(
+    shape: tuple[int, int], low: IntArray, high: IntArray, reach: int, capacity: int = 100_000
+) -> PeakFinder:
+    return PeakFinder(shape[1], low, high, reach, capacity, GREEN)
+
+
+def picture(rng: np.random.Generator, shape: tuple[int, int], kind: str) -> U8:
+    if kind == "noise":
+        return rng.integers(0, 256, shape, dtype=np.uint8)
+    if kind == "few levels":
+        return np.asarray(40 * rng.integers(0, 5, shape), np.uint8)
+    x = np.arange(shape[1])
+    light = np.zeros(shape)
+    for _ in range(6):
+        at, sigma = rng.uniform(0.0, shape[1]), rng.uniform(0.7, 6.0)
+        light += rng.uniform(20.0, 250.0) * np.exp(-0.5 * ((x - at) / sigma) ** 2)
+    light += rng.normal(0.0, 3.0, shape)
+    return np.clip(np.rint(30.0 + light), 0, 255).astype(np.uint8)
+
+
+def assert_same(line: IntArray, table: FloatArray, expected: list[Peak]) -> None:
+    np.testing.assert_array_equal(line, [one.line for one in expected])
+    np.testing.assert_array_equal(table[HEIGHT], [one.height for one in expected])
+    np.testing.assert_array_equal(table[TOP], [one.top for one in expected])
+    # Sums in another order.
+    rounding = {"rtol": 0.0, "atol": 1e-9}
+    np.testing.assert_allclose(table[POSITION], [one.position for one in expected], **rounding)
+    np.testing.assert_allclose(table[WIDTH], [one.width for one in expected], **rounding)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_lines=st.integers(1, 5),
+    length=st.integers(1, 150),
+    reach=st.integers(2, 40),
+    contrast=st.sampled_from([1, 6, 20, 90]),
+    every=st.sampled_from([1, 2, 3]),
+    kind=st.sampled_from(["noise", "few levels", "stripes"]),
+)
+def test_peaks_are_those_of_the_reference(
+    seed: int, n_lines: int, length: int, reach: int, contrast: int, every: int, kind: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    lines = picture(rng, (n_lines, length), kind)
+    # Bands of all kinds, empty ones among them.
+    low, high = rng.integers(0, length, (2, n_lines))
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, True, 1)
+    found = finder(lines.shape, low, high, reach).find(image, contrast, every)
+    expected = [
+        peak
+        for x in range(0, n_lines, every)
+        if low[x] <= high[x]
+        for peak in peaks_of(
+            [int(value) for value in lines[x]], x, int(low[x]), int(high[x]), contrast, reach
+        )
+    ]
+    assert_same(*found, expected)
+
+
+def test_the_background_is_the_higher_of_the_two_sliding_minima() -> None:
+    row = np.full(60, 20, np.uint8)
+    row[30:] = 90
+    row[28:31] = [120, 150, 120]
+    whole = np.array([0]), np.array([59])
+    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, True, 1)
+    _, table = finder((1, 60), *whole, 10).find(image, 6)
+    # A stripe on the edge of a box counts from the brighter side.
+    np.testing.assert_array_equal(table[HEIGHT], [60.0])
+    row[40:] = 20
+    _, table = finder((1, 60), *whole, 40).find(image, 6)
+    # Within reach the box has another side, and is dark behind it: all of it stands out.
+    np.testing.assert_array_equal(table[HEIGHT], [130.0])
+
+
+def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
+    rng = np.random.default_rng(4)
+    lines = picture(rng, (20, 400), "noise")
+    low, high = np.zeros(20, np.int64), np.full(20, 399)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, True, 1)
+    roomy = finder(lines.shape, low, high, 12)
+    sizes = {contrast: len(roomy.find(image, contrast)[0]) for contrast in (10, 20, 40, 80, 160)}
+    tight = finder(lines.shape, low, high, 12, capacity=sizes[40] + 1)
+    line, table = tight.find(image, 10)
+    assert sizes[10] > sizes[40] == len(line) > 0
+    assert_same(
+        line,
+        table,
+        [
+            peak
+            for x in range(20)
+            for peak in peaks_of([int(value) for value in lines[x]], x, 0, 399, 40, 12)
+        ],
+    )
+
+
+@pytest.mark.parametrize("line_px", [1, 2])
+@pytest.mark.parametrize("along_x", [True, False])
+def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(along_x: bool, line_px: int) -> None:
+    length, n_lines = 80, 24
+    lines = np.full((n_lines, length), 60, np.uint8)
+    lines[:, 38:43] = [80, 120, 160, 120, 80]
+    half_lines = n_lines * line_px // 2
+    u, v = (
+        np.full((half_lines, length // 2), 118, np.uint8),
+        np.full((half_lines, 40), 124, np.uint8),
+    )
+    u[:, 18:23], v[:, 18:23] = 108, 94
+    if not along_x:
+        u, v = u.T.copy(), v.T.copy()
+    low, high = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
+    image = SearchImage(lines, u, v, along_x, line_px)
+    line, table = finder(lines.shape, low, high, 12).find(image, 6)
+    np.testing.assert_array_equal(line, np.arange(n_lines))
+    np.testing.assert_allclose(table[STEP_U], -10.0)
+    np.testing.assert_allclose(table[STEP_V], -30.0)
