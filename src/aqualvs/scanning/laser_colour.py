@@ -292,7 +292,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
 def _learn_from_crowd(
     table: FloatArray, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """Return the fields of a `LineColour`, given that most peaks are paint; a ratio of 0 if unknown."""
+    """Return the fields of a `LineColour` where most peaks are paint; a ratio of 0 if unknown."""
     sigma = _noise(table)
     height = table[HEIGHT]
     of_u, of_v = table[STEP_U] / height, table[STEP_V] / height
