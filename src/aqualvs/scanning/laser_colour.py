@@ -34,6 +34,8 @@ _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # by what shares of their mean step half of them scatter at most, and are taken to at least.
 _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.3
 _BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
+# So many peaks are enough to learn from.
+_ENOUGH = 2500
 # So tall peaks, so many times as many as the lasers can make, are mostly paint. Lines then lie so
 # many standard deviations off it, and it spreads by so much at least, as chroma for each level.
 _TALL, _CROWD, _CLEAR_OF_PAINT, _LEAST_SPREAD, _MAD_TO_SIGMA = 20.0, 2.0, 4.0, 0.02, 1.4826
@@ -172,13 +174,15 @@ def learn_colour(
     LineColour or None
         None where too few peaks are clearly of the laser's colour.
     """
+    every = 1 + table.shape[1] // _ENOUGH
+    table, n_possible = table[:, ::every], n_possible / every
     tall = np.flatnonzero(table[HEIGHT] >= _TALL)
     if len(tall) > _CROWD * n_possible:
         crowded = LineColour(*_learn_from_crowd(table[:, tall], *colour.value))
         # A sample may hold too few lines to find them in a crowd, where all peaks do not.
         if crowded.ratio > 0.0 or is_sample:
             return crowded if crowded.ratio > 0.0 else None
-    found = LineColour(*_learn(table, *colour.value))
+    found = LineColour(*_learn(np.ascontiguousarray(table), *colour.value))
     return found if found.ratio > 0.0 else None
 
 
@@ -231,7 +235,8 @@ def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
 def element_at(values: FloatArray, share: float) -> float:
     """Return the value that a share of the values exceeds no more: one of them; 0 of none."""
     n = values.shape[0]
-    return float(np.sort(values)[int(share * (n - 1))]) if n else 0.0
+    rank = int(share * (n - 1))
+    return float(np.partition(values, rank)[rank]) if n else 0.0
 
 
 @inline_kernel
