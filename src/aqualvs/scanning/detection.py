@@ -193,15 +193,15 @@ class FrameDetector:
         """
         most = _MOST_PEAKS * self._n_possible / _SAMPLE_EVERY
         heights = np.sort(sample[HEIGHT])[::-1]
-        crowded = float(heights[int(most)]) if len(heights) > most else 0.0
+        crowded = round(min(heights[int(most)], HIGHEST_USEFUL)) if len(heights) > most else 0
         if not has_colour:
-            return round(crowded), []
+            return crowded, []
         colours = [
             learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY, is_sample=True)
             for colour in self._colours
         ]
         useful = useful_height(sample[HEIGHT], self._likelihood(sample, colours))
-        return max(useful, round(min(crowded, HIGHEST_USEFUL))), colours
+        return max(useful, crowded), colours
 
     def _likelihood(self, table: FloatArray, known: Sequence[LineColour | None]) -> FloatArray:
         """Return how likely each peak is laser light of any of the colours.

@@ -32,7 +32,7 @@ _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # many standard deviations and so many levels, within an angle of this cosine to the wavelength's
 # direction, and at least a share of the largest for their height; how many of them it takes, and
 # by what shares of their mean step half of them scatter at most, and are taken to at least.
-_MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.3
+_MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.2
 _BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
 # So many peaks are enough to learn from.
 _ENOUGH = 2500
