@@ -275,7 +275,9 @@ def test_stripes_side_by_side_far_away_do_not_fix_a_plane() -> None:
     """Two lasers 13 mm apart on a net at 1.7 m: the plane could turn about them."""
     rig = replace(example_rig(), working_range=(0.3, 1.8))
     first = rig.lasers[0]
-    second = replace(first, plane=Plane(first.plane.normal, first.plane.offset + 0.013))
+    second = replace(
+        first, name="beside", plane=Plane(first.plane.normal, first.plane.offset + 0.013)
+    )
     found = scan(
         [(plane(1.7), strands)],
         rig=replace(rig, lasers=(first, second)),

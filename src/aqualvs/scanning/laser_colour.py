@@ -37,8 +37,10 @@ _BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
 # So many peaks are enough to learn from.
 _ENOUGH = 2500
 # So tall peaks, so many times as many as the lasers can make, are mostly paint. Lines then lie so
-# many standard deviations off it, and it spreads by so much at least, as chroma for each level.
-_TALL, _CROWD, _CLEAR_OF_PAINT, _LEAST_SPREAD, _MAD_TO_SIGMA = 20.0, 2.0, 4.0, 0.02, 1.4826
+# many standard deviations off it, and it spreads by so much at least and at most, as chroma for
+# each level.
+_TALL, _CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 20.0, 2.0, 4.0, 1.4826
+_LEAST_SPREAD, _MOST_PAINT_SPREAD = 0.02, 0.07
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least and the most that is believed of a learned one, and how far paint
 # and glare spread about none. Lines of nine cameras show 0.15 to 0.7.
@@ -179,8 +181,10 @@ def learn_colour(
     tall = np.flatnonzero(table[HEIGHT] >= _TALL)
     if len(tall) > _CROWD * n_possible:
         crowded = LineColour(*_learn_from_crowd(table[:, tall], *colour.value))
-        # A sample may hold too few lines to find them in a crowd, where all peaks do not.
-        if crowded.ratio > 0.0 or is_sample:
+        # Peaks of one colour, and so no mixture of lines and noise. A sample may hold too few lines
+        # to find them in a crowd, where all peaks do not.
+        is_paint = crowded.spread_u * crowded.spread_v < _MOST_PAINT_SPREAD**2
+        if is_paint and (crowded.ratio > 0.0 or is_sample):
             return crowded if crowded.ratio > 0.0 else None
     found = LineColour(*_learn(np.ascontiguousarray(table), *colour.value))
     return found if found.ratio > 0.0 else None
@@ -308,7 +312,7 @@ def _learn_from_crowd(
     off_v = (of_v - paint_v) / np.hypot(spread_v, sigma / height)
     is_near = u * of_u + v * of_v > _LEAST_COSINE * np.hypot(of_u, of_v)
     best = np.flatnonzero(is_near & (np.hypot(off_u, off_v) > _CLEAR_OF_PAINT))
-    nothing = (u, v, 0.0, sigma, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+    nothing = (u, v, 0.0, sigma, paint_u, paint_v, spread_u, spread_v, 1.0, 1.0)
     if best.shape[0] < _MIN_LEARNED:
         return nothing
     line_u, line_v = element_at(of_u[best], 0.5), element_at(of_v[best], 0.5)
