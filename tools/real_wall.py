@@ -229,9 +229,9 @@ def measure(source: Path, rig: Path, out: Path, more: Sequence[str] = ()) -> lis
 
 
 def _sigma(row: dict[str, str], what: str) -> float:
-    """Return the total sigma of a row where the file has one, else that of the frame's noise."""
-    total = [name for name in row if "total" in name and what in name]
-    return float(row[total[0] if total else f"sigma_{what}"])
+    """Return the total sigma of a row: what the frame's noise and the rig make of it."""
+    kind, unit = what.rsplit("_", 1)
+    return float(row[f"sigma_{kind}_total_{unit}"])
 
 
 def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose) -> Measured:
