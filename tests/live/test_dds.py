@@ -106,7 +106,7 @@ def test_values_arrive(
 def check_values(listener: Listener, sample: LiveSample, *, variance: bool) -> None:
     posture = sample.scan.posture
     assert posture
-    pose = plane_pose(posture.range, posture.pitch, posture.yaw, posture.covariance)
+    pose = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
     message = listener.messages("/aqualvs/posture")[-1]
     assert message["header"]["frame_id"] == "aqualvs_dome"
     assert [*message["pose"]["pose"]["position"].values()] == pose.position.tolist()
@@ -117,7 +117,7 @@ def check_values(listener: Listener, sample: LiveSample, *, variance: bool) -> N
     assert message["range"] == np.float32(posture.range)
     assert message["radiation_type"] == 1
     if variance:
-        assert message["variance"] == np.float32(posture.covariance[0, 0])
+        assert message["variance"] == np.float32(posture.total_covariance[0, 0])
 
     cloud = listener.messages("/aqualvs/cloud")[-1]
     assert cloud["width"] == len(sample.scan.points)

@@ -176,8 +176,10 @@ def test_the_autopilot_gets_what_was_measured(lab: Lab) -> None:
     found = peer.wait_for("DISTANCE_SENSOR")["fields"]
     assert found["current_distance"] == round(100 * posture.range)
     assert (found["min_distance"], found["max_distance"]) == (29, 101)
-    # 0 is a laser that looks forward; 1 cm² is the least variance above none.
-    assert (found["type"], found["orientation"], found["covariance"]) == (0, 0, 1)
+    # 0 is a laser that looks forward; the rig's part of the variance counts, in cm².
+    variance = round(1e4 * float(posture.total_covariance[0, 0]))
+    assert variance > round(1e4 * float(posture.covariance[0, 0]))
+    assert (found["type"], found["orientation"], found["covariance"]) == (0, 0, variance)
     assert 2 <= found["signal_quality"] <= 100
     assert found["time_boot_ms"] == SAMPLE.instants.arrived_ns // 1_000_000
     value = peer.wait_for("NAMED_VALUE_FLOAT", name="aq_range")["fields"]["value"]

@@ -186,7 +186,7 @@ def test_values_arrive(
 def check_values(listener: Listener, sample: LiveSample) -> None:
     posture = sample.scan.posture
     assert posture
-    pose = plane_pose(posture.range, posture.pitch, posture.yaw, posture.covariance)
+    pose = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
     first, *_, message = listener.messages("/aqualvs/posture")
     assert message["header"]["frame_id"] == "aqualvs_dome"
     assert message["header"]["seq"] > first["header"]["seq"]
