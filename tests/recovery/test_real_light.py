@@ -81,7 +81,7 @@ def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
 
 
 def test_two_photographs_of_fifteen_lines_are_too_few(wall, tmp_path) -> None:
-    """Two boards do not tell which of 15 near-parallel lines belong together; nothing is written."""
+    """Two boards do not tell which of 15 lines belong together; nothing is written."""
     pictures = sorted(PHOTOGRAPHS.glob("*.jpg"))
     assert wall.calibrate(pictures, tmp_path, rig=wall.rig_text(CROP)) is None
     said = (tmp_path / "calibrate.txt").read_text()

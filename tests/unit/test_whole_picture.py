@@ -86,7 +86,10 @@ def test_how_likely_a_piece_must_be_laser_light_is_an_option() -> None:
     image[100:104, 40:300] = (100, 112, 100)
     paint = [
         np.count_nonzero(np.abs(distances(find_stripes(image, options), line)) > 2.0)
-        for options in (WholePictureOptions(), WholePictureOptions(min_likelihood=0.99))
+        for options in (
+            WholePictureOptions(min_likelihood=0.3),
+            WholePictureOptions(min_likelihood=0.99),
+        )
     ]
     assert paint[0] > 200
     assert paint[1] == 0

@@ -134,11 +134,12 @@ def check_count(
     ]
     if unmatched:
         longest = max(unmatched, key=lambda line: len(line.members))
-        many = "" if len(unmatched) == 1 else f" and {len(unmatched) - 1} shorter ones"
+        alone = len(unmatched) == 1
+        rest = "belongs" if alone else f"and {len(unmatched) - 1} shorter ones belong"
         words.append(
             f"a stripe of {len(longest.members)} points "
-            f"({_where(longest.patch, views, surfaces)}){many} belong to no laser; "
-            "reflections, perhaps"
+            f"({_where(longest.patch, views, surfaces)}) {rest} to no laser; "
+            f"{'a reflection' if alone else 'reflections'}, perhaps"
         )
     return words
 
