@@ -19,7 +19,7 @@ from aqualvs.scanning.laser_colour import (
 )
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
-from aqualvs.scanning.search_image import SearchLines, U8Array
+from aqualvs.scanning.search_image import SearchLines
 from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
     HEIGHT,
@@ -28,6 +28,7 @@ from aqualvs.scanning.stripe import (
     Returns,
     SearchImage,
     StripeOptions,
+    U8Array,
 )
 from aqualvs.scanning.threshold import ThresholdDetector, ThresholdOptions
 
@@ -87,6 +88,14 @@ class FrameDetector:
             if isinstance(options, StripeOptions)
             else {}
         )
+        self._threshold = (
+            {
+                axis: ThresholdDetector(axis, size_px, *band, options)
+                for axis, band in self._bands.items()
+            }
+            if isinstance(options, ThresholdOptions)
+            else {}
+        )
         width, height = size_px
         self._lines = {axis: SearchLines(size_px, axis, self._line_px) for axis in self._bands}
         self._luma = np.empty((height, width), np.uint8)
@@ -130,10 +139,8 @@ class FrameDetector:
         if isinstance(self._options, ThresholdOptions):
             np.copyto(self._luma, frame.luma)
             return {
-                axis: ThresholdDetector(axis, self._size_px, *band, self._options).detect(
-                    self._lines[axis].of(self._luma)
-                )
-                for axis, band in self._bands.items()
+                axis: detector.detect(self._lines[axis].of(self._luma))
+                for axis, detector in self._threshold.items()
             }
         return self._find_stripes(frame, self._options)
 

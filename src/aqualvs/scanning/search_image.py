@@ -1,15 +1,12 @@
 """Search images: a picture as each search direction sees it, with search lines as rows."""
 
-from typing import TypeAlias
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.search import SearchAxis
-
-U8Array: TypeAlias = NDArray[np.uint8]
+from aqualvs.scanning.stripe import U8Array
 
 
 class SearchLines:
