@@ -97,3 +97,10 @@ def test_check_tells_a_sane_rig_from_a_useless_one(tmp_path, capsys):
     assert "This rig cannot measure" in capsys.readouterr().out
     assert main(["check", str(tmp_path / "missing.yaml")]) == 2
     assert "missing.yaml" in capsys.readouterr().err
+
+
+def test_a_fault_is_one_line_whatever_the_file_is_called(tmp_path, capsys):
+    assert main(["check", str(tmp_path / "rig\nof\x1b[31mmine.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "rig\\nof\\x1b[31mmine.yaml: no such file" in error

@@ -189,5 +189,7 @@ def _usage(fault: Exception) -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"aqualvs: error: {message}", file=sys.stderr)
+    # Names of files, and values in them, may hold line feeds and other control characters.
+    line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message)
+    print(f"aqualvs: error: {line}", file=sys.stderr)
     return code
