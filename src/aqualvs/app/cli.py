@@ -92,7 +92,7 @@ app.command(
 )(board)
 app.command(
     help="Say in words whether a rig is sane and what it can measure.",
-    epilog="Example: aqualvs check rig.yaml --against rig.before.yaml",
+    epilog="Example: aqualvs check rig.yaml --against last",
 )(check)
 app.command(
     help="Predict what a camera, a dome and lasers would measure, and tilt the lasers best. "
