@@ -39,6 +39,7 @@ DetectorOptions = StripeOptions | ThresholdOptions
 _SAMPLE_EVERY, _MOST_PEAKS = 48, 3.0
 # What the frame's bright returns are as high as.
 _BRIGHT_QUANTILE = 0.9
+_CACHE_LINE = 8  # numbers of 64 bits
 # An overexposed line is no wider than this share of the picture.
 _WIDEST_WHITE = 0.02
 
@@ -85,9 +86,10 @@ class FrameDetector:
             else {}
         )
         self._room = options.max_returns
-        # Peaks of all directions, one after the other.
+        # Peaks of all directions, one after the other. Rows of a length that is a power of two would
+        # all fall on the same few places of the processor's cache.
         self._line = np.empty(len(self._finders) * self._room, np.int64)
-        self._table = np.empty((N_MEASURES, len(self._line)))
+        self._table = np.empty((N_MEASURES, len(self._line) + _CACHE_LINE))
         self._threshold = (
             {
                 axis: ThresholdDetector(axis, size_px, *band, options)
@@ -173,10 +175,14 @@ class FrameDetector:
         }
 
     def _brightest(self, frame: Frame) -> U8Array:
-        """Return the picture in which the lasers stand out best; the next call overwrites it."""
-        np.copyto(self._luma, channel_image(frame, self._colours[0]))
-        for colour in self._colours[1:]:
-            np.maximum(self._luma, channel_image(frame, colour), out=self._luma)
+        """Return the picture in which the lasers stand out best; the next call may overwrite it."""
+        first, *others = (channel_image(frame, colour) for colour in self._colours)
+        # Kernels are compiled for arrays that are contiguous and may be written to.
+        if not others and first.flags.carray:
+            return first
+        np.copyto(self._luma, first)
+        for image in others:
+            np.maximum(self._luma, image, out=self._luma)
         return self._luma
 
     def _find(
