@@ -31,6 +31,19 @@ FAST_EVERY, SLOW_EVERY, STICKS_EVERY = 2, 10, 3
 GUIDED_LAPSE_S = 3.0
 MANUAL, GUIDED = 19, 4
 STATION = (255, 190)
+# As ArduSub 4.7 has them after a reset, with its names.
+PARAMETERS = {
+    "MAV_GCS_SYSID": 255.0,
+    "MAV_GCS_SYSID_HI": 0.0,
+    "FS_PILOT_INPUT": 2.0,
+    "FS_PILOT_TIMEOUT": 3.0,
+    "FS_GCS_ENABLE": 2.0,
+    "JS_GAIN_DEFAULT": 0.5,
+    "JS_THR_GAIN": 1.0,
+    "PILOT_SPEED_UP": 500.0,
+    "PILOT_SPEED_DN": 0.0,
+    "RNGFND1_TYPE": 0.0,
+}
 # For system 1, in body axes (BODY_NED, BODY_FRD), with all but speeds and turning rate left out.
 SPEEDS_ALONE = ((1, 8, 1479), (1, 12, 1479))
 
@@ -79,6 +92,8 @@ class Vehicle:
         Nothing comes from it and nothing reaches it.
     beat_s : float
         Heartbeats come so far apart, and at once when the mode changes.
+    parameters : dict
+        What it answers when asked; it stays silent about all others, as ArduPilot does.
     """
 
     motion: Motion
@@ -99,6 +114,7 @@ class Vehicle:
     speeds: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     speeds_at: float = -math.inf
     beat_at: float = 0.0
+    parameters: dict[str, float] = field(default_factory=lambda: dict(PARAMETERS))
 
     def play(self, event: dict[str, Any]) -> None:
         """Play a scripted event: set what it names."""
@@ -186,6 +202,14 @@ class Wire:
         if v.station:
             self.station.heartbeat_send(6, 8, 0, 0, 4)
 
+    def answer(self, message: Any, v: Vehicle) -> None:
+        """Tell a parameter that was asked for."""
+        asked = (message.target_system, message.target_component, message.param_index)
+        if asked == (1, 1, -1) and message.param_id in v.parameters:
+            name, value = message.param_id, v.parameters[message.param_id]
+            kind = mavlink.MAV_PARAM_TYPE_REAL32
+            self.link.mav.param_value_send(name.encode(), value, kind, len(v.parameters), 0)
+
     def tell_sticks(self, v: Vehicle) -> None:
         """Pass the pilot's sticks on, and obey them."""
         if v.joystick is not None:
@@ -221,6 +245,8 @@ def read_all(wire: Wire, v: Vehicle) -> None:
         if message.get_type() != "BAD_DATA" and not v.away:
             heard(message)
             v.hear(message, time.monotonic())
+            if message.get_type() == "PARAM_REQUEST_READ":
+                wire.answer(message, v)
 
 
 def listen(script: "queue.Queue[str]", v: Vehicle) -> None:

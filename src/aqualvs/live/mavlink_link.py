@@ -6,6 +6,7 @@ import selectors
 import struct
 import threading
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,9 @@ _MAX_KINDS = 1024
 # What a serial driver already holds delays a message by so much at most; beyond, it is dropped.
 _PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
 _ARDUPILOT, _NO_AUTOPILOT = 3, 8
+_AUTOPILOT_COMPONENT = 1
+# ArduPilot queues 20 requests at most (GCS_Param.cpp), and a lost datagram loses some.
+_ASKED_AT_ONCE, _ASK_AGAIN_S, _ANSWER_POLL_S = 10, 0.3, 0.01
 _ARDUPILOT_NAMES = {1: "ArduPlane", 2: "ArduCopter", 10: "ArduRover", 11: "ArduBoat", 12: "ArduSub"}
 _AUTOPILOT_NAMES = {_ARDUPILOT: "ArduPilot", 12: "PX4"}
 
@@ -93,6 +97,7 @@ class MavlinkLink:
         _check_id("component", component)
         self.url = url
         self.system = system
+        self._autopilot_ids = (system, _AUTOPILOT_COMPONENT)
         self.dialect: Any = _dialect()
         self._address = parse_address(url)
         check_address(self._address)
@@ -113,6 +118,7 @@ class MavlinkLink:
         self._n_unsent = 0
         self._receiving = threading.Lock()
         self._inbox: dict[tuple[str, int, int], Received] = {}
+        self._parameters: dict[str, float] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"mavlink {url}", daemon=True)
         self._thread.start()
@@ -169,6 +175,45 @@ class MavlinkLink:
                 and component in (None, of_component)
             ]
         return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
+        """Ask the autopilot for parameters and wait for the answers.
+
+        Parameters
+        ----------
+        names : iterable of str
+            As ArduPilot calls them, such as `RC4_DZ`.
+        patience_s : float
+            How long to ask and wait, in seconds.
+
+        Returns
+        -------
+        parameters : dict of str to float
+            In the autopilot's units. A parameter that the autopilot does not have, or did not
+            answer in time, is left out.
+        """
+        wanted = list(dict.fromkeys(names))
+        with self._receiving:
+            for name in wanted:
+                self._parameters.pop(name, None)
+        end_s = time.monotonic() + patience_s
+        missing = wanted
+        while missing and time.monotonic() < end_s and not self._closing.is_set():
+            asked = missing[:_ASKED_AT_ONCE]
+            self._ask(asked)
+            again_s = min(time.monotonic() + _ASK_AGAIN_S, end_s)
+            while time.monotonic() < again_s and not all(map(self._parameters.__contains__, asked)):
+                time.sleep(_ANSWER_POLL_S)
+            # Those that stay silent go to the end, so that the others are asked for.
+            rotated = [*missing[_ASKED_AT_ONCE:], *asked]
+            missing = [name for name in rotated if name not in self._parameters]
+        with self._receiving:
+            return {name: self._parameters[name] for name in wanted if name in self._parameters}
+
+    def _ask(self, names: list[str]) -> None:
+        request = self.dialect.MAVLink_param_request_read_message
+        for name in names:
+            self.send(request(self.system, _AUTOPILOT_COMPONENT, name.encode("ascii"), -1))
 
     def autopilot(self) -> Received | None:
         """Return the last heartbeat of the own vehicle's autopilot, None if none has come."""
@@ -308,6 +353,9 @@ class MavlinkLink:
             entry = Received(message, received_ns, system, component)
             with self._receiving:
                 self._inbox[kind, system, component] = entry
+                if kind == "PARAM_VALUE" and (system, component) == self._autopilot_ids:
+                    # ArduPilot casts integers to float; it does not copy their bits.
+                    self._parameters[message.param_id] = float(message.param_value)
                 if len(self._inbox) > _MAX_KINDS:
                     del self._inbox[next(iter(self._inbox))]
 
