@@ -92,6 +92,8 @@ class Vehicle:
         Nothing comes from it and nothing reaches it.
     beat_s : float
         Heartbeats come so far apart, and at once when the mode changes.
+    halves : bool
+        Half a message goes out before each of its own, as of somebody behind its router.
     parameters : dict
         What it answers when asked; it stays silent about all others, as ArduPilot does.
     """
@@ -108,6 +110,7 @@ class Vehicle:
     beats: bool = True
     away: bool = False
     decoy: bool = True
+    halves: bool = False
     sticks: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     sticks_at: float = -math.inf
     lapsed: bool = True
@@ -165,10 +168,11 @@ class Vehicle:
 class Wire:
     """Two senders on one socket: the vehicle, and the ground station behind its router."""
 
-    def __init__(self, port: int) -> None:
-        self.link = mavutil.mavlink_connection(
-            f"udpin:127.0.0.1:{port}", source_system=1, source_component=1
-        )
+    def __init__(self, port: int, to: int) -> None:
+        url = f"udpout:127.0.0.1:{to}" if to else f"udpin:127.0.0.1:{port}"
+        self.link = mavutil.mavlink_connection(url, source_system=1, source_component=1)
+        if to:
+            self.link.port.bind(("127.0.0.1", port))
         self.port = int(self.link.port.getsockname()[1])
         self.station = mavlink.MAVLink(self.link, *STATION)
         self.extra = mavlink.MAVLink(self.link, 1, 194)
@@ -264,6 +268,9 @@ def read_script(script: "queue.Queue[str]") -> None:
 
 
 def speak(wire: Wire, v: Vehicle, i: int, now: float) -> None:
+    if v.halves:
+        # Announces 255 bytes more than follow.
+        wire.link.write(b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00")
     if i % FAST_EVERY == 0:
         wire.tell_fast(v)
     if i % SLOW_EVERY == 0:
@@ -278,6 +285,7 @@ def speak(wire: Wire, v: Vehicle, i: int, now: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--to", type=int, default=0, help="speak to this port first")
     parser.add_argument("--distance", type=float, default=0.9)
     parser.add_argument("--angle", type=float, default=0.0)
     parser.add_argument("--gain", type=float, default=1.0)
@@ -286,7 +294,7 @@ def main() -> None:
     args = parser.parse_args()
     script: queue.Queue[str] = queue.Queue()
     threading.Thread(target=read_script, args=(script,), daemon=True).start()
-    wire = Wire(args.port)
+    wire = Wire(args.port, args.to)
     motion = Motion(args.distance, args.angle)
     v = Vehicle(motion, gain=args.gain, lapse_s=args.lapse, beat_s=args.beat)
     say(port=wire.port)

@@ -31,9 +31,11 @@ class Wire:
         self.heard: dict[tuple[str, int, int], Received] = {}
         self.sent: list[Any] = []
         self.works = True
+        self.conflict = ""
 
-    def send(self, *messages: Any, urgent: bool = False) -> bool:
+    def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
         assert urgent
+        assert to_vehicle
         reader = dialect.MAVLink(None)
         for message in messages if self.works else ():
             self.sent.extend(reader.parse_buffer(message.pack(self.packer)))
@@ -47,10 +49,13 @@ class Wire:
     ) -> Received | None:
         found = [
             entry
-            for (name, s, c), entry in self.heard.items()
-            if name == kind and system in (None, s) and component in (None, c)
+            for entry in self.every(kind)
+            if system in (None, entry.system) and component in (None, entry.component)
         ]
         return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def every(self, kind: str) -> list[Received]:
+        return [entry for (name, *_), entry in self.heard.items() if name == kind]
 
     def put(
         self, kind: str, sender: tuple[int, int] = (1, 1), age_s: float = 0.0, **f: Any
@@ -120,12 +125,24 @@ def test_only_the_autopilots_own_heartbeat_counts(wire: Wire, vehicle: ArduSubLi
 
 def test_no_ground_station_no_efforts(wire: Wire) -> None:
     wire.put("HEARTBEAT", (255, 190), age_s=3.5, type=6, autopilot=8, base_mode=0)
-    assert on(wire).state().mode is Mode.UNKNOWN
+    assert on(wire).state().mode is Mode.NO_STATION
     assert on(wire, station_timeout_s=5.0).state().mode is Mode.OURS
     assert on(wire, station_timeout_s=None).state().mode is Mode.OURS
-    assert on(wire, station_timeout_s=5.0, ground_station=254).state().mode is Mode.UNKNOWN
+    assert on(wire, station_timeout_s=5.0, ground_station=254).state().mode is Mode.NO_STATION
     wire.put("HEARTBEAT", (255, 190), type=18, autopilot=8, base_mode=0)
-    assert on(wire).state().mode is Mode.UNKNOWN
+    assert on(wire).state().mode is Mode.NO_STATION
+
+
+def test_a_missing_ground_station_is_named_with_the_one_that_is_there(wire: Wire) -> None:
+    state = on(wire, ground_station=250).state()
+    assert state.mode_name == "ALT_HOLD; no heartbeat of ground station 250, but of 255"
+
+
+def test_heartbeats_that_contradict_each_other_are_no_mode_of_ours(wire: Wire) -> None:
+    wire.conflict = "heartbeats contradict each other"
+    state = on(wire).state()
+    assert state.mode is Mode.CONFLICT
+    assert "contradict" in state.mode_name
 
 
 def test_heard_between_heartbeats_by_attitude(wire: Wire, vehicle: ArduSubLink) -> None:
@@ -185,6 +202,14 @@ def test_joystick_of_the_ground_station(
     assert vehicle.state().pilot_moves is moves
     wire.put("MANUAL_CONTROL", (255, 190), age_s=1.1, **axes)
     assert not vehicle.state().pilot_moves
+
+
+def test_one_who_holds_his_sticks_still_does_not_hide_another(
+    wire: Wire, vehicle: ArduSubLink
+) -> None:
+    wire.put("MANUAL_CONTROL", (255, 190), age_s=0.1, x=500, y=0, z=500, r=0)
+    wire.put("MANUAL_CONTROL", (255, 1), x=0, y=0, z=500, r=0)
+    assert vehicle.state().pilot_moves
 
 
 def channels(**moved: int) -> dict[str, int]:

@@ -40,8 +40,12 @@ class Mode(StrEnum):
     """A mode in which the vehicle takes our efforts (depth hold: it keeps its own depth)."""
     PILOT = "pilot"
     """Any other: manual, stabilise, surface."""
+    NO_STATION = "no_station"
+    """Ours, but the ground station that must be there is not heard."""
+    CONFLICT = "conflict"
+    """Messages in the vehicle's name contradict each other."""
     UNKNOWN = "unknown"
-    """Nothing heard yet."""
+    """Nothing heard yet, or nothing that could be steered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -217,7 +217,8 @@ class ArduSubLink:
         with self._sending:
             if self.options.command is Command.STICKS:
                 self._sticks.note(sticks_of(effort))
-            sent = self.link.send(self._commander.message(effort), urgent=True)
+            message = self._commander.message(effort)
+            sent = self.link.send(message, urgent=True, to_vehicle=True)
             self._sent_s = time.monotonic() if sent else self._sent_s
         return sent
 
@@ -228,8 +229,10 @@ class ArduSubLink:
         name = SUB_MODES.get(heard.custom_mode, f"mode {heard.custom_mode}")
         if name not in self.options.own_modes:
             return Mode.PILOT, name
+        if self.link.conflict:
+            return Mode.CONFLICT, f"{name}; {self.link.conflict}"
         if not self._is_supervised():
-            return Mode.UNKNOWN, f"{name}, no ground station"
+            return Mode.NO_STATION, f"{name}; {self._missing_station()}"
         return Mode.OURS, name
 
     def _is_supervised(self) -> bool:
@@ -241,6 +244,16 @@ class ArduSubLink:
         if beat is None or beat.message.type != _GROUND_STATION:
             return False
         return beat.age_s < timeout_s
+
+    def _missing_station(self) -> str:
+        """Say which ground station is missing, and which is there instead."""
+        wanted = f"no heartbeat of ground station {self.options.ground_station}"
+        others = {
+            beat.system
+            for beat in self.link.every("HEARTBEAT")
+            if beat.message.type == _GROUND_STATION and beat.age_s < _BEATS_WITHIN_S
+        } - {self.options.ground_station}
+        return f"{wanted}, but of {', '.join(map(str, sorted(others)))}" if others else wanted
 
     def _heard_s(self, beat: Received) -> float:
         """Return when the vehicle was heard last.

@@ -8,6 +8,8 @@ from aqualvs.control.safety import Reason
 from aqualvs.control.vehicle import Effort, VehicleState
 from aqualvs.live.health import State
 
+_TELL_MODE = (Reason.PILOT_MODE, Reason.NO_STATION, Reason.CONFLICT, Reason.UNKNOWN_MODE)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PilotReport:
@@ -43,7 +45,7 @@ class PilotReport:
     def words(self) -> str:
         """What it does, or why it does not, in one line."""
         told = self.reason.words if self.reason else _aim(self.guidance)
-        if self.reason is Reason.PILOT_MODE and self.state.mode_name:
+        if self.reason in _TELL_MODE and self.state.mode_name:
             told = f"{told} ({self.state.mode_name})"
         return told
 
