@@ -168,7 +168,7 @@ class Vehicle:
 class Wire:
     """Two senders on one socket: the vehicle, and the ground station behind its router."""
 
-    def __init__(self, port: int, to: int) -> None:
+    def __init__(self, port: int, to: int, key: bytes) -> None:
         url = f"udpout:127.0.0.1:{to}" if to else f"udpin:127.0.0.1:{port}"
         self.link = mavutil.mavlink_connection(url, source_system=1, source_component=1)
         if to:
@@ -176,6 +176,9 @@ class Wire:
         self.port = int(self.link.port.getsockname()[1])
         self.station = mavlink.MAVLink(self.link, *STATION)
         self.extra = mavlink.MAVLink(self.link, 1, 194)
+        if key:
+            self.link.setup_signing(key)
+            self.station.signing = self.extra.signing = self.link.mav.signing
         self.started = time.monotonic()
 
     def tell_fast(self, v: Vehicle) -> None:
@@ -286,6 +289,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--to", type=int, default=0, help="speak to this port first")
+    parser.add_argument("--key", type=bytes.fromhex, default=b"", help="sign, and take signed only")
     parser.add_argument("--distance", type=float, default=0.9)
     parser.add_argument("--angle", type=float, default=0.0)
     parser.add_argument("--gain", type=float, default=1.0)
@@ -294,7 +298,7 @@ def main() -> None:
     args = parser.parse_args()
     script: queue.Queue[str] = queue.Queue()
     threading.Thread(target=read_script, args=(script,), daemon=True).start()
-    wire = Wire(args.port, args.to)
+    wire = Wire(args.port, args.to, args.key)
     motion = Motion(args.distance, args.angle)
     v = Vehicle(motion, gain=args.gain, lapse_s=args.lapse, beat_s=args.beat)
     say(port=wire.port)

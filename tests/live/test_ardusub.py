@@ -33,6 +33,9 @@ class Wire:
         self.works = True
         self.conflict = ""
 
+    def make_packer(self, system: int, component: int) -> Any:
+        return dialect.MAVLink(None, system, component)
+
     def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
         assert urgent
         assert to_vehicle

@@ -7,6 +7,7 @@ vehicle must be told neutral in time.
 import contextlib
 import os
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
 
 pytest.importorskip("pymavlink")
 
@@ -72,6 +73,7 @@ class Strangers:
     says: list[bytes]
     count: int = 20
     every_s: float = 0.02
+    host: str = "127.0.0.1"
     got: list[bytes] = field(default_factory=list)
 
     def __enter__(self) -> "Strangers":
@@ -89,7 +91,7 @@ class Strangers:
             made = []
             for _ in range(self.count):
                 one = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                one.bind(("127.0.0.1", 0))
+                one.bind((self.host, 0))
                 one.setblocking(False)
                 made.append(one)
             while not self._stop.wait(self.every_s):
@@ -224,3 +226,52 @@ def test_centred_sticks_of_strangers_do_not_hide_the_pilots(dive: Dive) -> None:
         time.sleep(0.2)
         at = dive.fake.play(joystick={"y": -600})
         assert_released(dive, at)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="one address for this computer")
+def test_peers_that_may_not_speak_are_not_heard(vehicle: Fake) -> None:
+    vehicle.play(**AT_START)
+    link = MavlinkLink(f"udpin:127.0.0.1:{PORT}", LinkOptions(peers=("127.0.0.1",)))
+    with contextlib.closing(Dive(vehicle, link=link)) as one:
+        pushed(one)
+        with Strangers(PORT, [beat(19), sticks(900)], count=3, host="127.0.0.2") as strangers:
+            time.sleep(0.5)
+            assert one.pilot.engaged
+            assert_neutral_without_video(one)
+        assert not strangers.got
+
+
+def test_a_vehicle_that_may_not_speak_is_named(vehicle: Fake) -> None:
+    vehicle.play(**AT_START)
+    link = MavlinkLink(f"udpin:127.0.0.1:{PORT}", LinkOptions(peers=("192.0.2.1",)))
+    with contextlib.closing(link):
+        until(lambda: "127.0.0.1 is none of the peers" in link.health().detail, "a word on it")
+        assert link.autopilot() is None
+
+
+KEY = bytes(range(32))
+
+
+def test_only_who_has_the_key_is_heard_and_steered() -> None:
+    port = free_port()
+    fake = Fake("--to", str(port), "--lapse", "0.5", "--key", KEY.hex())
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", LinkOptions(key=KEY))
+    with contextlib.ExitStack() as stack:
+        stack.callback(fake.stop)
+        one = stack.enter_context(contextlib.closing(Dive(fake, link=link)))
+        pushed(one)
+        # The vehicle takes signed messages only, so it obeys: ours are signed.
+        until(lambda: abs(fake.truths[-1]["sticks"][0]) > 0.05, "sticks that are obeyed")
+        with Strangers(port, [beat(19), sticks(900)], count=3) as strangers:
+            time.sleep(0.5)
+            assert one.pilot.engaged
+            assert_neutral_without_video(one)
+        assert not strangers.got
+
+
+def test_a_vehicle_without_the_key_is_told(vehicle: Fake) -> None:
+    vehicle.play(**AT_START)
+    link = MavlinkLink(f"udpin:127.0.0.1:{PORT}", LinkOptions(key=KEY))
+    with contextlib.closing(link):
+        until(lambda: "not signed with our key" in link.health().detail, "a word on it")
+        assert link.autopilot() is None

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.live.mavlink_link import LinkOptions
 from aqualvs.live.outputs.mavlink import (
     FILTERED_NAMES,
     NAMES,
@@ -278,7 +278,7 @@ def test_a_speed_that_the_system_does_not_know_is_refused() -> None:
 @pytest.mark.parametrize(("name", "value"), [("system", 0), ("component", 256)])
 def test_ids_out_of_range_are_refused(name: str, value: int) -> None:
     with pytest.raises(OptionError, match=f"{name} id {value}"):
-        MavlinkLink("udpout:127.0.0.1:9", **{name: value})
+        LinkOptions(**{name: value})
 
 
 def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

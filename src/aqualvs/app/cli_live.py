@@ -5,7 +5,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.app.cli_options import Celsius, IndexTarget, Salinity, Target, WaterIndex
+from aqualvs.app.cli_options import (
+    Celsius,
+    IndexTarget,
+    MavlinkKey,
+    MavlinkPeer,
+    Salinity,
+    Target,
+    WaterIndex,
+)
 
 
 def live(
@@ -17,6 +25,8 @@ def live(
         list[str] | None,
         typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
     ] = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
     json: Annotated[
         list[str] | None, typer.Option(help="Send lines of JSON by UDP to HOST:PORT; repeatable.")
     ] = None,
@@ -83,6 +93,7 @@ def live(
     """Measure live."""
     from aqualvs.app import live as body
     from aqualvs.app.live_outputs import OutputRequest
+    from aqualvs.app.mavlink_options import link_options
     from aqualvs.app.run_inputs import Water, scanner_options
 
     request = body.LiveRequest(
@@ -91,6 +102,7 @@ def live(
         feed=body.FeedRequest(fps=fps, size=size, pixel_format=pixel_format, transport=transport),
         outputs=OutputRequest(
             mavlink=tuple(mavlink or ()),
+            link=link_options(mavlink_peer, mavlink_key),
             json=tuple(json or ()),
             ros2=ros2,
             ros1=ros1,
@@ -120,8 +132,12 @@ def doctor(
     mavlink: Annotated[
         str | None, typer.Option(help="Autopilot to listen for.", show_default=False)
     ] = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
 ) -> None:
     """Look at the machine."""
     from aqualvs.app.doctor import DoctorRequest, run_doctor
+    from aqualvs.app.mavlink_options import link_options
 
-    raise typer.Exit(run_doctor(DoctorRequest(source=source, rig=rig, mavlink=mavlink)))
+    link = link_options(mavlink_peer, mavlink_key)
+    raise typer.Exit(run_doctor(DoctorRequest(source=source, rig=rig, mavlink=mavlink, link=link)))

@@ -206,12 +206,8 @@ class ArduSubLink:
                 speed=options.speed,
                 turning_rate=options.turning_rate,
             )
-        return StickCommander(
-            link.dialect,
-            target=link.system,
-            system=options.ground_station,
-            component=_SENDER,
-        )
+        packer = link.make_packer(options.ground_station, _SENDER)
+        return StickCommander(link.dialect, packer, target=link.system)
 
     def _send(self, effort: Effort) -> bool:
         with self._sending:

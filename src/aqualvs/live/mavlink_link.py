@@ -6,13 +6,14 @@ import selectors
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from aqualvs.errors import OptionError
 from aqualvs.live.health import PartHealth, State
 from aqualvs.live.mavlink_peers import MOVES_AFTER_S, Peer, PeerTable
-from aqualvs.live.outputs.mavlink_address import SerialAddress, parse_address
+from aqualvs.live.mavlink_signing import Signer
+from aqualvs.live.outputs.mavlink_address import AllowedPeers, SerialAddress, parse_address
 from aqualvs.live.outputs.mavlink_ports import Port, check_address, open_port, why
 
 MAV_COMP_ID_ONBOARD_COMPUTER = 191
@@ -66,6 +67,42 @@ class Received:
         return 1e-9 * (time.monotonic_ns() - self.received_ns)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkOptions:
+    """Who we are on a connection, and who may speak to us.
+
+    Attributes
+    ----------
+    system : int
+        Own system id; that of the vehicle, whose part this computer is.
+    component : int
+        Own component id.
+    peers : tuple of str
+        Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
+        everybody if empty. Other connections hear one peer only.
+    key : bytes or None
+        Of MAVLink 2 signing, see `load_key`: what is sent is signed, and what is not signed with
+        it is not heard. None: nothing is signed, and nothing checked.
+    """
+
+    system: int = 1
+    component: int = MAV_COMP_ID_ONBOARD_COMPUTER
+    peers: tuple[str, ...] = ()
+    key: bytes | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        _check_id("system", self.system)
+        _check_id("component", self.component)
+        AllowedPeers(self.peers)
+
+
 class MavlinkLink:
     """Sends and receives MAVLink 2 as an onboard computer.
 
@@ -80,13 +117,13 @@ class MavlinkLink:
     ----------
     url : str
         See `parse_address`.
-    system : int
-        Own system id; that of the vehicle, whose part this computer is.
-    component : int
-        Own component id.
+    options : LinkOptions, optional
+        Defaults if left out.
 
     Attributes
     ----------
+    system : int
+        System id of the vehicle, and our own.
     dialect : module
         pymavlink's messages and constants (ardupilotmega, which holds all common ones).
 
@@ -96,18 +133,16 @@ class MavlinkLink:
         If the address makes no sense, or pymavlink is not installed.
     """
 
-    def __init__(
-        self, url: str, *, system: int = 1, component: int = MAV_COMP_ID_ONBOARD_COMPUTER
-    ) -> None:
-        _check_id("system", system)
-        _check_id("component", component)
+    def __init__(self, url: str, options: LinkOptions | None = None) -> None:
+        options = options or LinkOptions()
         self.url = url
-        self.system = system
+        self.system = system = options.system
         self._autopilot_ids = (system, _AUTOPILOT_COMPONENT)
         self.dialect: Any = _dialect()
         self._address = parse_address(url)
         check_address(self._address)
-        self._packer = self.dialect.MAVLink(None, system, component)
+        self._signer = None if options.key is None else Signer(self.dialect, options.key)
+        self._packer = self.make_packer(system, options.component)
         self._heartbeat = self.dialect.MAVLink_heartbeat_message(
             self.dialect.MAV_TYPE_ONBOARD_CONTROLLER,
             self.dialect.MAV_AUTOPILOT_INVALID,
@@ -126,9 +161,17 @@ class MavlinkLink:
         self._inbox: dict[str, dict[tuple[int, int, Peer], Received]] = {}
         self._parameters: dict[str, float] = {}
         self._closing = threading.Event()
+        self._allowed, self._n_foreign, self._foreign = AllowedPeers(options.peers), 0, ""
         self._peers = PeerTable(self._make_parser, (self.dialect.MAVError,), system)
         self._thread = threading.Thread(target=self._run, name=f"mavlink {url}", daemon=True)
         self._thread.start()
+
+    def make_packer(self, system: int, component: int) -> Any:
+        """Return a packer of pymavlink for another sender's name on this connection."""
+        packer = self.dialect.MAVLink(None, system, component)
+        if self._signer is not None:
+            self._signer.sign(packer)
+        return packer
 
     def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
         """Send messages together, in one datagram where there are datagrams; never waits.
@@ -272,7 +315,12 @@ class MavlinkLink:
         others = [beat for beat in self._autopilots() if beat.age_s < SILENT_AFTER_S]
         if others:
             return f"no heartbeat of sysid {self.system}, but of {_name(others[-1])}"
-        return f"no heartbeat of sysid {self.system} yet"
+        told = f"no heartbeat of sysid {self.system} yet"
+        if self._signer is not None and self._signer.n_refused:
+            told += f"; {self._signer.n_refused} messages are not signed with our key, or are old"
+        if self._n_foreign:
+            told += f"; {self._foreign} is none of the peers that may speak"
+        return told
 
     def _autopilots(self) -> list[Received]:
         beats = self.every("HEARTBEAT")
@@ -288,6 +336,8 @@ class MavlinkLink:
             vehicle = self._peers.vehicle if port.many else ()
             if port.lag_s > patience_s or (to_vehicle and vehicle is None):
                 return False
+            if self._signer is not None:
+                self._signer.advance()
             frames = b"".join([self._packed(message) for message in messages])
             if to_vehicle and vehicle is not None:
                 return port.write(frames, vehicle)
@@ -364,6 +414,8 @@ class MavlinkLink:
     def _make_parser(self) -> Any:
         parser = self.dialect.MAVLink(None)
         parser.robust_parsing = True
+        if self._signer is not None:
+            self._signer.check(parser)
         return parser
 
     def _read(self, port: Port) -> None:
@@ -372,6 +424,9 @@ class MavlinkLink:
             data, peer = port.read()
             if not data:
                 return
+            if peer not in self._allowed:
+                self._n_foreign, self._foreign = self._n_foreign + 1, str(peer[0])
+                continue
             for message in self._peers.decode(peer, data, whole=port.whole):
                 if self._peers.admit(peer, message):
                     self._keep(peer, message)
