@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fake_ardusub import PARAMETERS
 
 from aqualvs.control.autopilot import NetPilot
 from aqualvs.control.mission import HoldMission
@@ -43,6 +44,10 @@ AT_START = {
     "beats": True,
     "away": False,
     "halves": False,
+    "channels_told": True,
+    "parameters": PARAMETERS,
+    "station_id": 255,
+    "obeys": 255,
     "lapsed": True,
     "sticks": [0.0, 0.0, 0.0, 0.0],
     "speeds": [0.0, 0.0, 0.0, 0.0],

@@ -31,6 +31,7 @@ from fake_ardusub_cases import (
     FRAME_S,
     MARGIN_S,
     PATIENCE_S,
+    STEERED,
     WITHIN_S,
     Dive,
     Fake,
@@ -64,7 +65,7 @@ def fake(vehicle: Fake) -> Iterator[Fake]:
     yield vehicle
     for message in vehicle.wire[n:]:
         kind, sender = message["kind"], (message["system"], message["component"])
-        assert kind in ("HEARTBEAT", "MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
+        assert kind in ("HEARTBEAT", "PARAM_REQUEST_READ", *STEERED)
         if kind == "MANUAL_CONTROL":
             fields = message["fields"]
             assert sender == (255, 191)

@@ -12,6 +12,7 @@ from aqualvs.app.cli_options import (
     MavlinkPeer,
     Salinity,
     Target,
+    VehicleFileOption,
     WaterIndex,
 )
 
@@ -25,6 +26,7 @@ def live(
         list[str] | None,
         typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
     ] = None,
+    vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,
     json: Annotated[
@@ -93,7 +95,7 @@ def live(
     """Measure live."""
     from aqualvs.app import live as body
     from aqualvs.app.live_outputs import OutputRequest
-    from aqualvs.app.mavlink_options import link_options
+    from aqualvs.app.mavlink_options import vehicle_setup
     from aqualvs.app.run_inputs import Water, scanner_options
 
     request = body.LiveRequest(
@@ -102,7 +104,7 @@ def live(
         feed=body.FeedRequest(fps=fps, size=size, pixel_format=pixel_format, transport=transport),
         outputs=OutputRequest(
             mavlink=tuple(mavlink or ()),
-            link=link_options(mavlink_peer, mavlink_key),
+            link=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key).link,
             json=tuple(json or ()),
             ros2=ros2,
             ros1=ros1,
@@ -132,12 +134,14 @@ def doctor(
     mavlink: Annotated[
         str | None, typer.Option(help="Autopilot to listen for.", show_default=False)
     ] = None,
+    vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,
 ) -> None:
     """Look at the machine."""
     from aqualvs.app.doctor import DoctorRequest, run_doctor
-    from aqualvs.app.mavlink_options import link_options
+    from aqualvs.app.mavlink_options import vehicle_setup
 
-    link = link_options(mavlink_peer, mavlink_key)
-    raise typer.Exit(run_doctor(DoctorRequest(source=source, rig=rig, mavlink=mavlink, link=link)))
+    setup = vehicle_setup(vehicle_file, mavlink_peer, mavlink_key)
+    request = DoctorRequest(source=source, rig=rig, mavlink=mavlink, vehicle=setup)
+    raise typer.Exit(run_doctor(request))

@@ -44,6 +44,15 @@ IndexTarget = Annotated[
         show_default=False,
     ),
 ]
+VehicleFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--vehicle-file",
+        metavar="FILE",
+        help="MAVLink: system ids, ground station, modes, peers, key (YAML; docs/ardusub.md).",
+        show_default=False,
+    ),
+]
 MavlinkPeer = Annotated[
     list[str] | None,
     typer.Option(

@@ -23,11 +23,12 @@ from aqualvs.control.safety import SafetyGate
 from aqualvs.control.setpoint import SetpointHolder
 from aqualvs.errors import AqualvsError
 from aqualvs.live.ardusub_link import ArduSubLink
-from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
+from aqualvs.live.mavlink_link import MavlinkLink
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import Pilot
 from aqualvs.live.runner import FixedScanner, LiveRunner
 from aqualvs.live.time_filter import PostureFilter
+from aqualvs.live.vehicle_file import VehicleSetup
 from aqualvs.live.warm_up import warm_up
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 
@@ -43,8 +44,8 @@ class FollowRequest:
     rig : Path
     mavlink : str
         Address of the vehicle.
-    link : LinkOptions
-        Of that connection.
+    vehicle : VehicleSetup
+        Who is there, and how it is steered.
     gains : str
         Gains file, or the name of a vehicle whose gains come with the package.
     out : Path
@@ -65,7 +66,7 @@ class FollowRequest:
     gains: str
     out: Path
     aim: Aim
-    link: LinkOptions = field(default_factory=LinkOptions)
+    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
     feed: FeedRequest = field(default_factory=FeedRequest)
     dashboard: str | None = None
     token: str | None = None
@@ -92,8 +93,8 @@ def follow_and_tell(
     steering = NetPilot(mission, RangeYawController(load_gains(request.gains)), SafetyGate(limits))
     scanner = Scanner(rig, request.scanner)
     warm_up(scanner)
-    with contextlib.closing(MavlinkLink(request.mavlink, request.link)) as link:
-        pilot = Pilot(steering, ArduSubLink(link), holder)
+    with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
+        pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
         runner = _runner(request, scanner, pilot, holder, tell)
         tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
         listen(pilot, sys.stdin if keys is None else keys, tell)

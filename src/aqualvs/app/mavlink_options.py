@@ -1,25 +1,34 @@
-"""From the words of the command line to the options of a MAVLink connection."""
+"""From the words of the command line to a vehicle on MAVLink."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from aqualvs.live.mavlink_link import LinkOptions
 from aqualvs.live.mavlink_signing import load_key
+from aqualvs.live.vehicle_file import VehicleSetup, load_vehicle
 
 
-def link_options(peers: Sequence[str] | None, key: Path | None) -> LinkOptions:
-    """Return the options of a connection.
+def vehicle_setup(file: Path | None, peers: Sequence[str] | None, key: Path | None) -> VehicleSetup:
+    """Return who the vehicle is and how it is steered.
 
     Parameters
     ----------
+    file : Path or None
+        `--vehicle-file`; defaults if left out.
     peers : sequence of str or None
-        `--mavlink-peer`.
+        `--mavlink-peer`; instead of those of the file.
     key : Path or None
-        `--mavlink-key`.
+        `--mavlink-key`; instead of the file's.
 
     Raises
     ------
     OptionError
-        If a peer is no address, or the file holds no key.
+        If a file cannot be used, or a peer is no address.
     """
-    return LinkOptions(peers=tuple(peers or ()), key=None if key is None else load_key(key))
+    setup = VehicleSetup() if file is None else load_vehicle(file)
+    link = setup.link
+    if peers:
+        link = replace(link, peers=tuple(peers))
+    if key is not None:
+        link = replace(link, key=load_key(key))
+    return replace(setup, link=link)

@@ -22,6 +22,7 @@ class Reason(StrEnum):
     DISARMED = "disarmed"
     PILOT_MODE = "pilot_mode"
     NO_STATION = "no_station"
+    IGNORED = "ignored"
     CONFLICT = "conflict"
     UNKNOWN_MODE = "unknown_mode"
     PILOT_STICKS = "pilot_sticks"
@@ -51,6 +52,7 @@ _WORDS = {
     Reason.DISARMED: "the vehicle is disarmed; arm it and engage again",
     Reason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
     Reason.NO_STATION: "no ground station heard; stopped until engaged again",
+    Reason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
     Reason.CONFLICT: "somebody else speaks as the vehicle; stopped until engaged again",
     Reason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
     Reason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
@@ -70,6 +72,7 @@ _TAKES_OVER = frozenset(
         Reason.DISARMED,
         Reason.PILOT_MODE,
         Reason.NO_STATION,
+        Reason.IGNORED,
         Reason.CONFLICT,
         Reason.UNKNOWN_MODE,
         Reason.PILOT_STICKS,
@@ -80,6 +83,7 @@ _TAKES_OVER = frozenset(
 _REFUSED_MODES = {
     Mode.PILOT: Reason.PILOT_MODE,
     Mode.NO_STATION: Reason.NO_STATION,
+    Mode.IGNORED: Reason.IGNORED,
     Mode.CONFLICT: Reason.CONFLICT,
     Mode.UNKNOWN: Reason.UNKNOWN_MODE,
 }

@@ -5,6 +5,7 @@ import importlib
 import selectors
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -160,6 +161,7 @@ class MavlinkLink:
         self._receiving = threading.Lock()
         self._inbox: dict[str, dict[tuple[int, int, Peer], Received]] = {}
         self._parameters: dict[str, float] = {}
+        self._n_received: Counter[str] = Counter()
         self._closing = threading.Event()
         self._allowed, self._n_foreign, self._foreign = AllowedPeers(options.peers), 0, ""
         self._peers = PeerTable(self._make_parser, (self.dialect.MAVError,), system)
@@ -259,21 +261,32 @@ class MavlinkLink:
         missing = wanted
         while missing and time.monotonic() < end_s and not self._closing.is_set():
             asked = missing[:_ASKED_AT_ONCE]
-            self._ask(asked)
+            self.ask_parameters(asked)
             again_s = min(time.monotonic() + _ASK_AGAIN_S, end_s)
             while time.monotonic() < again_s and not all(map(self._parameters.__contains__, asked)):
                 time.sleep(_ANSWER_POLL_S)
             # Those that stay silent go to the end, so that the others are asked for.
             rotated = [*missing[_ASKED_AT_ONCE:], *asked]
             missing = [name for name in rotated if name not in self._parameters]
-        with self._receiving:
-            return {name: self._parameters[name] for name in wanted if name in self._parameters}
+        known = self.parameters()
+        return {name: known[name] for name in wanted if name in known}
 
-    def _ask(self, names: list[str]) -> None:
+    def ask_parameters(self, names: Iterable[str]) -> None:
+        """Ask the autopilot for parameters, ten at once at most; returns at once."""
         request = self.dialect.MAVLink_param_request_read_message
         for name in names:
             asked = request(self.system, _AUTOPILOT_COMPONENT, name.encode("ascii"), -1)
             self.send(asked, to_vehicle=True)
+
+    def parameters(self) -> dict[str, float]:
+        """Return the parameters that the autopilot has told, whoever asked for them."""
+        with self._receiving:
+            return dict(self._parameters)
+
+    def n_received(self, kind: str) -> int:
+        """Return how many messages of a kind have come from the vehicle's autopilot."""
+        with self._receiving:
+            return self._n_received[kind]
 
     def autopilot(self) -> Received | None:
         """Return the last heartbeat of the own vehicle's autopilot, None if none has come."""
@@ -442,6 +455,7 @@ class MavlinkLink:
             if len(latest) > _MAX_SENDERS:
                 others = [key for key in latest if key[0] != self.system]
                 del latest[(others or list(latest))[0]]
+            self._n_received[kind] += sender == self._autopilot_ids
             if kind == "PARAM_VALUE" and sender == self._autopilot_ids:
                 # ArduPilot casts integers to float; it does not copy their bits.
                 self._parameters[message.param_id] = float(message.param_value)
