@@ -142,9 +142,6 @@ _USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
 _EXIT_BROKEN_PIPE = 141
-# As characters that would break the line, and others that do not print, are shown.
-_ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160))}
-_ESCAPES |= {0x0A: "\\n", 0x0D: "\\r", 0x09: "\\t", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 
 
 @app.callback(invoke_without_command=True)
@@ -206,7 +203,9 @@ def _usage(fault: Exception) -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"aqualvs: error: {message.translate(_ESCAPES)}", file=sys.stderr)
+    # Names of files, and values in them, may hold line feeds and other control characters.
+    line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message)
+    print(f"aqualvs: error: {line}", file=sys.stderr)
     return code
 
 

@@ -18,16 +18,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import yaml
-
 from aqualvs.app.append_file import locked_folder
 from aqualvs.app.disk import explain, writing
 from aqualvs.app.journal import PointsJournal, check_idle
 from aqualvs.app.points_export import DRAFT, PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv
-from aqualvs.app.runfile import RunFile, Status, now, write_yaml
+from aqualvs.app.runfile import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.app.tally import Tally, tally_of
-from aqualvs.errors import OutputError
+from aqualvs.errors import OutputError, SourceError
 from aqualvs.scanning.scan import Scan
 
 POSTURE_CSV = "posture.csv"
@@ -253,10 +251,10 @@ def _mend_run_file(folder: Path) -> None:
     """Replace the status of a run that could not say how it ended."""
     path = folder / RUN_YAML
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError):
+        content = read_run_yaml(folder)
+    except SourceError:
         return
-    if not isinstance(content, dict) or content.get("status") != Status.RUNNING:
+    if content.get("status") != Status.RUNNING:
         return
     known = {"status", "started", "ended", "error", "summary"}
     head = {

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import yaml
 from pyarrow import csv
 
 from aqualvs.app.outputs import POSTURE_BARE_CSV
+from aqualvs.app.runfile import read_run_yaml
 from aqualvs.app.truth import read_truth as truth_by_frame
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -30,8 +30,6 @@ _NUMBERS = (
     "n_water",
 )
 _TOTALS = tuple(name for name in _NUMBERS if "_total_" in name)
-# The one in C is ten times as fast; not every build of PyYAML has it.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TRUE = ("true", "1", "yes")
 POSTURE = ("range_m", "pitch_deg", "yaw_deg")
 """The three columns of a posture, in the order of every (N, 3) array of the report."""
@@ -84,16 +82,12 @@ def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
 
     An interrupted run may have left none or half of one; the report is still worth having.
     """
-    path = run_dir / "run.yaml"
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_LOADER)
-    except FileNotFoundError:
+    if not (run_dir / "run.yaml").exists():
         return {}, "run.yaml is missing: rig, options and source are unknown."
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+    try:
+        return read_run_yaml(run_dir), ""
+    except SourceError:
         return {}, "run.yaml cannot be read: rig, options and source are unknown."
-    if not isinstance(content, dict):
-        return {}, "run.yaml is empty or not a mapping: rig, options and source are unknown."
-    return content, ""
 
 
 def read_track(path: Path) -> Track:

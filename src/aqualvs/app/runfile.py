@@ -15,7 +15,9 @@ import yaml
 
 from aqualvs import __version__
 from aqualvs.app.disk import replace_text
+from aqualvs.errors import SourceError
 from aqualvs.optics.rigtext import TidyDumper
+from aqualvs.yamlfile import read_yaml
 
 # A list stays on one line, however many digits it has.
 _WIDTH = 1000
@@ -82,6 +84,21 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
         dict(content), Dumper=TidyDumper, sort_keys=False, allow_unicode=True, width=_WIDTH
     )
     replace_text(path, text)
+
+
+def read_run_yaml(folder: Path) -> dict[str, Any]:
+    """Return the content of a run's `run.yaml`.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read, or holds no keys.
+    """
+    path = folder / "run.yaml"
+    content = read_yaml(path, "the run.yaml of a run", SourceError)
+    if not isinstance(content, dict):
+        raise SourceError(f"{path}: holds no keys; run the dive again")
+    return content
 
 
 def versions() -> dict[str, str]:
