@@ -18,6 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from aqualvs.app.append_file import locked_folder
 from aqualvs.app.disk import explain, writing
 from aqualvs.app.journal import PointsJournal, check_idle
 from aqualvs.app.overwriting import Claim
@@ -99,9 +100,10 @@ class RunOutputs:
         self.tally = Tally()
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
+            # First of all: of two runs that begin at the same moment, one gets no further.
+            self._points = stack.enter_context(_new_journal(folder))
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
-            self._points = stack.enter_context(PointsJournal(folder / JOURNAL))
             self._export: PointsExport | None = PointsExport(
                 folder / POINTS_PARQUET, folder / POINTS_PLY
             )
@@ -194,10 +196,11 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        check_idle(folder / JOURNAL)
-        claim = claim_run(folder, RUN_FILES, overwrite=overwrite)
-        for path in claim.found:
-            path.unlink()
+        with locked_folder(folder):
+            check_idle(folder / JOURNAL)
+            claim = claim_run(folder, RUN_FILES, overwrite=overwrite)
+            for path in claim.found:
+                path.unlink()
     return claim
 
 
@@ -245,6 +248,23 @@ def recover(folder: Path) -> bool:
         journal.unlink()
         _mend_run_file(folder)
     return True
+
+
+def _new_journal(folder: Path) -> PointsJournal:
+    """Begin the journal of a run.
+
+    Raises
+    ------
+    OutputError
+        If another run has begun one since `prepare_folder`.
+    """
+    try:
+        with locked_folder(folder):
+            return PointsJournal(folder / JOURNAL, exclusive=True)
+    except FileExistsError:
+        raise OutputError(
+            f"{folder}: another run has just begun here; choose another folder"
+        ) from None
 
 
 def _export_journal(folder: Path) -> None:

@@ -35,6 +35,10 @@ POSTURE = ("range_m", "pitch_deg", "yaw_deg")
 """The three columns of a posture, in the order of every (N, 3) array of the report."""
 
 
+class NoFrameError(SourceError):
+    """A table without a row, as of a run that was killed before its first frame."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """`posture.csv` as arrays, one entry per frame, ordered by frame.
@@ -144,19 +148,27 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     return truth
 
 
-def read_bare(run_dir: Path, track: Track) -> FloatArray | None:
-    """Return the posture that a bare-lens camera gives on the same pixels, if the run has it.
+def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:
+    """Read the posture that a bare-lens camera gives on the same pixels, if the run has it.
 
     Returns
     -------
     posture : array, shape (N, 3), or None
         As `Track.posture`, on the frames of `track`.
+    trouble : str
+        What is wrong with the file, in words; "" if nothing is, or the run was killed before it
+        had a row.
     """
     path = run_dir / POSTURE_BARE_CSV
-    if not path.is_file():
-        return None
-    bare = read_track(path)
-    return _onto(track.frame, bare.frame.astype(np.float64), bare.posture)
+    if not path.is_file() or path.stat().st_size == 0:
+        return None, ""
+    try:
+        bare = read_track(path)
+    except NoFrameError:
+        return None, ""
+    except SourceError as fault:
+        return None, f"{fault}: no comparison with a bare lens."
+    return _onto(track.frame, bare.frame.astype(np.float64), bare.posture), ""
 
 
 def number(value: object) -> float:
@@ -196,7 +208,9 @@ def _read_columns(
     # With NumPy: filtering an Arrow table imports all of its functions first.
     whole = np.isfinite(_numbers(table["frame"]))
     if not whole.any():
-        raise SourceError(f"{path}: holds no frame; there is nothing to report, run the dive again")
+        raise NoFrameError(
+            f"{path}: holds no frame; there is nothing to report, run the dive again"
+        )
     words = table.unify_dictionaries()
     return (
         {name: _numbers(table[name])[whole] for name in numbers},
@@ -212,7 +226,11 @@ def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) ->
     )
     parse = csv.ParseOptions(invalid_row_handler=lambda _row: "skip")
     try:
-        return csv.read_csv(path, parse_options=parse, convert_options=convert)
+        content = path.read_bytes()
+        if not content.isascii():
+            # Arrow prints its own complaint of a damaged row that is not UTF-8.
+            content = content.decode("utf-8", "replace").encode()
+        return csv.read_csv(pa.BufferReader(content), parse_options=parse, convert_options=convert)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; name the folder of a run, or run it") from None
     except (pa.ArrowInvalid, OSError) as fault:

@@ -1,7 +1,6 @@
 """`run.yaml`: what was run, on what, with what, and how it went."""
 
 import functools
-import os
 import platform
 import sys
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ from typing import Any
 import yaml
 
 from aqualvs import __version__
+from aqualvs.app.disk import replace_text
 from aqualvs.errors import SourceError
 from aqualvs.optics.rigtext import TidyDumper
 from aqualvs.yamlfile import read_yaml
@@ -80,15 +80,10 @@ class RunFile:
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a mapping as YAML in its own order; the old file stays until the new one is whole."""
-    draft = path.with_name(path.name + ".part")
     text = yaml.dump(
         dict(content), Dumper=TidyDumper, sort_keys=False, allow_unicode=True, width=_WIDTH
     )
-    try:
-        draft.write_text(text, encoding="utf-8")
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    replace_text(path, text)
 
 
 def read_run_yaml(folder: Path) -> dict[str, Any]:

@@ -21,9 +21,11 @@ from aqualvs.live.recorder.records import (
 
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
+MAX_RECORD_BYTES = 1 << 29
+"""Size of a record, also when decompressed; more is damage, or meant to fill the memory."""
+# The records of a summary are far smaller than chunks.
+_MAX_SUMMARY_BYTES = 1 << 24
 _KNOWN = frozenset(Op)
-# What a chunk, and any other record, may hold at most; more is damage.
-_LARGEST_CHUNK, _LARGEST_RECORD = 1 << 28, 1 << 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +192,7 @@ def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
             if only_channels:
                 break
             found.chunks[at] = length
-        elif kind == Op.CHANNEL:
+        elif kind == Op.CHANNEL and length <= _MAX_SUMMARY_BYTES:
             with contextlib.suppress(struct.error, ValueError):
                 _note(found, kind, file.read(length))
         elif kind == Op.DATA_END and length == DATA_END_BYTES - HEAD_BYTES:
@@ -254,7 +256,7 @@ def _records(file: BinaryIO, at: int) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of the records from a place on; paddings without their content."""
     while (first := _record_head(file, at)) is not None:
         kind, length = first
-        if kind < Op.PADDING and length > _LARGEST_RECORD:
+        if kind < Op.PADDING and length > _MAX_SUMMARY_BYTES:
             return
         content = b"" if kind >= Op.PADDING else file.read(length)
         if kind < Op.PADDING and len(content) < length:
@@ -270,10 +272,9 @@ def _record_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
     if len(head) < HEAD_BYTES or head[0] == 0:
         return None
     kind, length = struct.unpack("<BQ", head)
-    largest = _LARGEST_CHUNK if kind == Op.CHUNK else _LARGEST_RECORD
     # Paddings run ahead of the data, attachments are skipped.
     skipped = kind >= Op.PADDING or kind not in _KNOWN
-    return None if length > largest and not skipped else (kind, length)
+    return None if length > MAX_RECORD_BYTES and not skipped else (kind, length)
 
 
 def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
@@ -288,17 +289,24 @@ def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
         name_at = _CHUNK_HEAD.size + 4
         compression = content[name_at : name_at + n_name].decode("ascii")
         data = content[name_at + n_name + 8 :]
-        raw = _decompressed(compression, data, raw_size)
+        raw = decompressed(compression, data, raw_size)
     except (struct.error, ValueError, OSError, pa.ArrowException):
         return None
     return raw if crc in (0, zlib.crc32(raw)) else None
 
 
-def _decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
+def decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
+    """Return the raw content of a chunk.
+
+    Raises
+    ------
+    ValueError, OSError, ArrowException
+        If it has another size than its head says, or is too large.
+    """
     if not compression:
         return data
-    if raw_size > _LARGEST_CHUNK:
-        raise ValueError("too large")
+    if raw_size > MAX_RECORD_BYTES:
+        raise ValueError(f"a chunk of {raw_size} bytes")
     found: bytes = pa.decompress(data, raw_size, codec=compression, asbytes=True)
     return found
 
