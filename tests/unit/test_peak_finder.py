@@ -151,7 +151,7 @@ def test_peaks_are_those_of_the_reference(
     lines = picture(rng, (n_lines, length), kind)
     # Bands of all kinds, empty ones among them.
     low, high = rng.integers(0, length, (2, n_lines))
-    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, True, 1)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1)
     found = finder(lines.shape, low, high, reach).find(image, contrast, every)
     expected = [
         peak
@@ -169,7 +169,7 @@ def test_the_background_is_the_higher_of_the_two_sliding_minima() -> None:
     row[30:] = 90
     row[28:31] = [120, 150, 120]
     whole = np.array([0]), np.array([59])
-    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, True, 1)
+    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, 1)
     _, table = finder((1, 60), *whole, 10).find(image, 6)
     # A stripe on the edge of a box counts from the brighter side.
     np.testing.assert_array_equal(table[HEIGHT], [60.0])
@@ -183,7 +183,7 @@ def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
     rng = np.random.default_rng(4)
     lines = picture(rng, (20, 400), "noise")
     low, high = np.zeros(20, np.int64), np.full(20, 399)
-    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, True, 1)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1)
     roomy = finder(lines.shape, low, high, 12)
     sizes = {contrast: len(roomy.find(image, contrast)[0]) for contrast in (10, 20, 40, 80, 160)}
     tight = finder(lines.shape, low, high, 12, capacity=sizes[40] + 1)
@@ -201,8 +201,7 @@ def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
 
 
 @pytest.mark.parametrize("line_px", [1, 2])
-@pytest.mark.parametrize("along_x", [True, False])
-def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(along_x: bool, line_px: int) -> None:
+def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(line_px: int) -> None:
     length, n_lines = 80, 24
     lines = np.full((n_lines, length), 60, np.uint8)
     lines[:, 38:43] = [80, 120, 160, 120, 80]
@@ -212,10 +211,8 @@ def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(along_x: bool, line_p
         np.full((half_lines, 40), 124, np.uint8),
     )
     u[:, 18:23], v[:, 18:23] = 108, 94
-    if not along_x:
-        u, v = u.T.copy(), v.T.copy()
     low, high = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    image = SearchImage(lines, u, v, along_x, line_px)
+    image = SearchImage(lines, u, v, line_px)
     line, table = finder(lines.shape, low, high, 12).find(image, 6)
     np.testing.assert_array_equal(line, np.arange(n_lines))
     np.testing.assert_allclose(table[STEP_U], -10.0)
