@@ -87,7 +87,7 @@ def test_python_runs(block: Block, folder):
             cwd=folder,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=300,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
     finally:

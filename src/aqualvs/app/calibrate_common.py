@@ -17,6 +17,7 @@ from aqualvs.app.progress import progress
 from aqualvs.app.run_inputs import checked_index
 from aqualvs.calibration.view import View
 from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.live.sources.images import read_image
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import save_rig
 
@@ -196,14 +197,12 @@ def check_same_size(rig: Rig, found: Found) -> None:
 
 
 def _read(path: Path, how: int) -> Image:
-    level = cv2.utils.logging.setLogLevel(0)
-    try:
-        image = cv2.imread(str(path), how)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    image = read_image(path, how)
     if image is None:
-        raise CalibrationError(f"{path}: not a readable picture; remove or replace it")
-    return np.asarray(image, np.uint8)
+        raise CalibrationError(
+            f"{path}: not a readable picture, or too large; remove or replace it"
+        )
+    return image
 
 
 def _common_size(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from aqualvs.app.cli_command import CheckedCommand
 from aqualvs.app.cli_options import Celsius, Salinity
 
 calibrate = typer.Typer(
@@ -43,6 +44,7 @@ Medium = Annotated[
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Intrinsics of the camera, from a board in air, without the dome.",
     epilog="Example: aqualvs calibrate camera air/*.png --board board.yaml -o rig.yaml",
 )
@@ -82,6 +84,7 @@ def camera(
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Place of the lens in the dome, from a board outside it, in air, in water, or both. "
     "With poses (distance only, or full) the camera's rotation is found too.",
     epilog="Example: aqualvs calibrate dome rail/*.png --board board.yaml --poses poses.csv "
@@ -168,6 +171,7 @@ def dome(
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Laser planes, all lasers on at once, from a box of markers (--box), or from stripes on "
     "a plane that carries a board (--board).",
     epilog="Example: aqualvs calibrate lasers box/*.png --box box.yaml --rig rig.yaml -o rig.yaml",
@@ -230,6 +234,7 @@ def lasers(
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Refractive index of the water, from a target fixed on the vehicle. SOURCE is a video, "
     "pictures, or a folder of them.",
     epilog="Example: aqualvs calibrate water dive.mp4 --target target.yaml --rig rig.yaml "

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aqualvs.app.disk import writing
 from aqualvs.app.net_pass import NetPass
 from aqualvs.app.net_request import NetRequest
@@ -22,6 +20,7 @@ from aqualvs.app.progress import progress
 from aqualvs.app.report import write_report
 from aqualvs.app.run import RunRequest, run_and_tell
 from aqualvs.app.run_inputs import scanner_options
+from aqualvs.app.runfile import read_run_yaml
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.stored_scans import check_stored, stored_scans
 from aqualvs.errors import OptionError, OutputError, SourceError
@@ -177,13 +176,7 @@ def _prepare(folder: Path, *, overwrite: bool) -> None:
 
 
 def _run_file(run_folder: Path) -> dict[str, Any]:
-    path = run_folder / RUN_YAML
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as fault:
-        raise SourceError(
-            f"{path}: cannot be read, and the rig with it; run the dive again"
-        ) from fault
-    if not isinstance(content, dict) or not isinstance(content.get("rig"), dict):
-        raise SourceError(f"{path}: holds no rig; run the dive again")
+    content = read_run_yaml(run_folder)
+    if not isinstance(content.get("rig"), dict):
+        raise SourceError(f"{run_folder / RUN_YAML}: holds no rig; run the dive again")
     return content

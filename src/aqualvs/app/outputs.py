@@ -18,15 +18,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import yaml
-
+from aqualvs.app.append_file import locked_folder
 from aqualvs.app.disk import explain, writing
 from aqualvs.app.journal import PointsJournal, check_idle
 from aqualvs.app.points_export import DRAFT, PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv
-from aqualvs.app.runfile import RunFile, Status, now, write_yaml
+from aqualvs.app.runfile import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.app.tally import Tally, tally_of
-from aqualvs.errors import OutputError
+from aqualvs.errors import OutputError, SourceError
 from aqualvs.scanning.scan import Scan
 
 POSTURE_CSV = "posture.csv"
@@ -98,9 +97,10 @@ class RunOutputs:
         self.tally = Tally()
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
+            # First of all: of two runs that begin at the same moment, one gets no further.
+            self._points = stack.enter_context(_new_journal(folder))
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
-            self._points = stack.enter_context(PointsJournal(folder / JOURNAL))
             self._export: PointsExport | None = PointsExport(
                 folder / POINTS_PARQUET, folder / POINTS_PLY
             )
@@ -188,15 +188,16 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> None:
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        found = [folder / name for name in RUN_FILES if (folder / name).exists()]
-        check_idle(folder / JOURNAL)
-        if found and not overwrite:
-            raise OutputError(
-                f"{folder}: already holds a run ({found[0].name}); "
-                "choose another folder or add --overwrite"
-            )
-        for path in found:
-            path.unlink()
+        with locked_folder(folder):
+            found = [folder / name for name in RUN_FILES if (folder / name).exists()]
+            check_idle(folder / JOURNAL)
+            if found and not overwrite:
+                raise OutputError(
+                    f"{folder}: already holds a run ({found[0].name}); "
+                    "choose another folder or add --overwrite"
+                )
+            for path in found:
+                path.unlink()
 
 
 def recover(folder: Path) -> bool:
@@ -225,6 +226,23 @@ def recover(folder: Path) -> bool:
     return True
 
 
+def _new_journal(folder: Path) -> PointsJournal:
+    """Begin the journal of a run.
+
+    Raises
+    ------
+    OutputError
+        If another run has begun one since `prepare_folder`.
+    """
+    try:
+        with locked_folder(folder):
+            return PointsJournal(folder / JOURNAL, exclusive=True)
+    except FileExistsError:
+        raise OutputError(
+            f"{folder}: another run has just begun here; choose another folder"
+        ) from None
+
+
 def _export_journal(folder: Path) -> None:
     export_points(folder / JOURNAL, folder / POINTS_PARQUET, folder / POINTS_PLY)
 
@@ -233,10 +251,10 @@ def _mend_run_file(folder: Path) -> None:
     """Replace the status of a run that could not say how it ended."""
     path = folder / RUN_YAML
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError):
+        content = read_run_yaml(folder)
+    except SourceError:
         return
-    if not isinstance(content, dict) or content.get("status") != Status.RUNNING:
+    if content.get("status") != Status.RUNNING:
         return
     known = {"status", "started", "ended", "error", "summary"}
     head = {

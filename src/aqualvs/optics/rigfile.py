@@ -20,9 +20,10 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
 from aqualvs.optics.rigschema import VERSION, LaserPart, RigFile, WaterPart, parse_rig
-from aqualvs.optics.rigtext import read_yaml, rig_text
+from aqualvs.optics.rigtext import rig_text
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
+from aqualvs.yamlfile import read_yaml
 
 __all__ = ["load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
 
@@ -52,7 +53,8 @@ def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
     RigError
         One line that names the file, the place in it, the value and the remedy.
     """
-    return rig_from_mapping(read_yaml(Path(path)), source_name=str(path), need_lasers=need_lasers)
+    content = read_yaml(Path(path), "a rig file", RigError)
+    return rig_from_mapping(content, source_name=str(path), need_lasers=need_lasers)
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 
 from aqualvs.app.design.best import best_angles
@@ -15,10 +14,10 @@ from aqualvs.app.design.calibrated import camera_errors
 from aqualvs.app.design.changes import changes
 from aqualvs.app.design.figures import draw_figures
 from aqualvs.app.design.file import (
-    EXAMPLE,
     FAN_DEG,
     design_from,
     design_of_rig,
+    example_content,
     load_design,
     merged_content,
 )
@@ -141,7 +140,7 @@ def _asked_for(request: DesignRequest) -> Design:
         return design_of_rig(load_rig(request.rig), request.fan_deg or FAN_DEG)
     if request.design is not None:
         return load_design(request.design, request.given)
-    content = merged_content(yaml.safe_load(EXAMPLE), request.given)
+    content = merged_content(example_content(), request.given)
     return design_from(content, name="design", folder=Path())
 
 

@@ -14,8 +14,8 @@ from aqualvs.live.recorder.records import FOOTER_BYTES, HEAD_BYTES, MAGIC, Op
 
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-# What a record may hold at most; more is garbage in a torn file.
-_LARGEST = 1 << 31
+MAX_RECORD_BYTES = 1 << 29
+"""Size of a record, also when decompressed; more is garbage, or meant to fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ def _record_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
     if len(head) < HEAD_BYTES or head[0] == 0:
         return None
     kind, length = struct.unpack("<BQ", head)
-    return None if length > _LARGEST else (kind, length)
+    return None if length > MAX_RECORD_BYTES else (kind, length)
 
 
 def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
@@ -188,17 +188,24 @@ def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
         name_at = _CHUNK_HEAD.size + 4
         compression = content[name_at : name_at + n_name].decode("ascii")
         data = content[name_at + n_name + 8 :]
-        raw = _decompressed(compression, data, raw_size)
+        raw = decompressed(compression, data, raw_size)
     except (struct.error, ValueError, OSError, pa.ArrowException):
         return None
     return raw if crc in (0, zlib.crc32(raw)) else None
 
 
-def _decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
+def decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
+    """Return the raw content of a chunk.
+
+    Raises
+    ------
+    ValueError, OSError, ArrowException
+        If it has another size than its head says, or is too large.
+    """
     if not compression:
         return data
-    if raw_size > _LARGEST:
-        raise ValueError("too large")
+    if raw_size > MAX_RECORD_BYTES:
+        raise ValueError(f"a chunk of {raw_size} bytes")
     found: bytes = pa.decompress(data, raw_size, codec=compression, asbytes=True)
     return found
 
