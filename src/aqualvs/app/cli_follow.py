@@ -56,6 +56,16 @@ def follow(
         str | None,
         typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.", show_default=False),
     ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Vehicle: record from the start.")
+    ] = False,
+    record_to: Annotated[
+        Path | None,
+        typer.Option(help="Vehicle: folder of recordings; that of -o if left out."),
+    ] = None,
+    record_video: Annotated[
+        bool, typer.Option("--record-video", help="Vehicle: record the pictures too.")
+    ] = False,
     target: Annotated[
         str,
         typer.Option(
@@ -144,6 +154,9 @@ def follow(
         aim=aim,
         dashboard=dashboard_address if dashboard else None,
         token=token,
+        record=record,
+        record_to=record_to,
+        record_video=record_video,
         water=Water(n_water=water_n, temperature_c=None, salinity=None),
         scanner=scanner_options(target, "ridge", "none", "robust"),
         overwrite=overwrite,
