@@ -45,6 +45,14 @@ def demo_pictures_halved(size: tuple[int, int], n: int) -> Iterator[Any]:
         yield cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
+def demo_pictures_frozen(size: tuple[int, int], n: int) -> Iterator[Any]:
+    """Half of it moves; then an encoder gets the last picture again and again."""
+    *moving, last = demo_pictures(size, n // 2)
+    yield from moving
+    for _ in range(n - len(moving)):
+        yield last
+
+
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("clips")
@@ -53,6 +61,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {
         "dive": make_clip(folder / "dive", size, N_CLIP, gop=12, content=demo_pictures),
         "small": make_clip(folder / "small", small, 15, content=demo_pictures_halved),
+        "frozen": make_clip(folder / "frozen", size, 100, gop=12, content=demo_pictures_frozen),
     }
 
 
@@ -198,6 +207,22 @@ def replayed(recording: Path, out: Path) -> list[dict[str, str]]:
     text = (out / "posture.csv").read_text().splitlines()
     assert tuple(text[0].split(",")) == POSTURE_COLUMNS
     return [dict(zip(POSTURE_COLUMNS, line.split(","), strict=True)) for line in text[1:]]
+
+
+def test_a_stream_that_repeats_its_picture_has_no_posture(
+    clips: dict[str, Path], rig_file: Path
+) -> None:
+    with live(rig_file) as run:
+        run.send(clips["frozen"])
+        run.wait(lambda: "frozen" in run.reasons(), "the reason")
+        lines = [line for _, line in run.lines if line["reason"] != "no_frames"]
+        assert run.end(signal.SIGTERM) == 0
+    # Time stamps run on: by these it is noticed, however busy the machine.
+    first = lines[0]["frame"]
+    told = next(line["frame"] for line in lines if line["reason"] == "frozen")
+    assert 50 < told - first <= 50 + 12
+    assert not any(line["valid"] for line in lines if line["frame"] > told)
+    assert sum(line["valid"] for line in lines) > 10
 
 
 def test_after_a_kill_the_recording_holds_all_but_the_last_moment(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aqualvs.app.disk import writing
-from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_fast_eye import Blind, Loss, SampledEye
 from aqualvs.app.follow_rendered import RenderedEye
 from aqualvs.app.follow_report import RunFacts, summary_lines, write_report
 from aqualvs.app.follow_sim import Eye, SimulatedLoop, Timing
@@ -105,6 +105,8 @@ class SimRequest:
     camera : str or None
         Simulated camera that takes the rendered frames; the ideal one if left out.
     seed : int
+    freeze : float or None
+        When the picture begins to stand still, in seconds; never if left out.
     dashboard : str or None
         Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
     token : str or None
@@ -126,6 +128,7 @@ class SimRequest:
     rendered: bool = False
     camera: str | None = None
     seed: int = 0
+    freeze: float | None = None
     dashboard: str | None = None
     token: str | None = None
 
@@ -151,6 +154,8 @@ class SimRequest:
                 f"--current {self.current:g} m/s, --net-sway {self.net_sway:g} m: choose 0 to 2, "
                 "and 0 to 1"
             )
+        if self.freeze is not None and not self.freeze >= 0.0:
+            raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
 
 
 _LEAST_S, _LEAST_RADIUS = 1.0, 2.0
@@ -170,9 +175,12 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     with writing(request.out):
         request.out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([request.seed, 53])
-    eye: Eye = SampledEye(case.net, rng, working_range=rig.working_range)
+    freeze_s = math.inf if request.freeze is None else request.freeze
+    frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
+    eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
     if request.rendered:
-        eye = RenderedEye(case.net, rig, rng, camera=simulated_camera(request.camera or "ideal"))
+        camera = simulated_camera(request.camera or "ideal")
+        eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
     loop = case.loop(eye, mission)
     with ExitStack() as undo:
         page = None
