@@ -156,10 +156,34 @@ def test_steers_by_a_video_until_told_to_end(clip: Path, tmp_path: Path) -> None
         time.sleep(0.2)
         assert all(map(is_neutral, fake.steered()[-3:]))
         assert not fake.steered(ended + 0.2)
-        assert {m["kind"] for m in fake.wire} == {"HEARTBEAT", "MANUAL_CONTROL"}
+        assert {m["kind"] for m in fake.wire} == {
+            "HEARTBEAT",
+            "MANUAL_CONTROL",
+            "PARAM_REQUEST_READ",
+        }
     finally:
         fake.stop()
     assert_logged(tmp_path / FOLLOW_CSV)
+
+
+def test_a_vehicle_file_says_who_steers(clip: Path, tmp_path: Path) -> None:
+    fake = Fake("--lapse", "0.5")
+    fake.play(parameters={"MAV_GCS_SYSID": 250.0}, station_id=250)
+    file = tmp_path / "vehicle.yaml"
+    try:
+        with follow(fake, clip, tmp_path) as one:
+            until(
+                lambda: "set MAV_GCS_SYSID 255, or ground_station 250" in one.press(),
+                "the reason why not",
+                PATIENCE_S,
+            )
+        file.write_text("aqualvs_vehicle: 1\nground_station: 250\n", encoding="utf-8")
+        with follow(fake, clip, tmp_path, "--vehicle-file", str(file)) as one:
+            one.engage()
+            until(lambda: fake.steered(), "efforts")
+            assert {message["system"] for message in fake.steered()} == {250}
+    finally:
+        fake.stop()
 
 
 def assert_logged(path: Path) -> None:

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from aqualvs.app.cli_options import MavlinkKey, MavlinkPeer, VehicleFileOption
+
 
 def follow(
     source: Annotated[
@@ -40,6 +42,9 @@ def follow(
         str | None,
         typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.", show_default=False),
     ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
     dashboard: Annotated[
         bool,
         typer.Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time."),
@@ -101,7 +106,7 @@ def follow(
 
     aim = body.Aim(plan=plan, range=hold_range, yaw=math.radians(yaw))
     if sim:
-        if source is not None or mavlink is not None:
+        if source is not None or any((mavlink, vehicle_file, mavlink_peer, mavlink_key)):
             raise OptionError("--sim: has no source and no --mavlink; leave them out")
         request = body.SimRequest(
             out=out,
@@ -129,12 +134,14 @@ def follow(
             "follow: give SOURCE, --rig, --mavlink and --gains for a vehicle, or --sim to try it"
         )
     from aqualvs.app.follow_vehicle import FollowRequest, follow_and_tell
+    from aqualvs.app.mavlink_options import vehicle_setup
     from aqualvs.app.run_inputs import Water, scanner_options
 
     dive = FollowRequest(
         source=source,
         rig=rig,
         mavlink=mavlink,
+        vehicle=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key),
         gains=gains,
         out=out,
         aim=aim,

@@ -44,6 +44,31 @@ IndexTarget = Annotated[
         show_default=False,
     ),
 ]
+VehicleFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--vehicle-file",
+        metavar="FILE",
+        help="MAVLink: system ids, ground station, modes, peers, key (YAML; docs/ardusub.md).",
+        show_default=False,
+    ),
+]
+MavlinkPeer = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="MAVLink, listening: hear nobody else, such as 192.168.2.2 or 192.168.2.0/24; "
+        "repeatable.",
+    ),
+]
+MavlinkKey = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="MAVLink: sign, and hear nobody without this key; a passphrase or 64 hex digits.",
+        show_default=False,
+    ),
+]
 
 
 def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:

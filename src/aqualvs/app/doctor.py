@@ -9,7 +9,7 @@ import shutil
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -18,7 +18,9 @@ from aqualvs import __version__
 from aqualvs.app.check_finding import Finding, Severity, findings_table
 from aqualvs.app.demo import bundled_dive
 from aqualvs.errors import AqualvsError
+from aqualvs.live.mavlink_link import MavlinkLink
 from aqualvs.live.sources import open_source
+from aqualvs.live.vehicle_file import VehicleSetup
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner
@@ -52,11 +54,14 @@ class DoctorRequest:
         Rig that the pictures should fit.
     mavlink : str or None
         Address of an autopilot.
+    vehicle : VehicleSetup
+        Who is to be there, and how it is to be steered.
     """
 
     source: str | None = None
     rig: Path | None = None
     mavlink: str | None = None
+    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
 
 def run_doctor(request: DoctorRequest, console: Console | None = None) -> int:
@@ -73,7 +78,7 @@ def run_doctor(request: DoctorRequest, console: Console | None = None) -> int:
     if request.source is not None:
         looks.append(lambda: _stream(str(request.source), request.rig))
     if request.mavlink is not None:
-        looks.append(lambda: _autopilot(str(request.mavlink)))
+        looks.append(lambda: _autopilot(str(request.mavlink), request.vehicle))
     worst = Severity.OK
     for look in looks:
         found = list(_guarded(look))
@@ -218,11 +223,9 @@ def _fit(rig: Rig, frames: list[Frame]) -> Finding:
     return Finding(Severity.OK, words)
 
 
-def _autopilot(address: str) -> Iterator[Finding]:
+def _autopilot(address: str, vehicle: VehicleSetup) -> Iterator[Finding]:
     """Wait for the heartbeat of an autopilot."""
-    from aqualvs.live.mavlink_link import MavlinkLink
-
-    link = MavlinkLink(address)
+    link = MavlinkLink(address, vehicle.link)
     try:
         end = time.monotonic() + _HEARTBEAT_S
         while link.autopilot() is None and time.monotonic() < end:

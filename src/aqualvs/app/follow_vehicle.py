@@ -1,5 +1,6 @@
 """`aqualvs follow SOURCE`: hold and follow with a real vehicle."""
 
+import contextlib
 import sys
 import threading
 from collections.abc import Callable
@@ -22,10 +23,12 @@ from aqualvs.control.safety import SafetyGate
 from aqualvs.control.setpoint import SetpointHolder
 from aqualvs.errors import AqualvsError
 from aqualvs.live.ardusub_link import ArduSubLink
+from aqualvs.live.mavlink_link import MavlinkLink
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import Pilot
 from aqualvs.live.runner import FixedScanner, LiveRunner
 from aqualvs.live.time_filter import PostureFilter
+from aqualvs.live.vehicle_file import VehicleSetup
 from aqualvs.live.warm_up import warm_up
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 
@@ -41,6 +44,8 @@ class FollowRequest:
     rig : Path
     mavlink : str
         Address of the vehicle.
+    vehicle : VehicleSetup
+        Who is there, and how it is steered.
     gains : str
         Gains file, or the name of a vehicle whose gains come with the package.
     out : Path
@@ -61,6 +66,7 @@ class FollowRequest:
     gains: str
     out: Path
     aim: Aim
+    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
     feed: FeedRequest = field(default_factory=FeedRequest)
     dashboard: str | None = None
     token: str | None = None
@@ -87,26 +93,40 @@ def follow_and_tell(
     steering = NetPilot(mission, RangeYawController(load_gains(request.gains)), SafetyGate(limits))
     scanner = Scanner(rig, request.scanner)
     warm_up(scanner)
-    feed = request.feed.opened(request.source, realtime=True)
+    with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
+        pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
+        runner = _runner(request, scanner, pilot, holder, tell)
+        tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
+        listen(pilot, sys.stdin if keys is None else keys, tell)
+        with StopSignals() as stop:
+            fault = runner.run(lambda: stop.caught is not None)
+    if fault is not None:
+        raise fault
+    return 0
+
+
+def _runner(
+    request: FollowRequest,
+    scanner: Scanner,
+    pilot: Pilot,
+    holder: SetpointHolder,
+    tell: Callable[[str], object],
+) -> LiveRunner:
+    """Make the live loop; what was made before a part that fails is closed."""
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
-        undo.callback(feed.close)
-        pilot = Pilot(steering, ArduSubLink(request.mavlink), holder)
         undo.callback(pilot.close)
+        feed = request.feed.opened(request.source, realtime=True)
+        undo.callback(feed.close)
         outputs: list[Output] = [pilot, FollowLogOutput(request.out / FOLLOW_CSV, pilot)]
         undo.callback(outputs[1].close)
         outputs.append(Console())
         if request.dashboard is not None:
-            outputs.append(serve_page(request.dashboard, request.token, rig, holder, None, tell))
+            page = serve_page(request.dashboard, request.token, scanner.rig, holder, None, tell)
+            outputs.append(page)
         runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
         undo.pop_all()
-    tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
-    listen(pilot, sys.stdin if keys is None else keys, tell)
-    with StopSignals() as stop:
-        fault = runner.run(lambda: stop.caught is not None)
-    if fault is not None:
-        raise fault
-    return 0
+    return runner
 
 
 def listen(pilot: Pilot, keys: TextIO, tell: Callable[[str], object]) -> threading.Thread:
