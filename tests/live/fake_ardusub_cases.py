@@ -29,8 +29,8 @@ from aqualvs.live.time_filter import FilteredPosture, PostureFilter
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from live_cases import demo_rig
+from waiting import PATIENCE_S
 
-PATIENCE_S = 10.0
 FRAME_S = 0.04
 HELD = Setpoint(0.6)
 MARGIN_S = 0.05

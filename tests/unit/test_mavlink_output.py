@@ -59,7 +59,7 @@ class Bench:
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
-        self._socket.settimeout(5.0)
+        self._socket.settimeout(60.0)
         self.output = MavlinkOutput(f"udpout:127.0.0.1:{self._socket.getsockname()[1]}")
         self.dialect = self.output.link.dialect
         self._parser = self.dialect.MAVLink(None)
