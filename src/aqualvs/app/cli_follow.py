@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.app.cli_options import MavlinkKey, MavlinkPeer, VehicleFileOption
+from aqualvs.app.cli_options import MavlinkKey, MavlinkPeer, Overwrite, VehicleFileOption
 
 
 def follow(
@@ -105,6 +105,7 @@ def follow(
     ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
     seed: Annotated[int, typer.Option(help="Sim: of waves and noise.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Hold a distance to a net, or follow it."""
     from aqualvs.app import follow as body
@@ -132,6 +133,7 @@ def follow(
             seed=seed,
             dashboard=dashboard_address if dashboard else None,
             token=token,
+            overwrite=overwrite,
         )
         raise typer.Exit(body.simulate_and_tell(request, typer.echo))
     if source is None or rig is None or mavlink is None or gains is None:
@@ -157,5 +159,6 @@ def follow(
         record_video=record_video,
         water=Water(n_water=water_n, temperature_c=None, salinity=None),
         scanner=scanner_options(target, "ridge", "none", "robust"),
+        overwrite=overwrite,
     )
     raise typer.Exit(follow_and_tell(dive, typer.echo))

@@ -13,6 +13,7 @@ from aqualvs.app.follow import FOLLOW_CSV, Aim
 from aqualvs.app.follow_vehicle_log import FollowLogOutput
 from aqualvs.app.live import SWITCH_S, FeedRequest, recorder_options
 from aqualvs.app.live_console import Console
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.stopping import StopSignals
@@ -82,6 +83,7 @@ class FollowRequest:
     record_video: bool = False
     water: Water = field(default_factory=Water)
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    overwrite: bool = False
 
 
 def follow_and_tell(
@@ -96,6 +98,7 @@ def follow_and_tell(
     AqualvsError
         If an input cannot be used, or the source can never work.
     """
+    claim = Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite)
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)
@@ -110,6 +113,7 @@ def follow_and_tell(
         listen(pilot, sys.stdin if keys is None else keys, tell)
         with StopSignals() as stop:
             fault = runner.run(lambda: stop.caught is not None)
+    claim.settle()
     if fault is not None:
         raise fault
     return 0

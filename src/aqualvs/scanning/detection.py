@@ -18,7 +18,7 @@ from aqualvs.scanning.laser_colour import (
 )
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
-from aqualvs.scanning.search_image import SearchLines
+from aqualvs.scanning.search_image import SearchLines, is_plain
 from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
     HEIGHT,
@@ -161,7 +161,7 @@ class FrameDetector:
             line, table, likelihood, ends, options.min_likelihood, options.min_share
         )
         line, likelihood = line[rows], likelihood[rows]
-        position, height, width = table[:3, rows]
+        position, height, width = table[:3].take(rows, axis=1)
         bounds = np.searchsorted(rows, ends)
         return {
             axis: Returns(
@@ -175,10 +175,12 @@ class FrameDetector:
         }
 
     def _brightest(self, frame: Frame) -> U8Array:
-        """Return the picture in which the lasers stand out best; the next call may overwrite it."""
+        """Return the picture in which the lasers stand out best.
+
+        Overwritten by the next call; the frame's luma itself where that is the same.
+        """
         first, *others = (channel_image(frame, colour) for colour in self._colours)
-        # Kernels are compiled for arrays that are contiguous and may be written to.
-        if not others and first.flags.carray:
+        if not others and is_plain(first):
             return first
         np.copyto(self._luma, first)
         for image in others:

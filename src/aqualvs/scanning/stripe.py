@@ -23,9 +23,10 @@ U8Array: TypeAlias = NDArray[np.uint8]
 _MAX_CONTRAST = 120
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
-# Pixels are skipped eight at a time where none stands out.
-_WORD, _WORD_BITS, _IN_WORD = 8, 3, 7
-_NOTHING = np.uint64(0)
+# Marks of pixels, bytes of 0 or 1, are looked at eight at a time.
+_WORD = 8
+_NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
+_EACH_BYTE, _BYTE_NUMBERS = np.uint64(0x0101010101010101), np.uint64(0x0001020304050607)
 _BRIGHT = np.uint8(255)
 # Luma of flanks that are dark; black is 16.
 _DARK = 36.0
@@ -240,15 +241,13 @@ def _find_peaks(
         first = max(lowest[x] - reach_px, 0)
         end = min(highest[x] + reach_px + 1, row.shape[0])
         _mark_above(row, first, end, min_contrast, reach_px, scratch)
-        start = _next_set(scratch, 0)
+        start = _next_with(_MARKED, scratch.words, 0)
         if start < end - first and chroma_line != (x * image.line_px) >> 1:
             chroma_line = (x * image.line_px) >> 1
             _sum_neighbours(image.u, chroma_line, scratch.u)
             _sum_neighbours(image.v, chroma_line, scratch.v)
         while start < end - first:
-            stop = start
-            while scratch.above[stop]:
-                stop += 1
+            stop = _next_with(_UNMARKED, scratch.words, start)
             if first + start <= highest[x] and first + stop > lowest[x]:
                 run = (start, stop)
                 n = _measure_run(
@@ -256,7 +255,7 @@ def _find_peaks(
                 )
                 if n == line.shape[0]:
                     return n
-            start = _next_set(scratch, stop)
+            start = _next_with(_MARKED, scratch.words, stop)
     return n
 
 
@@ -303,20 +302,18 @@ def _copy(source: U8Array, out: U8Array) -> None:
 
 
 @inline_borrowing_kernel
-def _next_set(scratch: _Scratch, at: int) -> int:
-    """Return the first marked pixel from `at` on; there is one beyond the last pixel."""
-    above, words = scratch.above, scratch.words
-    while at & _IN_WORD:
-        if above[at]:
-            return at
-        at += 1
-    word = at >> _WORD_BITS
-    while words[word] == _NOTHING:
-        word += 1
-    at = word << _WORD_BITS
-    while not above[at]:
-        at += 1
-    return at
+def _next_with(mark: np.uint64, words: NDArray[np.uint64], at: int) -> int:
+    """Return the first pixel from `at` on that is marked, for 1, or not, for 0; there is one."""
+    # Bytes of the word that have the mark become 1, others 0; those before `at` as well.
+    other = _EACH_BYTE * (np.uint64(1) - mark)
+    index = at >> 3
+    found = (words[index] ^ other) & (_EACH_BYTE << np.uint64(8 * (at & 7)))
+    while found == _NOTHING:
+        index += 1
+        found = words[index] ^ other
+    # The lowest of these bits alone shifts the number of its byte to the top.
+    lowest = found & (~found + np.uint64(1))
+    return (index << 3) + np.int64((lowest * _BYTE_NUMBERS) >> np.uint64(56))
 
 
 @inline_borrowing_kernel
