@@ -22,11 +22,11 @@ from aqualvs.app.overwriting import Claim
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.follow_log import FollowLog
-from aqualvs.control.gains_file import load_gains
 from aqualvs.control.mission import HoldMission, Mission
 from aqualvs.control.plan import load_plan
 from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.control.tune import usable_gains
 from aqualvs.errors import OptionError
 from aqualvs.simulation.cameras import simulated_camera
 from aqualvs.simulation.example_rigs import example_rig
@@ -214,7 +214,7 @@ def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimC
     model = vehicle_model(request.vehicle, request.pilot_gain)
     return SimCase(
         model=model,
-        gains=tuned_gains(model) if request.gains is None else load_gains(request.gains),
+        gains=tuned_gains(model) if request.gains is None else usable_gains(request.gains),
         water=sea(
             current=request.current,
             current_to=request.current_to,
