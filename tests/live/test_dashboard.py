@@ -18,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from aqualvs.app.dashboard.access import Access, make_access, token_fault
 from aqualvs.app.dashboard.commands import MAX_MESSAGE_BYTES, Controls
 from aqualvs.app.dashboard.hub import Hub, Watcher
+from aqualvs.app.dashboard.limits import ConnectionLimits, TokenGate
 from aqualvs.app.dashboard.output import Dashboard
 from aqualvs.app.dashboard.picture import page_picture
 from aqualvs.app.dashboard.server import DashboardServer
@@ -341,3 +342,149 @@ def test_what_is_no_number_becomes_null(bench: Bench) -> None:
     with bench.connect() as connection:
         connection.recv(timeout=PATIENCE_S)
         assert bench.shown(connection, silent)["health"]["quality"] is None
+
+
+def raw(bench: Bench) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", bench.server.port), timeout=10)
+
+
+def first_line(wire: socket.socket, *lines: str) -> str:
+    """Send a request and return the first line of its answer."""
+    wire.sendall("".join(f"{line}\r\n" for line in (*lines, "")).encode("latin-1"))
+    answer = b""
+    while b"\r\n" not in answer and (part := wire.recv(4096)):
+        answer += part
+    return answer.split(b"\r\n")[0].decode("latin-1")
+
+
+UPGRADE = (
+    "Connection: Upgrade",
+    "Upgrade: websocket",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+)
+
+
+@pytest.mark.parametrize("path", ["/", "/live", "/register_service"])
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("Host: [",),
+        ("Host: [::1",),
+        ("Host: ::1]:80",),
+        ("Host: a b",),
+        ("Host: 127.0.0.1:99999",),
+        ("Host: 127.0.0.1:port",),
+        ("Host: user@127.0.0.1",),
+        ("Host: 127.0.0.1/path",),
+        ("Host: \xff\xfe",),
+        ("Host: 127.0.0.1", "Origin: http://["),
+        ("Host: 127.0.0.1", "Origin: 127.0.0.1"),
+        ("Host: 127.0.0.1", "Origin: http://127.0.0.1:1e3"),
+        ("Host: 127.0.0.1", "Origin: http://127.0.0.1/page"),
+        ("Host: 127.0.0.1", "Origin: http://127.0.0.1", "Origin: http://evil.example"),
+    ],
+    ids=str,
+)
+def test_malformed_addresses_are_a_bad_request(
+    bench: Bench, path: str, lines: tuple[str, ...]
+) -> None:
+    upgrade = UPGRADE if path == "/live" else ()
+    with raw(bench) as wire:
+        answer = first_line(wire, f"GET {path} HTTP/1.1", *lines, *upgrade)
+    assert answer.split()[1:2] == ["400"], answer
+
+
+def test_idle_connections_of_strangers_leave_room_for_the_pilot(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        for _ in range(60):
+            open_.enter_context(raw(bench))
+        for _ in range(20):
+            trickling = open_.enter_context(raw(bench))
+            with contextlib.suppress(OSError):
+                trickling.sendall(b"GET / HTTP/1.1\r\nHo")
+        with raw(bench) as wire:
+            assert first_line(wire, "GET / HTTP/1.1", "Host: boat").endswith("200 OK")
+        with bench.connect(TOKEN) as page:
+            assert json.loads(page.recv(timeout=5))["may_command"] is True
+
+
+def test_one_address_holds_few_connections_without_a_greeting(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        page = open_.enter_context(bench.connect(TOKEN))
+        page.recv(timeout=5)
+        first = open_.enter_context(raw(bench))
+        for _ in range(ConnectionLimits.PER_ADDRESS):
+            open_.enter_context(raw(bench))
+        first.settimeout(10.0)
+        with contextlib.suppress(ConnectionResetError):
+            assert first.recv(1) == b""
+        # Whoever has greeted stays.
+        bench.play()
+        assert state_of(page)["posture"]["valid"] == "1"
+
+
+def test_who_never_asks_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ConnectionLimits, "SILENCE_S", 0.3)
+    rig = demo_rig()
+    controls = Controls(SetpointHolder(rig.working_range), Button())
+    server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", TOKEN), rig, controls)
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as wire:
+            wire.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+            with contextlib.suppress(ConnectionResetError):
+                assert wire.recv(1) == b""
+    finally:
+        server.close()
+
+
+def test_wrong_tokens_cost_time_over_all_connections(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TokenGate, "WRONG_S", 0.3)
+    n_guesses = 6
+    begin = time.monotonic()
+    with contextlib.ExitStack() as open_:
+        guessing = [open_.enter_context(bench.connect(f"guess {i}")) for i in range(n_guesses)]
+        # The pilot's own token waits for its turn at most.
+        with bench.connect(TOKEN) as page:
+            assert json.loads(page.recv(timeout=10))["may_command"] is True
+        for connection in guessing:
+            with pytest.raises(ConnectionClosed):
+                connection.recv(timeout=10)
+    assert time.monotonic() - begin >= n_guesses * 0.3
+
+
+def test_addresses_without_wrong_tokens_are_asked_first() -> None:
+    async def scene() -> list[str]:
+        gate, order = TokenGate(Access("0.0.0.0", TOKEN)), []
+
+        async def ask(address: str, token: str) -> None:
+            await gate.check(address, token)
+            order.append(address)
+
+        await gate.check("192.0.2.66", "guess")
+        await asyncio.gather(
+            *(ask("192.0.2.66", f"guess {i}") for i in range(4)), ask("192.0.2.1", TOKEN)
+        )
+        return order
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TokenGate, "WRONG_S", 0.01)
+        order = asyncio.run(scene())
+    assert order.index("192.0.2.1") <= 1
+
+
+def test_a_page_with_the_token_takes_the_place_of_one_without(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        pages = [open_.enter_context(bench.connect()) for _ in range(Hub.MAX_WATCHERS)]
+        for page in pages:
+            page.recv(timeout=5)
+        pilot = open_.enter_context(bench.connect(TOKEN))
+        assert json.loads(pilot.recv(timeout=5))["may_command"] is True
+        with pytest.raises(ConnectionClosed) as closed:
+            receive_until_closed(pages[0])
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.reason == "a page with the token took this place"
+        bench.play()
+        assert state_of(pages[1])["posture"]["valid"] == "1"

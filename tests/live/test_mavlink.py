@@ -20,7 +20,7 @@ import pytest
 
 from aqualvs.live import mavlink_link
 from aqualvs.live.health import State
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
 from aqualvs.live.outputs import mavlink_ports
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.scanning.posture import Reason, Refusal
@@ -354,7 +354,7 @@ def test_a_connection_that_takes_nothing_for_long_is_made_anew(
 
 def test_several_share_one_link(lab: Lab) -> None:
     peer = lab.peer("udpin:127.0.0.1:0")
-    link = MavlinkLink(f"udpout:127.0.0.1:{peer.port}", component=192)
+    link = MavlinkLink(f"udpout:127.0.0.1:{peer.port}", LinkOptions(component=192))
     with contextlib.closing(link):
         until(link.autopilot, "a heartbeat")
         output = MavlinkOutput(link)
