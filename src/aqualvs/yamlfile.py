@@ -145,7 +145,9 @@ def _parse(text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         problem = " ".join((error.problem or error.context or "malformed").split())
         mark = error.problem_mark
-        raise _TextError(f"is not YAML: {problem}", 0 if mark is None else mark.line + 1) from None
+        # The parser in C puts what is missing at the end into the line after the last.
+        line = 0 if mark is None else min(mark.line + 1, max(1, len(text.splitlines())))
+        raise _TextError(f"is not YAML: {problem}", line) from None
     except (yaml.YAMLError, ValueError):
         # The parser in Python leaks a ValueError for an escape that is no character.
         raise _TextError("is not YAML", 0, "mend it") from None

@@ -17,6 +17,7 @@ import pytest
 
 from aqualvs.app.follow import FOLLOW_CSV
 from aqualvs.live.colour import bgr_of
+from aqualvs.live.recorder import DiveRecording, is_recording
 from live_cases import demo_frames, demo_rig
 from shell_cases import write_video
 from waiting import PATIENCE_S
@@ -101,7 +102,7 @@ def sticks(fake: Fake, since: float = 0.0) -> list[dict[str, Any]]:
 def test_steers_by_a_video_until_told_to_end(clip: Path, tmp_path: Path) -> None:
     fake = Fake("--lapse", "0.5")
     try:
-        with follow(fake, clip, tmp_path, "--range", "0.9", "--yaw", "20") as one:
+        with follow(fake, clip, tmp_path, "--range", "0.9", "--yaw", "20", "--record") as one:
             time.sleep(0.3)
             assert not fake.steered()
             one.engage()
@@ -128,13 +129,23 @@ def test_steers_by_a_video_until_told_to_end(clip: Path, tmp_path: Path) -> None
         assert all(map(is_neutral, fake.steered()[-3:]))
         assert not fake.steered(ended + 0.2)
         assert {m["kind"] for m in fake.wire} == {
+            "DISTANCE_SENSOR",
             "HEARTBEAT",
             "MANUAL_CONTROL",
+            "NAMED_VALUE_FLOAT",
             "PARAM_REQUEST_READ",
         }
+        distances = [m["fields"] for m in fake.wire if m["kind"] == "DISTANCE_SENSOR"]
+        # The net of the clip is at 0.47 m.
+        assert {d["orientation"] for d in distances} == {0}
+        assert any(45 <= d["current_distance"] <= 49 for d in distances)
     finally:
         fake.stop()
     assert_logged(tmp_path / FOLLOW_CSV)
+    (recorded,) = tmp_path.glob("*.mcap")
+    assert is_recording(recorded)
+    frames = list(DiveRecording(recorded).frames(with_pictures=False))
+    assert len(frames) > 20
 
 
 def test_a_vehicle_file_says_who_steers(clip: Path, tmp_path: Path) -> None:

@@ -13,9 +13,11 @@ import yaml
 from pyarrow import parquet
 
 from aqualvs.app.append_file import AppendFile
+from aqualvs.app.cli import main
 from aqualvs.app.disk import explain
 from aqualvs.app.journal import POINTS_SCHEMA, PointsJournal, points_batch, read_journal
 from aqualvs.app.outputs import RunOutputs, prepare_folder, recover
+from aqualvs.app.overwriting import RECORD
 from aqualvs.app.points_export import PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv, posture_row
 from aqualvs.app.runfile import Status
@@ -433,7 +435,23 @@ def test_a_run_is_only_replaced_on_demand_and_nothing_else_ever(tmp_path):
         prepare_folder(tmp_path, overwrite=False)
     assert (tmp_path / "posture.csv").exists()
     prepare_folder(tmp_path, overwrite=True)
-    assert [p.name for p in tmp_path.iterdir()] == ["dive.mp4"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [RECORD, "dive.mp4"]
+
+
+def test_a_report_of_others_stays(tmp_path, capsys):
+    with prepare_folder(tmp_path, overwrite=False), outputs(tmp_path) as out:
+        out.write(scan(0))
+    (tmp_path / "report.html").write_text("precious")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "did not write it" in capsys.readouterr().err
+    assert (tmp_path / "report.html").read_text() == "precious"
+    (tmp_path / "report.html").unlink()
+    assert main(["report", str(tmp_path)]) == 0
+    assert main(["report", str(tmp_path)]) == 0
+    # A copy without its hidden files, or the run of an earlier version.
+    (tmp_path / RECORD).unlink()
+    assert main(["report", str(tmp_path)]) == 0
+    prepare_folder(tmp_path, overwrite=True)
 
 
 def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path):

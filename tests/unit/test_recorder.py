@@ -468,7 +468,7 @@ def test_torn_chunks_are_left_out_and_counted(tmp_path, samples):
     path = recorded(tmp_path / "dive.mcap", far_apart(samples), RecorderOptions(chunk_s=0.5))
     data = bytearray(path.read_bytes())
     file = McapFile(path)
-    at = file._index.chunks[2]
+    at = file._chunks[2]
     data[at + 200 : at + 900] = bytes(700)
     path.write_bytes(data)
     recording = DiveRecording(path)
@@ -480,7 +480,7 @@ def test_torn_chunks_are_left_out_and_counted(tmp_path, samples):
 def test_a_file_without_its_end_is_read_as_far_as_it_goes(tmp_path, samples):
     path = recorded(tmp_path / "dive.mcap", far_apart(samples), RecorderOptions(chunk_s=0.5))
     whole = path.read_bytes()
-    chunks = McapFile(path)._index.chunks
+    chunks = McapFile(path)._chunks
     path.write_bytes(whole[: chunks[-1] + 1000])
     assert is_recording(path)
     n = len(list(DiveRecording(path).frames(with_pictures=False)))

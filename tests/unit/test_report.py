@@ -297,7 +297,7 @@ def test_interrupted_run_still_gives_a_report(tmp_path: Path) -> None:
         ("points.parquet", b"PAR1 cut", "points.parquet cannot be read"),
         ("points.parquet", None, "points.parquet is missing"),
         ("run.yaml", None, "run.yaml is missing"),
-        ("run.yaml", b"- a\n- list\n", "run.yaml is empty or not a mapping"),
+        ("run.yaml", b"- a\n- list\n", "run.yaml cannot be read"),
         ("run.yaml", b"\xff\xfe\x00", "run.yaml cannot be read"),
     ],
 )

@@ -258,7 +258,8 @@ def test_nothing_else_reads_yaml() -> None:
     guilty = []
     for path in SOURCES.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        if path.name != "yamlfile.py" and "yaml" in text:
+        # What carries comments over looks for their places only.
+        if path.name not in ("yamlfile.py", "yamlcomments.py") and "yaml" in text:
             used = set(re.findall(r"\byaml\.(\w+)", re.sub(r'\w+\.yaml|"[^"\n]*"', "", text)))
             guilty += [(path, name) for name in used - writing]
             assert not re.search(r"from yaml import|import yaml as", text), path

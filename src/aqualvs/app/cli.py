@@ -98,7 +98,7 @@ _command(
 )(board)
 _command(
     help="Say in words whether a rig is sane and what it can measure.",
-    epilog="Example: aqualvs check rig.yaml --against rig.before.yaml",
+    epilog="Example: aqualvs check rig.yaml --against last",
 )(check)
 _command(
     help="Predict what a camera, a dome and lasers would measure, and tilt the lasers best. "

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from aqualvs.app.cli_command import CheckedCommand
-from aqualvs.app.cli_options import Celsius, Salinity
+from aqualvs.app.cli_options import Celsius, Overwrite, Salinity
 
 calibrate = typer.Typer(
     name="calibrate",
@@ -29,7 +29,7 @@ RigOut = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="Rig file to write; a file that is there is kept as NAME.before.yaml.",
+        help="Rig file to write; one that is there is kept under a dated name.",
         show_default=False,
     ),
 ]
@@ -329,6 +329,7 @@ def board(
         tuple[float, float, float],
         typer.Option(metavar="X Y Z", help="Rotation vector of the plate in the dome's frame."),
     ] = (0.0, 0.0, 0.0),
+    overwrite: Overwrite = False,
 ) -> None:
     """Print a target."""
     from aqualvs.app import board as body
@@ -350,6 +351,7 @@ def board(
             first_id=first_id,
             position_mm=position_mm,
             rotation_deg=rotation_deg,
+            overwrite=overwrite,
         ),
         typer.echo,
     )

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.app.cli_options import MavlinkKey, MavlinkPeer, VehicleFileOption
+from aqualvs.app.cli_options import MavlinkKey, MavlinkPeer, Overwrite, VehicleFileOption
 
 
 def follow(
@@ -56,6 +56,16 @@ def follow(
         str | None,
         typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.", show_default=False),
     ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Vehicle: record from the start.")
+    ] = False,
+    record_to: Annotated[
+        Path | None,
+        typer.Option(help="Vehicle: folder of recordings; that of -o if left out."),
+    ] = None,
+    record_video: Annotated[
+        bool, typer.Option("--record-video", help="Vehicle: record the pictures too.")
+    ] = False,
     target: Annotated[
         str,
         typer.Option(
@@ -95,6 +105,7 @@ def follow(
     ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
     seed: Annotated[int, typer.Option(help="Sim: of waves and noise.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Hold a distance to a net, or follow it."""
     from aqualvs.app import follow as body
@@ -122,6 +133,7 @@ def follow(
             seed=seed,
             dashboard=dashboard_address if dashboard else None,
             token=token,
+            overwrite=overwrite,
         )
         raise typer.Exit(body.simulate_and_tell(request, typer.echo))
     if source is None or rig is None or mavlink is None or gains is None:
@@ -142,7 +154,11 @@ def follow(
         aim=aim,
         dashboard=dashboard_address if dashboard else None,
         token=token,
+        record=record,
+        record_to=record_to,
+        record_video=record_video,
         water=Water(n_water=water_n, temperature_c=None, salinity=None),
         scanner=scanner_options(target, "ridge", "none", "robust"),
+        overwrite=overwrite,
     )
     raise typer.Exit(follow_and_tell(dive, typer.echo))

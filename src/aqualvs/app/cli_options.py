@@ -9,6 +9,9 @@ import typer
 OutFolder = Annotated[
     Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
 ]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what this command wrote there before.")
+]
 Target = Annotated[
     str,
     typer.Option(metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."),

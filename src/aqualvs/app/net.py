@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aqualvs.app.disk import writing
 from aqualvs.app.net_pass import NetPass
 from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import (
@@ -14,6 +13,7 @@ from aqualvs.app.outputs import (
     POSTURE_CSV,
     REPORT_HTML,
     RUN_YAML,
+    claim_run,
     recover,
 )
 from aqualvs.app.progress import progress
@@ -23,7 +23,7 @@ from aqualvs.app.run_inputs import scanner_options
 from aqualvs.app.runfile import read_run_yaml
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.stored_scans import check_stored, stored_scans
-from aqualvs.errors import OptionError, OutputError, SourceError
+from aqualvs.errors import OptionError, SourceError
 from aqualvs.optics.rigfile import rig_from_mapping
 
 
@@ -103,7 +103,7 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
         tell(f"{run_folder}: points completed from the journal of a run that was killed")
     stored = StoredDive(run_folder)
     net = stored.net_pass(request)
-    _prepare(folder, overwrite=place.overwrite)
+    claim = claim_run(folder, NET_FILES, overwrite=place.overwrite)
     with StopSignals() as stop, progress(str(run_folder), stored.n_frames) as tick:
         for scan in stored_scans(run_folder):
             net.add(scan)
@@ -111,12 +111,15 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
             if stop.caught:
                 break
     result = net.write(folder, stored.video)
+    claim.settle()
     for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
         tell(line)
     if stop.caught:
         tell(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
     if folder == run_folder and (run_folder / REPORT_HTML).exists():
-        tell(f"report: {write_report(run_folder)}")
+        # The run's own page, brought up to date.
+        with claim_run(folder, [REPORT_HTML], overwrite=True):
+            tell(f"report: {write_report(run_folder)}")
     return stop.exit_code
 
 
@@ -162,17 +165,6 @@ class StoredDive:
         """
         rig = rig_from_mapping(self._content["rig"], source_name=str(self._folder / RUN_YAML))
         return NetPass(rig, request)
-
-
-def _prepare(folder: Path, *, overwrite: bool) -> None:
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        found = [folder / name for name in NET_FILES if (folder / name).exists()]
-        if found and not overwrite:
-            raise OutputError(
-                f"{folder}: already holds the state of a net ({found[0].name}); choose another "
-                "folder or add --overwrite"
-            )
 
 
 def _run_file(run_folder: Path) -> dict[str, Any]:

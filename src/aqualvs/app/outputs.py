@@ -13,7 +13,7 @@ The report, the state of a net and the overlay video are written beside them by 
 """
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,6 +21,7 @@ from typing import Any, Self
 from aqualvs.app.append_file import locked_folder
 from aqualvs.app.disk import explain, writing
 from aqualvs.app.journal import PointsJournal, check_idle
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.points_export import DRAFT, PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv
 from aqualvs.app.runfile import RunFile, Status, now, read_run_yaml, write_yaml
@@ -35,6 +36,7 @@ POINTS_PARQUET = "points.parquet"
 POINTS_PLY = "points.ply"
 RUN_YAML = "run.yaml"
 OVERLAY_MP4 = "overlay.mp4"
+DIVE_MCAP = "dive.mcap"
 REPORT_HTML = "report.html"
 NET_CSV = "net.csv"
 HOLES_CSV = "holes.csv"
@@ -53,6 +55,7 @@ RUN_FILES = (
     POINTS_PARQUET + DRAFT,
     POINTS_PLY + DRAFT,
     OVERLAY_MP4,
+    DIVE_MCAP,
     REPORT_HTML,
     *NET_FILES,
 )
@@ -170,8 +173,8 @@ class RunOutputs:
         return self.tally.facts()
 
 
-def prepare_folder(folder: Path, *, overwrite: bool) -> None:
-    """Make sure that a run can be written to `folder`.
+def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
+    """Make sure that a run can be written to `folder`, and remove the one that it replaces.
 
     Parameters
     ----------
@@ -180,24 +183,45 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> None:
     overwrite : bool
         Whether to remove the files of a run that is already there (`RUN_FILES`, no others).
 
+    Returns
+    -------
+    claim : Claim
+        To be settled when the folder is complete.
+
     Raises
     ------
     OutputError
-        If the folder holds a run and `overwrite` is not set, if another process is writing to it,
-        or if it cannot be written.
+        If the folder holds a run and `overwrite` is not set, or files under a run's names that are
+        none of a run's, if another process is writing to it, or if it cannot be written.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with locked_folder(folder):
-            found = [folder / name for name in RUN_FILES if (folder / name).exists()]
             check_idle(folder / JOURNAL)
-            if found and not overwrite:
-                raise OutputError(
-                    f"{folder}: already holds a run ({found[0].name}); "
-                    "choose another folder or add --overwrite"
-                )
-            for path in found:
+            claim = claim_run(folder, RUN_FILES, overwrite=overwrite)
+            for path in claim.found:
                 path.unlink()
+    return claim
+
+
+def claim_run(folder: Path, names: Sequence[str], *, overwrite: bool) -> Claim:
+    """Return a claim on files of a run's folder, which all commands share that write to it.
+
+    Raises
+    ------
+    OutputError
+        As `Claim` does.
+    """
+    paths = [folder / name for name in names]
+    known = [folder / name for name in RUN_FILES] if _is_run(folder) else []
+    return Claim("run", paths, overwrite=overwrite, known=known)
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        return {"status", "source", "versions"} <= read_run_yaml(folder).keys()
+    except SourceError:
+        return False
 
 
 def recover(folder: Path) -> bool:

@@ -132,6 +132,8 @@ class ArduSubLink:
         Address as in `parse_address`, or a link that others use too; such a one is not closed here.
     options : ArduSubOptions, optional
         Defaults if left out.
+    advises : bool
+        Whether settings of the vehicle that are not safe are logged.
 
     Raises
     ------
@@ -139,7 +141,13 @@ class ArduSubLink:
         If the address makes no sense, or pymavlink is not installed.
     """
 
-    def __init__(self, link: str | MavlinkLink, options: ArduSubOptions | None = None) -> None:
+    def __init__(
+        self,
+        link: str | MavlinkLink,
+        options: ArduSubOptions | None = None,
+        *,
+        advises: bool = True,
+    ) -> None:
         self.options = options or ArduSubOptions()
         self._owns_link = isinstance(link, str)
         self.link = MavlinkLink(link) if isinstance(link, str) else link
@@ -154,7 +162,7 @@ class ArduSubLink:
         self._depth = DepthChoice(self.link, _FRESH_S)
         self._response = StickResponse(self.link)
         self._watch = ParameterWatch(self.link, FOR_STICKS)
-        self._advised = False
+        self._advised = not advises
         # A watchdog sends from a thread of its own.
         self._sending = threading.Lock()
         self._sent_s = float("-inf")

@@ -26,7 +26,7 @@ FOR_DISTANCE = (RANGE_TYPE, RANGE_ORIENT, *(name for name, _ in (*RANGE_NEAR, *R
 FULL_CLIMB_RATE = 0.5
 """What a full stick asks for at a pilot gain of 1 in m/s, as the packaged gains take it."""
 
-_DISABLED, _WARN, _DISARM = 0, 1, 2
+_DISABLED, _DISARM = 0, 2
 _MAVLINK_RANGEFINDER, _FORWARD = 10, 0
 # A last effort that stands longer than this goes far.
 _LONGEST_TIMEOUT_S = 1.0

@@ -8,12 +8,11 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
-from aqualvs.scanning.segments import link_segments
-from aqualvs.scanning.stripe import Returns, StripeOptions
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe_pieces import LENGTH, SMOOTHING, continued, find_pieces, line_log_odds
 
 # A stripe that runs less than 45 degrees off a search line is left to the other axis.
 _STEEPEST = 1.0
@@ -30,8 +29,8 @@ _SIGMA_IN_WIDTHS, _LEAST_SIGMA_PX = 0.01, 0.05
 # centre by about so many widths for each height of the stripe.
 _FLANK_AT, _FLANK_PULL = 1.3, 0.2
 _SLOPE_AT, _SLOPE_PULL = 0.5, 0.35
-# Returns kept for each search line: a whole picture has more that is bright than the lasers' bands.
-_RETURNS_PER_LINE = 60
+# Full width at half height of a normal distribution, in standard deviations.
+_WIDTH_OF_SIGMA = 2.355
 _MAP_LENGTH = 30000
 
 
@@ -42,20 +41,22 @@ class WholePictureOptions:
     Attributes
     ----------
     min_likelihood : float
-        Least mean likelihood along a piece of stripe that its colour is a laser's: what tells a
-        laser's line from a printed edge. Only used where the picture has colour.
+        Least likelihood that a piece of stripe is a laser's line, by its shape and colour and by
+        what the picture's other lines look like, 0 to 1.
     min_length_share : float
         Shortest unbroken piece of a stripe, as a share of the picture's width.
     wavelength_nm : float or None
         Of the lasers; green if None.
     """
 
-    min_likelihood: float = 0.55
+    min_likelihood: float = 0.6
     min_length_share: float = 0.015
     wavelength_nm: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        if not 0.0 < self.min_likelihood < 1.0:
+            raise OptionError(f"min_likelihood is {self.min_likelihood}; use 0 to 1")
         if not 0.0 < self.min_length_share < 1.0:
             raise OptionError(f"min_length_share is {self.min_length_share}; use 0 to 1")
 
@@ -95,7 +96,7 @@ class StripePixels:
 def find_stripes(
     image: ImagePlane | Frame, options: WholePictureOptions | None = None
 ) -> StripePixels:
-    """Find what is thin, long and of a laser's colour, with the detector of the scanner.
+    """Find the lines of lasers: what is thin, long and of their colour, and looks alike.
 
     Parameters
     ----------
@@ -107,19 +108,29 @@ def find_stripes(
     -------
     StripePixels
         Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
+        Nothing where no piece is certain.
     """
     options = options or WholePictureOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
     height, width = frame.luma.shape
     colour = LaserColour.of(options.wavelength_nm)
-    searches = [_whole_search((width, height), axis, colour) for axis in SearchAxis]
-    most = _RETURNS_PER_LINE * max(len(search.lowest) for search in searches)
-    detector = FrameDetector(
-        (width, height), searches, StripeOptions(max_returns=most), are_lasers=False
-    )
-    returns = detector.detect(frame)
-    found = _joined([_pieces(search, returns[search.axis], width, options) for search in searches])
-    return replace(found, sigma_px=_sigma_px(frame.luma, found))
+    found = [
+        find_pieces(frame, _whole_search((width, height), axis, colour)) for axis in SearchAxis
+    ]
+    table = np.concatenate([pieces.table for pieces in found], axis=1)
+    log_odds = line_log_odds(table, width, has_colour=frame.chroma is not None)
+    least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
+    keep = continued(table, log_odds, least, width)
+    keep &= table[LENGTH] >= options.min_length_share * width
+    parts, first = [], 0
+    for pieces in found:
+        n = len(pieces.start) - 1
+        for k in np.flatnonzero(keep[first : first + n]):
+            chain = pieces.order[pieces.start[k] : pieces.start[k + 1]]
+            parts.append(_piece(pieces.search, pieces.returns, chain))
+        first += n
+    stripes = _joined([piece for piece in parts if _is_long(piece)])
+    return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
 def _whole_search(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> StripeSearch:
@@ -131,25 +142,8 @@ def _whole_search(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColou
     return StripeSearch(axis, line_px, lowest, highest, -slopes, slopes, colour)
 
 
-def _pieces(
-    search: StripeSearch, returns: Returns, width_px: int, options: WholePictureOptions
-) -> StripePixels:
-    """Return the pieces that are of the colour, long enough, and cross the search lines well."""
-    segments = link_segments(returns, search)
-    chains = np.split(segments.order, np.flatnonzero(np.diff(segments.stretch)) + 1)
-    least = max(3, math.ceil(options.min_length_share * width_px / search.line_px))
-    kept = [
-        chain
-        for chain in chains
-        if len(chain) >= least and np.mean(returns.likelihood[chain]) >= options.min_likelihood
-    ]
-    pieces = [_piece(search, returns, chain) for chain in kept]
-    return _joined([piece for piece in pieces if _is_long(piece)])
-
-
 def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePixels:
     axis = search.axis
-    chain = chain[np.argsort(returns.line[chain], kind="stable")]
     line = search.line_px * (returns.line[chain].astype(np.float64) + 0.5) - 0.5
     slope = _slopes(line, returns.position[chain])
     width = returns.width[chain]
@@ -161,7 +155,7 @@ def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePix
     cosine = 1.0 / np.hypot(1.0, slope)
     pixels = np.stack([line, returns.position[chain]], axis=-1)
     across = np.stack([-slope * cosine, cosine], axis=-1)
-    width = returns.width[chain] * cosine
+    width = _unsmoothed(returns.width[chain], slope * search.line_px) * cosine
     return StripePixels(
         pixels[:, ::-1] if along_x else pixels,
         across[:, ::-1] if along_x else across,
@@ -170,6 +164,13 @@ def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePix
         width,
         np.zeros(len(chain)),
     )
+
+
+def _unsmoothed(width: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return widths (N,) without what smoothing along slanted stripes adds to them."""
+    added = _WIDTH_OF_SIGMA * SMOOTHING * slope
+    squared: FloatArray = np.maximum(width**2 - added**2, (0.5 * width) ** 2)
+    return np.sqrt(squared)
 
 
 def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:

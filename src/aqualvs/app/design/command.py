@@ -12,7 +12,7 @@ from rich.console import Console
 from aqualvs.app.design.best import best_angles
 from aqualvs.app.design.calibrated import camera_errors
 from aqualvs.app.design.changes import changes
-from aqualvs.app.design.figures import draw_figures
+from aqualvs.app.design.figures import ERRORS_PNG, PICTURE_PNG, draw_figures
 from aqualvs.app.design.file import (
     FAN_DEG,
     design_from,
@@ -37,6 +37,7 @@ from aqualvs.app.design.words import (
     summary,
 )
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
@@ -67,6 +68,8 @@ class DesignRequest:
         Whether to look for the best angles.
     try_changes : bool
         Whether to say which changes would help.
+    overwrite : bool
+        Whether to replace what this command wrote to `out` before.
     """
 
     design: Path | None = None
@@ -77,6 +80,7 @@ class DesignRequest:
     turn: bool = False
     tilt: bool = True
     try_changes: bool = True
+    overwrite: bool = False
 
 
 def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
@@ -89,6 +93,9 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
     """
     console = console or Console()
     design = _asked_for(request)
+    names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG)
+    files = [(request.out or Path()) / name for name in names]
+    claim = Claim("design", files, overwrite=request.overwrite)
     if request.turn:
         turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
         design = design.with_mounts(turned)
@@ -111,6 +118,7 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
         console.print()
     if request.out is not None:
         _write(best, request.out, console)
+        claim.settle()
 
 
 def _tell_errors(console: Console, design: Design, title: str) -> None:
@@ -146,7 +154,6 @@ def _asked_for(request: DesignRequest) -> Design:
 
 def _write(design: Design, out: Path, console: Console) -> None:
     with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
         save_rig(designed_rig(design), out / RIG_YAML)
         pictures = draw_figures(design, out)
     for path in (out / RIG_YAML, *pictures):

@@ -1,0 +1,484 @@
+"""Pieces of stripes in a whole picture, and how likely each is a laser's line.
+
+A piece is a smooth chain of peaks of neighbouring search lines. One peak says little: noise,
+texture and printed edges make thousands, some of them of the laser's colour. Pooled along a piece,
+the evidence is strong: a laser's line is long for its width, thin, higher than what lies on either
+side, and moves the chroma along the wavelength's direction and not across it. The evidence is
+weighed by logistic regression, twice: first against what is known of lines in general, then against
+the picture's own lines, which are learned from the pieces that are certain. Where no piece is
+certain, there is no line.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.scanning.laser_colour import LaserColour, channel_image
+from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.scanning.search import SearchAxis, StripeSearch
+from aqualvs.scanning.segments import link_segments
+from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
+from aqualvs.scanning.stripe import POSITION, PeakFinder, Returns, SearchImage
+from aqualvs.scanning.stripe import WIDTH as PEAK_WIDTH
+
+Rows = NDArray[np.float32]
+
+LENGTH, HEIGHT, WIDTH, TOP, ONE_SIDED, ALONG, ACROSS, FIRST_X, FIRST_Y, LAST_X, LAST_Y = range(11)
+"""Rows of a table of pieces: lengths and places in pixels, heights in grey levels."""
+_N_MEASURES = 11
+
+# Peaks of so many grey levels are looked at, in a picture smoothed along the stripes by so many
+# search lines: noise of one pixel does not break a faint line then. As many for each search line.
+_MIN_CONTRAST, SMOOTHING, _PEAKS_PER_LINE = 3, 1.0, 120
+# The background is looked for within this share of the picture's width, or so many pixels.
+_REACH_SHARE, _LEAST_REACH = 0.045, 8
+# A piece ends where the next return is so many search lines or pixels away, or where the stripe
+# bends by so many pixels, or such a share of its width, within three returns; the fewest returns.
+_MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
+_KINK_PX, _KINK_IN_WIDTHS, MIN_RETURNS = 1.0, 0.25, 5
+# Light and chroma of a stripe are summed up to its flanks, so many pixels beyond half height.
+_FLANK_PX = 2
+# Ratios of chroma to light, and differences in height of the flanks for each level, are believed
+# within these bounds.
+_MOST_RATIO, _LEAST_RATIO, _MOST_ACROSS, _MOST_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
+# Levels of chroma that noise makes, and chroma for each level that grey pictures count as having.
+_CHROMA_NOISE, _EXPECTED_ALONG = 2.0, 0.25
+# A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
+_WHITE = 225.0
+# Weights of the evidence, in the order of `_evidence`, and of what the picture's own lines add to
+# it. Fitted by tools/fit_stripe_pieces.py.
+_GENERAL = np.array(
+    [-4.62, -0.196, 0.709, 0.613, -0.316, -1.27, -0.829, 29.9, 1.02, -4.89, -3.89, 0.358]
+)
+_OWN = np.array(
+    [
+        -4.1,
+        0.0586,
+        0.566,
+        0.342,
+        -0.48,
+        -0.795,
+        -0.49,
+        33.4,
+        0.814,
+        -4.7,
+        -1.59,
+        0.345,
+        -0.157,
+        -0.87,
+        2.77,
+    ]
+)
+# Pieces of more than these log odds, by what is known of lines in general, are certain; but none
+# that shows less chroma for each level than any camera's lines do, such as a highlight on steel.
+_CERTAIN, _LEAST_ALONG = 2.3, 0.1
+# What the picture's lines differ by in colour: chroma for each level, and as a share of theirs.
+_ACROSS_SPREAD, _SHARE_SPREAD = 0.08, 0.3
+_MOST_OWN = 9.0
+# A line that ends makes it more likely, by so many log odds, that what follows straight on is the
+# same line: at most this share of the picture's width away, and so many pixels, and for each pixel
+# of the gap such a share, off its direction.
+_HELP, _MOST_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
+
+
+class Pieces(NamedTuple):
+    """Pieces of stripes, P of them, along one search direction.
+
+    Attributes
+    ----------
+    search : StripeSearch
+        Of the whole picture.
+    returns : Returns
+        All peaks of the search direction.
+    order : int array, shape (N,)
+        Indices into the returns, piece by piece, along each piece.
+    start : int array, shape (P + 1,)
+        Where each piece begins in `order`, and N.
+    table : array, shape (11, P)
+        Measures of the pieces, rows as named above.
+    """
+
+    search: StripeSearch
+    returns: Returns
+    order: IntArray
+    start: IntArray
+    table: FloatArray
+
+
+class PictureRows(NamedTuple):
+    """A picture as one search direction sees it, with search lines as rows.
+
+    Attributes
+    ----------
+    light : float32 array, shape (n_lines, length)
+        Grey levels of the channel in which the laser is brightest.
+    along, across : float32 array, shape (n_lines, length)
+        Chroma along the direction of the laser's colour and at right angles to it; of shape (0, 0)
+        for a grey picture.
+    """
+
+    light: Rows
+    along: Rows
+    across: Rows
+
+
+def picture_rows(frame: Frame, search: StripeSearch, colour: LaserColour) -> PictureRows:
+    """Return a picture as the rows of a search, light smoothed along the stripes.
+
+    Parameters
+    ----------
+    frame : Frame
+    search : StripeSearch
+        Of the whole picture.
+    colour : LaserColour
+    """
+    light = _rows(channel_image(frame, colour), search)
+    # In wide pictures, a stripe of a pixel or two is smoothed across as well.
+    across = np.array([1.0]) if search.line_px == 1 else np.array([0.25, 0.5, 0.25])
+    along = cv2.getGaussianKernel(5, SMOOTHING)
+    light = np.asarray(
+        cv2.sepFilter2D(light, -1, across, along, borderType=cv2.BORDER_REPLICATE), np.float32
+    )
+    if frame.chroma is None:
+        none = np.empty((0, 0), np.float32)
+        return PictureRows(light, none, none)
+    u, v = (plane.astype(np.float32) - 128.0 for plane in frame.chroma)
+    to_u, to_v = colour.value
+    height, width = frame.luma.shape
+
+    def full(half: Rows) -> Rows:
+        size = 2 * half.shape[1], 2 * half.shape[0]
+        both = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+        return _rows(both, search)
+
+    return PictureRows(light, full(to_u * u + to_v * v), full(to_u * v - to_v * u))
+
+
+def _rows(image: ImagePlane | Rows, search: StripeSearch) -> Rows:
+    lines = image.T if search.axis is SearchAxis.ALONG_Y else image
+    step = search.line_px
+    n = len(lines) // step
+    rows = lines[: n * step].astype(np.float32)
+    if step > 1:
+        rows = sum((rows[i::step] for i in range(1, step)), rows[::step]) / np.float32(step)
+    return np.ascontiguousarray(rows)
+
+
+def find_pieces(frame: Frame, search: StripeSearch) -> Pieces:
+    """Find and measure all pieces, of whatever colour, along one search direction.
+
+    Parameters
+    ----------
+    frame : Frame
+    search : StripeSearch
+        Of the whole picture, with the colour of the laser.
+    """
+    rows = picture_rows(frame, search, search.colour)
+    returns = _peaks(rows.light, search, frame.luma.shape[1])
+    order, start = _smooth_chains(returns, search)
+    table = np.empty((_N_MEASURES, len(start) - 1))
+    _measure(
+        *rows,
+        returns.line,
+        returns.position,
+        returns.height,
+        returns.width,
+        order,
+        start,
+        search.line_px,
+        search.axis is SearchAxis.ALONG_X,
+        table,
+    )
+    return Pieces(search, returns, order, start, table)
+
+
+def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
+    n_lines, length = light.shape
+    reach_px = max(_LEAST_REACH, round(_REACH_SHARE * width_px))
+    finder = PeakFinder(
+        length,
+        search.lowest,
+        search.highest,
+        reach_px,
+        _PEAKS_PER_LINE * n_lines,
+        np.array([search.colour.value]),
+    )
+    grey = np.empty((0, 0), np.uint8)
+    levels = np.rint(light).astype(np.uint8)
+    along_x = search.axis is SearchAxis.ALONG_X
+    line, table = finder.find(
+        SearchImage(levels, grey, grey, along_x, search.line_px), _MIN_CONTRAST
+    )
+    position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]
+    # Flanks must lie in the picture.
+    margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
+    inside = (position >= margin) & (position < length - 1 - margin)
+    columns = (column[inside] for column in (position, height, width))
+    return Returns(line[inside], *columns, np.ones(np.count_nonzero(inside)))
+
+
+def _smooth_chains(returns: Returns, search: StripeSearch) -> tuple[IntArray, IntArray]:
+    """Return chains of returns without gaps and kinks: order, and where each begins."""
+    segments = link_segments(returns, search)
+    order = segments.order
+    if len(order) == 0:
+        return order, np.zeros(1, np.int64)
+    line, position, width = returns.line[order], returns.position[order], returns.width[order]
+    step = np.diff(line)
+    ends = (np.diff(segments.stretch) != 0) | (step <= 0) | (step > _MAX_LINE_STEP)
+    ends |= np.abs(np.diff(position)) > _MAX_STEP_PX
+    bend = np.abs(position[2:] - 2.0 * position[1:-1] + position[:-2])
+    kinks = np.flatnonzero(bend > np.maximum(_KINK_PX, _KINK_IN_WIDTHS * width[1:-1])) + 1
+    ends[kinks - 1] = ends[kinks] = True
+    start = np.concatenate([[0], np.flatnonzero(ends) + 1, [len(order)]])
+    long = np.diff(start) >= MIN_RETURNS
+    order = order[np.repeat(long, np.diff(start))]
+    return order, np.concatenate([[0], np.cumsum(np.diff(start)[long])])
+
+
+@kernel
+def _measure(
+    light: Rows,
+    along: Rows,
+    across: Rows,
+    line: IntArray,
+    position: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    order: IntArray,
+    start: IntArray,
+    line_px: int,
+    along_x: bool,
+    table: FloatArray,
+) -> None:
+    """Write the measures of all pieces."""
+    has_colour = along.shape[0] > 0
+    for k in range(start.shape[0] - 1):
+        members = order[start[k] : start[k + 1]]
+        n = members.shape[0]
+        tops, above, one_sided = np.empty(n), np.empty(n), np.empty(n)
+        total, total_along, total_across = 0.0, 0.0, 0.0
+        for i in range(n):
+            x, peak = line[members[i]], int(position[members[i]] + 0.5)
+            reach = int(np.ceil(0.5 * width[members[i]])) + _FLANK_PX
+            low, high = peak - reach, peak + reach
+            left = 0.5 * (light[x, low] + light[x, low - 1])
+            right = 0.5 * (light[x, high] + light[x, high + 1])
+            top = max(light[x, peak], light[x, peak - 1], light[x, peak + 1])
+            tops[i], above[i], one_sided[i] = top, top - max(left, right), abs(right - left)
+            if has_colour:
+                total += _sum_above_flanks(light[x], low, high)
+                total_along += _sum_above_flanks(along[x], low, high)
+                total_across += _sum_above_flanks(across[x], low, high)
+        total = max(total, 1.0)
+        first, last = members[0], members[n - 1]
+        begin, end = line_px * (line[first] + 0.5) - 0.5, line_px * (line[last] + 0.5) - 0.5
+        table[LENGTH, k] = np.hypot(end - begin, position[last] - position[first])
+        table[HEIGHT, k] = np.median(height[members])
+        table[WIDTH, k] = np.median(width[members])
+        table[TOP, k] = np.median(tops)
+        table[ONE_SIDED, k] = np.median(one_sided) / max(np.median(above), 1.0)
+        table[ALONG, k], table[ACROSS, k] = total_along / total, total_across / total
+        x, y = (FIRST_Y, FIRST_X) if along_x else (FIRST_X, FIRST_Y)
+        table[x, k], table[y, k] = begin, position[first]
+        x, y = (LAST_Y, LAST_X) if along_x else (LAST_X, LAST_Y)
+        table[x, k], table[y, k] = end, position[last]
+
+
+@kernel
+def _sum_above_flanks(row: Rows, low: int, high: int) -> float:
+    """Return the sum between two flanks above the straight line from one to the other."""
+    left, right = 0.5 * (row[low] + row[low - 1]), 0.5 * (row[high] + row[high + 1])
+    total = 0.0
+    for k in range(low + 1, high):
+        share = (k - low + 0.5) / (high - low + 1.0)
+        total += row[k] - (1.0 - share) * left - share * right
+    return total
+
+
+def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
+    """Return what tells lines from other things in any picture, one row a piece.
+
+    Parameters
+    ----------
+    table : array, shape (11, P)
+        Measures of pieces.
+    width_px : int
+        Of the picture: stripes are about as thin for it in every camera.
+    has_colour : bool
+        Whether the picture has chroma; else every piece counts as of the laser's colour.
+
+    Returns
+    -------
+    array, shape (P, 12)
+    """
+    length = np.log(32.0 * table[LENGTH] / width_px + 0.1)
+    slimness = np.log(table[LENGTH] / table[WIDTH] + 0.5)
+    height = np.log(np.maximum(table[HEIGHT], _MIN_CONTRAST) / 20.0)
+    width = np.log(200.0 * table[WIDTH] / width_px + 0.1)
+    n = table.shape[1]
+    along = _believed_along(table) if has_colour else np.full(n, _EXPECTED_ALONG)
+    across = table[ACROSS] if has_colour else np.zeros(n)
+    return np.stack(
+        [
+            np.ones(n),
+            length,
+            slimness,
+            height,
+            height**2,
+            width,
+            np.minimum(table[ONE_SIDED], _MOST_ONE_SIDED),
+            np.clip(along, 0.0, _LEAST_ALONG),
+            np.log1p(np.maximum(along, 0.0) * table[HEIGHT] / _CHROMA_NOISE),
+            np.clip(along, _LEAST_RATIO, 0.0),
+            np.minimum(np.abs(across), _MOST_ACROSS),
+            length * height,
+        ],
+        axis=-1,
+    )
+
+
+def _believed_along(table: FloatArray) -> FloatArray:
+    """Return chroma along the laser's colour for each level (P,); a white core says nothing."""
+    along = np.minimum(table[ALONG], _MOST_RATIO)
+    return np.where(table[TOP] >= _WHITE, np.maximum(along, _LEAST_ALONG), along)
+
+
+class OwnLines(NamedTuple):
+    """What the lines of a picture look like: colour, and logarithms of width and height."""
+
+    along: float
+    across: float
+    log_width: float
+    log_height: float
+
+
+def learn_lines(table: FloatArray, log_odds: FloatArray, *, has_colour: bool) -> OwnLines | None:
+    """Learn what the picture's lines look like from the pieces that are certain.
+
+    Parameters
+    ----------
+    table : array, shape (11, P)
+        Measures of pieces.
+    log_odds : array, shape (P,)
+        By the general evidence.
+    has_colour : bool
+        Whether the picture has chroma.
+
+    Returns
+    -------
+    OwnLines or None
+        None where no piece is certain.
+    """
+    certain = np.flatnonzero(
+        (log_odds > _CERTAIN) & ((table[ALONG] >= _LEAST_ALONG) | (not has_colour))
+    )
+    if len(certain) == 0:
+        return None
+    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _CERTAIN + 0.5, 0.0, 3.0)
+
+    def median(values: FloatArray) -> float:
+        by_size = np.argsort(values)
+        total = np.cumsum(weight[by_size])
+        return float(values[by_size[np.searchsorted(total, 0.5 * total[-1])]])
+
+    of = table[:, certain]
+    return OwnLines(
+        median(of[ALONG]), median(of[ACROSS]), median(np.log(of[WIDTH])), median(np.log(of[HEIGHT]))
+    )
+
+
+def own_evidence(
+    table: FloatArray, lines: OwnLines, width_px: int, *, has_colour: bool
+) -> FloatArray:
+    """Return the general evidence, and how pieces differ from the picture's own lines.
+
+    Returns
+    -------
+    array, shape (P, 15)
+    """
+    general = general_evidence(table, width_px, has_colour=has_colour)
+    off_across = np.zeros(table.shape[1])
+    if has_colour:
+        spread = _ACROSS_SPREAD + _SHARE_SPREAD * np.hypot(lines.along, lines.across)
+        off_across = np.clip(table[ACROSS] - lines.across, -_MOST_ACROSS, _MOST_ACROSS) / spread
+    off_width = np.log(table[WIDTH]) - lines.log_width
+    higher = np.maximum(np.log(table[HEIGHT]) - lines.log_height, 0.0)
+    own = np.minimum(np.stack([off_across**2, off_width**2, higher], axis=-1), _MOST_OWN)
+    return np.concatenate([general, own], axis=1)
+
+
+def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
+    """Return the log odds that each piece is a laser's line.
+
+    Parameters
+    ----------
+    table : array, shape (11, P)
+        Measures of all pieces of one picture.
+    width_px : int
+        Of the picture.
+    has_colour : bool
+        Whether the picture has chroma.
+
+    Returns
+    -------
+    array, shape (P,)
+        Minus infinity for all where none is certain.
+    """
+    log_odds = general_evidence(table, width_px, has_colour=has_colour) @ _GENERAL
+    lines = learn_lines(table, log_odds, has_colour=has_colour)
+    if lines is None:
+        return np.full(table.shape[1], -np.inf)
+    found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ _OWN
+    return found
+
+
+def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
+    """Mark the pieces that are lines: likely ones, and less likely ones that go on where they end.
+
+    Parameters
+    ----------
+    table : array, shape (11, P)
+        Measures of all pieces of one picture.
+    log_odds : array, shape (P,)
+        That each is a line.
+    least : float
+        Log odds from which on a piece needs no other.
+    width_px : int
+        Of the picture.
+
+    Returns
+    -------
+    bool array, shape (P,)
+    """
+    keep: BoolArray = log_odds >= least
+    waiting = np.flatnonzero(~keep & (log_odds >= least - _HELP))
+    new = np.flatnonzero(keep)
+    ends = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
+    while len(new) and len(waiting):
+        goes_on = np.zeros(len(waiting), bool)
+        for k in new:
+            goes_on |= _goes_on(ends[k], ends[waiting], width_px)
+        new = waiting[goes_on]
+        keep[new] = True
+        waiting = waiting[~goes_on]
+    return keep
+
+
+def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
+    """Mark which other pieces (N, 2, 2) lie on the straight continuation of a piece (2, 2)."""
+    way = piece[1] - piece[0]
+    length = float(np.hypot(*way))
+    way = way / max(length, 1e-9)
+    middle = piece.mean(axis=0)
+    off = others - middle
+    along, across = off @ way, off @ np.array([-way[1], way[0]])
+    # No farther away than the piece is long: its direction is not known better.
+    gap = np.abs(along).min(axis=1) - 0.5 * length
+    reach = min(length, _MOST_GAP * width_px)
+    allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)
+    return (gap > -0.5 * length) & (gap <= reach) & (np.abs(across).max(axis=1) <= allowed)
