@@ -14,6 +14,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
@@ -217,8 +219,8 @@ def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     # Flanks must lie in the picture.
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
     inside = (position >= margin) & (position < length - 1 - margin)
-    columns = (column[inside] for column in (position, height, width))
-    return Returns(line[inside], *columns, np.ones(np.count_nonzero(inside)))
+    position, height, width = (column[inside] for column in (position, height, width))
+    return Returns(line[inside], position, height, width, np.ones(len(position)))
 
 
 def _smooth_chains(returns: Returns, search: StripeSearch) -> tuple[IntArray, IntArray]:
@@ -345,7 +347,8 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 def _believed_along(table: FloatArray) -> FloatArray:
     """Return chroma along the laser's colour for each level (P,); a white core says nothing."""
     along = np.minimum(table[ALONG], _MOST_RATIO)
-    return np.where(table[TOP] >= _WHITE, np.maximum(along, _LEAST_ALONG), along)
+    believed: FloatArray = np.where(table[TOP] >= _WHITE, np.maximum(along, _LEAST_ALONG), along)
+    return believed
 
 
 class OwnLines(NamedTuple):
@@ -430,11 +433,26 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
         Minus infinity for all where none is certain.
     """
     log_odds = general_evidence(table, width_px, has_colour=has_colour) @ _GENERAL
+    # Dashes in a row are as long as all of them together.
+    likely = np.flatnonzero(log_odds > 0.0)
+    in_a_row = table[:, likely]
+    in_a_row[LENGTH] = _length_in_a_row(in_a_row, width_px)
+    log_odds[likely] = general_evidence(in_a_row, width_px, has_colour=has_colour) @ _GENERAL
     lines = learn_lines(table, log_odds, has_colour=has_colour)
     if lines is None:
         return np.full(table.shape[1], -np.inf)
     found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ _OWN
     return found
+
+
+def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
+    """Return the length (P,) of each piece with all pieces that go on where another ends."""
+    ends = _ends(table)
+    linked = np.array([_goes_on(one, ends, width_px) for one in ends]).reshape(len(ends), -1)
+    linked |= linked.T | np.eye(len(ends), dtype=bool)
+    _, row = connected_components(csr_array(linked), directed=False)
+    total = np.bincount(row, table[LENGTH], len(ends)).astype(np.float64)[row]
+    return total
 
 
 def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
@@ -458,7 +476,7 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
     keep: BoolArray = log_odds >= least
     waiting = np.flatnonzero(~keep & (log_odds >= least - _HELP))
     new = np.flatnonzero(keep)
-    ends = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
+    ends = _ends(table)
     while len(new) and len(waiting):
         goes_on = np.zeros(len(waiting), bool)
         for k in new:
@@ -467,6 +485,12 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
         keep[new] = True
         waiting = waiting[~goes_on]
     return keep
+
+
+def _ends(table: FloatArray) -> FloatArray:
+    """Return the first and the last point (P, 2, 2) of pieces."""
+    ends: FloatArray = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
+    return ends
 
 
 def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
@@ -481,4 +505,6 @@ def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
     gap = np.abs(along).min(axis=1) - 0.5 * length
     reach = min(length, _MOST_GAP * width_px)
     allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)
-    return (gap > -0.5 * length) & (gap <= reach) & (np.abs(across).max(axis=1) <= allowed)
+    goes_on: BoolArray = np.abs(across).max(axis=1) <= allowed
+    goes_on &= (gap > -0.5 * length) & (gap <= reach)
+    return goes_on
