@@ -85,6 +85,10 @@ _MOST_OWN = 9.0
 # same line: at most this share of the picture's width away, and so many pixels, and for each pixel
 # of the gap such a share, off its direction.
 _HELP, _MOST_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
+# At a line's end, at most so many returns follow, each within so many pixels of where the line is
+# due by its slope over so many returns, as high as this share of its height at least, and with
+# fewer than so many search lines missed.
+_MOST_FOLLOWING, _FOLLOW_PX, _SLOPE_RETURNS, _LEAST_HEIGHT_SHARE, _MOST_MISSED = 8, 1.2, 6, 0.3, 4
 
 
 class Pieces(NamedTuple):
@@ -451,8 +455,7 @@ def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
     linked = np.array([_goes_on(one, ends, width_px) for one in ends]).reshape(len(ends), -1)
     linked |= linked.T | np.eye(len(ends), dtype=bool)
     _, row = connected_components(csr_array(linked), directed=False)
-    total = np.bincount(row, table[LENGTH], len(ends)).astype(np.float64)[row]
-    return total
+    return np.bincount(row, table[LENGTH], len(ends)).astype(np.float64)[row]
 
 
 def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
@@ -485,6 +488,71 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
         keep[new] = True
         waiting = waiting[~goes_on]
     return keep
+
+
+def extended(pieces: Pieces, keep: BoolArray) -> list[IntArray]:
+    """Return the chains of returns of kept pieces, each with what follows it at its ends.
+
+    A piece ends at a kink or a gap; beyond, a few returns may still be the line's.
+
+    Parameters
+    ----------
+    pieces : Pieces
+    keep : bool array, shape (P,)
+        Which pieces are lines.
+    """
+    returns = pieces.returns
+    first_of = np.searchsorted(returns.line, np.arange(len(pieces.search.lowest) + 1))
+    chains = [pieces.order[pieces.start[k] : pieces.start[k + 1]] for k in np.flatnonzero(keep)]
+    used = np.zeros(len(returns), bool)
+    for chain in chains:
+        used[chain] = True
+    longer = []
+    for chain in chains:
+        after = _following(chain, 1, returns.line, returns.position, returns.height, first_of, used)
+        before = _following(
+            chain[::-1], -1, returns.line, returns.position, returns.height, first_of, used
+        )
+        longer.append(np.concatenate([before[::-1], chain, after]))
+    return longer
+
+
+@kernel
+def _following(
+    chain: IntArray,
+    step: int,
+    line: IntArray,
+    position: FloatArray,
+    height: FloatArray,
+    first_of: IntArray,
+    used: BoolArray,
+) -> IntArray:
+    """Return and mark the returns that follow the last one of a chain, one a search line."""
+    n = chain.shape[0]
+    last, back = chain[n - 1], chain[max(n - 1 - _SLOPE_RETURNS, 0)]
+    slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
+    least = _LEAST_HEIGHT_SHARE * np.median(height[chain])
+    found = np.empty(_MOST_FOLLOWING, np.int64)
+    n_found, x, place, gap = 0, line[last], position[last], 0
+    while n_found < _MOST_FOLLOWING and gap < _MOST_MISSED:
+        x += step
+        if x < 0 or x >= first_of.shape[0] - 1:
+            break
+        gap += 1
+        best, best_miss = -1, _FOLLOW_PX
+        for i in range(first_of[x], first_of[x + 1]):
+            miss = abs(position[i] - (place + slope * gap))
+            if miss < best_miss and height[i] >= least:
+                best, best_miss = i, miss
+        if best < 0:
+            continue
+        if used[best]:
+            break
+        place, gap = position[best], 0
+        used[best] = True
+        found[n_found] = best
+        n_found += 1
+    return found[:n_found].copy()
 
 
 def _ends(table: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from aqualvs.scanning.stripe_pieces import (
     SMOOTHING,
     Pieces,
     continued,
+    extended,
     find_pieces,
     line_log_odds,
 )
@@ -56,7 +57,7 @@ class WholePictureOptions:
         Of the lasers; green if None.
     """
 
-    min_likelihood: float = 0.6
+    min_likelihood: float = 0.5
     min_length_share: float = 0.015
     wavelength_nm: float | None = None
 
@@ -129,8 +130,7 @@ def find_stripes(
     parts, first = [], 0
     for pieces in found:
         n = len(pieces.start) - 1
-        for k in np.flatnonzero(keep[first : first + n]):
-            chain = pieces.order[pieces.start[k] : pieces.start[k + 1]]
+        for chain in extended(pieces, keep[first : first + n]):
             parts.append(_piece(pieces.search, pieces.returns, chain))
         first += n
     stripes = _joined([piece for piece in parts if _is_long(piece)])
