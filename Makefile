@@ -15,7 +15,7 @@ help: ## List the tasks
 setup: $(STAMP) ## Make .venv with the package and the tools of developers
 
 demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
-	$(BIN)/aqualvs demo -o out/demo
+	$(BIN)/aqualvs demo -o out/demo --overwrite
 
 test: $(STAMP) ## Run all tests: those that watch a clock one by one, the others two at a time
 	$(BIN)/python -m pytest --ignore=tests/live --numprocesses=2 --dist=loadfile

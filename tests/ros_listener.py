@@ -16,9 +16,10 @@ import numpy as np
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import POINT_TYPE
 from aqualvs.live.sample import LiveSample
+from waiting import PATIENCE_S
 
 
-def until(true: Callable[[], object], seconds: float = 15.0) -> bool:
+def until(true: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
     """Wait for something to become true."""
     end = time.monotonic() + seconds
     while not true():
@@ -80,8 +81,8 @@ class Listener:
 
     def close(self) -> None:
         self._process.kill()
-        self._process.wait(5.0)
-        self._thread.join(5.0)
+        self._process.wait(PATIENCE_S)
+        self._thread.join(PATIENCE_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
 
@@ -123,8 +124,17 @@ def send_now(output: Output, sample: LiveSample) -> float:
     return time.perf_counter() - began
 
 
+def typical_send(output: Output, sample: LiveSample, n: int) -> float:
+    """Send n times; returns the median of how long it took, in seconds.
+
+    A busy machine holds some calls up, but not half of them; an output that waits for others does
+    so in all of them.
+    """
+    return float(np.median([send_now(output, sample) for _ in range(n)]))
+
+
 def send_until(
-    output: Output, sample: LiveSample, true: Callable[[], object], seconds: float = 15.0
+    output: Output, sample: LiveSample, true: Callable[[], object], seconds: float = PATIENCE_S
 ) -> bool:
     """Send at 50 Hz until something becomes true."""
     end = time.monotonic() + seconds

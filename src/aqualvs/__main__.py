@@ -1,8 +1,46 @@
-"""`python -m aqualvs`."""
+"""The program `aqualvs`, also as `python -m aqualvs`."""
 
+import os
+import signal
 import sys
+from types import FrameType
 
-from aqualvs.app.cli import main
+_EXIT_INTERRUPTED = 130
+
+
+def main() -> int:
+    """Run the command line of this process.
+
+    Returns
+    -------
+    exit_code : int
+        As `aqualvs.app.cli.main`.
+    """
+    _open_standard_files()
+    interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if interruptible:
+        signal.signal(signal.SIGINT, _leave)
+    from aqualvs.app.cli import main as run
+
+    if interruptible:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return run()
+
+
+def _leave(_number: int, _frame: FrameType | None) -> None:
+    """End without a traceback while modules are being imported."""
+    os.write(2, b"aqualvs: error: interrupted\n")
+    os._exit(_EXIT_INTERRUPTED)
+
+
+def _open_standard_files() -> None:
+    """Lead standard files that are closed nowhere, or the next file opened takes their number."""
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+
 
 if __name__ == "__main__":
     sys.exit(main())

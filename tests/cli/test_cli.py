@@ -1,14 +1,19 @@
 """The command line as a whole: help, version, and how fast it is there."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
+import typer
 import yaml
 
 from aqualvs import __version__
 from aqualvs.app import cli
 from aqualvs.app.cli import main
+from aqualvs.app.cli_command import CheckedCommand
 from aqualvs.errors import AqualvsError
 from shell_cases import rig_file
 
@@ -97,3 +102,123 @@ def test_check_tells_a_sane_rig_from_a_useless_one(tmp_path, capsys):
     assert "This rig cannot measure" in capsys.readouterr().out
     assert main(["check", str(tmp_path / "missing.yaml")]) == 2
     assert "missing.yaml" in capsys.readouterr().err
+
+
+def commands(group, name=()):
+    """Yield every command with the words that call it."""
+    for word, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*name, word))
+        else:
+            yield (*name, word), command
+
+
+ALL = dict(commands(typer.main.get_command(cli.app)))
+
+
+def test_every_command_checks_its_values():
+    assert len(ALL) >= 20
+    assert all(isinstance(command, CheckedCommand) for command in ALL.values())
+
+
+NUMBERS = [
+    (words, option)
+    for words, command in ALL.items()
+    for option in command.params
+    if option.param_type_name == "option" and isinstance(option.default, float)
+]
+
+
+@pytest.mark.parametrize(
+    ("words", "option"), NUMBERS, ids=lambda one: str(getattr(one, "name", one))
+)
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+def test_numbers_that_are_not_finite_are_refused(words, option, value, capsys, tmp_path):
+    """Before anything else is looked at: required values are there, but stand for nothing."""
+    arguments = [*words]
+    for other in ALL[words].params:
+        if other.required:
+            nothing = str(tmp_path / "nothing")
+            arguments += (
+                [other.opts[0], nothing] if other.param_type_name == "option" else [nothing]
+            )
+    name = max(option.opts, key=len)
+    assert main([*arguments, f"{name}={value}"]) == 2
+    said = capsys.readouterr().err
+    assert said == f"aqualvs: error: {name} {value}: give a finite number\n" or "board" in words
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("/dev/zero", path)])
+def test_pipes_and_devices_are_refused(make, tmp_path, capsys):
+    odd = tmp_path / "odd"
+    make(odd)
+    rig = rig_file(tmp_path)
+    for arguments in (
+        ["check", odd],
+        ["check", rig, "--against", odd],
+        ["run", odd, "--rig", rig, "-o", tmp_path / "out"],
+        ["run", rig, "--rig", odd, "-o", tmp_path / "out"],
+        ["tune", "bluerov2", "-o", odd],
+        ["calibrate", "camera", odd, "--board", odd, "-o", tmp_path / "rig.yaml"],
+    ):
+        assert main([str(word) for word in arguments]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"aqualvs: error: {odd}: is a ")
+        assert said.count("\n") == 1
+
+
+def test_faults_of_the_system_are_one_line(monkeypatch, capsys):
+    def fail(**_):
+        raise PermissionError(13, "Permission denied", "/somewhere/dive.mp4")
+
+    monkeypatch.setattr(cli, "app", fail)
+    assert main(["run"]) == 2
+    assert capsys.readouterr().err == "aqualvs: error: /somewhere/dive.mp4: Permission denied\n"
+
+
+def aqualvs(*arguments, **more):
+    command = [sys.executable, "-m", "aqualvs", *map(str, arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **more)
+
+
+def test_output_that_nobody_reads_ends_no_command():
+    reader, writer = os.pipe()
+    os.close(reader)
+    process = aqualvs("simulate", "--list", stdout=writer)
+    os.close(writer)
+    assert process.communicate()[1] == ""
+    assert process.returncode == 141
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_output_that_cannot_be_written_is_said():
+    with open("/dev/full", "w") as full:
+        process = aqualvs("simulate", "--list", stdout=full)
+    assert "standard output: cannot be written" in process.communicate()[1]
+    assert process.returncode == 2
+
+
+def test_closed_standard_files_are_led_nowhere(tmp_path):
+    rig = rig_file(tmp_path)
+    command = f"{sys.executable} -m aqualvs check {rig} 0<&- >&- 2>&-"
+    assert subprocess.run(["/bin/sh", "-c", command], check=False).returncode == 0
+    command = f"{sys.executable} -m aqualvs check {tmp_path}/none 0<&- >&- 2>&-"
+    assert subprocess.run(["/bin/sh", "-c", command], check=False).returncode == 2
+
+
+@pytest.mark.parametrize("delay_s", [0.06, 0.1, 0.15, 0.25])
+def test_ctrl_c_at_the_very_beginning_is_no_traceback(delay_s):
+    """Where the interpreter itself is not up yet, the complaint is its own and empty of ours."""
+    process = aqualvs("check", "none", stdout=subprocess.PIPE)
+    time.sleep(delay_s)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate()[1]
+    assert "aqualvs" not in "".join(line for line in said.splitlines() if "File" in line)
+    assert process.returncode in (2, 130, -signal.SIGINT, 1)
+
+
+def test_a_fault_is_one_line_whatever_the_file_is_called(tmp_path, capsys):
+    assert main(["check", str(tmp_path / "rig\nof\x1b[31mmine.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "rig\\nof\\x1b[31mmine.yaml: no such file" in error

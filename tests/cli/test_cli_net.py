@@ -117,7 +117,7 @@ def test_from_a_run_to_the_state_of_its_net(scans, tmp_path, capsys):
 def test_another_folder_keeps_the_run_as_it_is(run_folder, tmp_path):
     before = sorted(path.name for path in run_folder.iterdir())
     assert main(["net", str(run_folder), "-o", str(tmp_path / "net")]) == 0
-    assert sorted(path.name for path in (tmp_path / "net").iterdir()) == sorted(NET_FILES)
+    assert sorted(path.name for path in (tmp_path / "net").glob("[!.]*")) == sorted(NET_FILES)
     assert sorted(path.name for path in run_folder.iterdir()) == before
 
 
@@ -127,6 +127,14 @@ def test_the_state_of_a_net_is_not_overwritten_unasked(run_folder, refused):
     assert (run_folder / "holes.csv").read_text() == "precious"
     assert main(["net", str(run_folder), "--overwrite"]) == 0
     assert (run_folder / "holes.csv").read_text().startswith("hole,piece,")
+
+
+def test_files_of_others_in_the_nets_place_stay(run_folder, tmp_path, refused):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "holes.csv").write_text("precious")
+    assert "did not write it" in refused("net", run_folder, "-o", out, "--overwrite")
+    assert (out / "holes.csv").read_text() == "precious"
 
 
 def test_the_report_of_the_run_gets_its_section(run_folder):

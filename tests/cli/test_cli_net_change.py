@@ -167,7 +167,7 @@ def test_the_date_is_told_by_the_user_the_names_or_the_video(cage, tmp_path, cap
     assert f"{runs[2]}: 2026-07-01 (the folder's name)" in said
 
 
-def test_faults_are_told_in_one_line(cage, tmp_path, refused):
+def test_faults_in_one_line_and_files_of_others_stay(cage, tmp_path, refused):
     a, b = (written(cage, tmp_path / name, 0) for name in ("2026-05-01", "plain"))
     out, run, empty = tmp_path / "out", tmp_path / "run", tmp_path / "batch"
     run.mkdir()
@@ -194,5 +194,5 @@ def test_faults_are_told_in_one_line(cage, tmp_path, refused):
     out.mkdir()
     (out / "net_change.csv").write_text("precious")
     written(cage, b, 21)
-    assert "--overwrite" in refused(a, b, *other, "-o", out)
+    assert "did not write it" in refused(a, b, *other, "-o", out, "--overwrite")
     assert (out / "net_change.csv").read_text() == "precious"

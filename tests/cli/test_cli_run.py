@@ -82,7 +82,7 @@ def test_a_dive_from_video_to_report(tmp_path, rig, capsys):
         assert abs(float(row["pitch_deg"])) < 0.5
         assert abs(float(row["yaw_deg"])) < 0.5
         assert float(row["n_water"]) == pytest.approx(1.3333)
-    assert sorted(path.name for path in out.iterdir()) == [
+    assert sorted(path.name for path in out.glob("[!.]*")) == [
         *("overlay.mp4", "points.parquet", "points.ply"),
         *("posture.csv", "posture_bare.csv", "report.html", "run.yaml"),
     ]

@@ -88,6 +88,14 @@ def test_the_truth_itself_scores_perfectly_and_is_set_beside_another(small_set, 
     assert "| total | poor | 2/4 | 50.0 |" in (out / "scores.md").read_text("utf-8")
 
 
+def test_scores_of_others_stay(small_set, tmp_path, capsys):
+    (tmp_path / "scores.md").write_text("precious")
+    command = ["score", "--truth", str(small_set), "-o", str(tmp_path), "--overwrite", "a=x"]
+    assert main(command) == 2
+    assert "scores.md: exists, and 'aqualvs score' did not" in capsys.readouterr().err
+    assert (tmp_path / "scores.md").read_text() == "precious"
+
+
 def test_two_systems_need_two_names(small_set, tmp_path, capsys):
     shutil.copyfile(small_set / "clear_wall" / "truth.csv", tmp_path / "clear_wall.csv")
     one = f"a={tmp_path}"

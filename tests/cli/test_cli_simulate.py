@@ -46,15 +46,16 @@ def test_the_help_names_every_camera(capsys):
 
 def test_an_existing_dive_is_kept(tmp_path, capsys):
     (tmp_path / "dive.mp4").write_bytes(b"precious")
-    assert main(["simulate", "wall", "-o", str(tmp_path), "--rig", str(rig_file(tmp_path))]) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    rig = rig_file(tmp_path).rename(tmp_path / "mine.yaml")
+    assert main(["simulate", "wall", "-o", str(tmp_path), "--rig", str(rig), "--overwrite"]) == 2
+    assert "did not write it" in capsys.readouterr().err
     assert (tmp_path / "dive.mp4").read_bytes() == b"precious"
 
 
 def test_an_existing_set_of_calibration_pictures_is_kept(tmp_path, capsys):
     (tmp_path / "box").mkdir()
     assert main(["simulate", "calibration", "-o", str(tmp_path)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    assert "did not write it" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["box"]
 
 
@@ -63,7 +64,11 @@ def test_a_simulated_dive_runs_against_its_truth(tmp_path, capsys):
     scenario.write_text("duration_s: 0.12\nmotion: {range_mm: [500, 520]}\nwalls: [{}]\n")
     dive = tmp_path / "dive"
     assert main(["simulate", str(scenario), "-o", str(dive)]) == 0
-    assert sorted(p.name for p in dive.iterdir()) == ["dive.mp4", "rig.yaml", "truth.csv"]
+    names = [".aqualvs.json", "dive.mp4", "rig.yaml", "truth.csv"]
+    assert sorted(p.name for p in dive.iterdir()) == names
+    assert main(["simulate", str(scenario), "-o", str(dive)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["simulate", str(scenario), "-o", str(dive), "--overwrite"]) == 0
     said = capsys.readouterr().out
     command = next(line for line in said.splitlines() if line.startswith("next: aqualvs "))
     assert main([*command.removeprefix("next: aqualvs ").split(), "--no-report"]) == 0

@@ -101,7 +101,7 @@ def shown(
 def opened(browser: str, page: Path, profile: Path, width: int) -> tuple[str, list[str]]:
     """Open a page; returns its document after the scripts ran, and what the console said."""
     command = [browser, *FLAGS, f"--user-data-dir={profile}", f"--window-size={width},1000"]
-    done = subprocess.run([*command, page.as_uri()], capture_output=True, timeout=120, check=True)
+    done = subprocess.run([*command, page.as_uri()], capture_output=True, timeout=300, check=True)
     log = done.stderr.decode("utf-8", "replace").splitlines()
     said = [line for line in log if ":CONSOLE" in line and not HARMLESS.search(line)]
     return done.stdout.decode("utf-8"), said

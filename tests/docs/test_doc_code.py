@@ -20,6 +20,7 @@ from aqualvs.app.run import RunRequest, run_and_tell
 from aqualvs.app.run_inputs import FrameWindow
 from aqualvs.calibration.target_files import load_board, load_box
 from aqualvs.control.plan import load_plan
+from aqualvs.live.vehicle_file import load_vehicle
 from aqualvs.optics.rigfile import load_rig
 from doc_blocks import ROOT, Block, blocks
 
@@ -87,7 +88,7 @@ def test_python_runs(block: Block, folder):
             cwd=folder,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=300,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
     finally:
@@ -104,6 +105,9 @@ def test_yaml_is_what_it_is_shown_for(block: Block, tmp_path):
     path.write_text(block.text, encoding="utf-8")
     if "aqualvs_plan" in shown:
         load_plan(path)
+    elif "aqualvs_vehicle" in shown:
+        (tmp_path / shown["key"]).write_text("a passphrase", encoding="utf-8")
+        load_vehicle(path)
     elif "squares_x" in shown:
         load_board(path)
     elif "markers" in shown:

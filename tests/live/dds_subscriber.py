@@ -22,7 +22,7 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-LONGEST_S = 20.0
+LONGEST_S = 180.0
 PLAIN = {"string": str, "bool": bool, "octet": types.uint8, "byte": types.uint8}
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 

@@ -31,6 +31,19 @@ FAST_EVERY, SLOW_EVERY, STICKS_EVERY = 2, 10, 3
 GUIDED_LAPSE_S = 3.0
 MANUAL, GUIDED = 19, 4
 STATION = (255, 190)
+# As ArduSub 4.7 has them after a reset, with its names.
+PARAMETERS = {
+    "MAV_GCS_SYSID": 255.0,
+    "MAV_GCS_SYSID_HI": 0.0,
+    "FS_PILOT_INPUT": 2.0,
+    "FS_PILOT_TIMEOUT": 3.0,
+    "FS_GCS_ENABLE": 2.0,
+    "JS_GAIN_DEFAULT": 0.5,
+    "JS_THR_GAIN": 1.0,
+    "PILOT_SPEED_UP": 500.0,
+    "PILOT_SPEED_DN": 0.0,
+    "RNGFND1_TYPE": 0.0,
+}
 # For system 1, in body axes (BODY_NED, BODY_FRD), with all but speeds and turning rate left out.
 SPEEDS_ALONE = ((1, 8, 1479), (1, 12, 1479))
 
@@ -75,10 +88,20 @@ class Vehicle:
         Whether the router passes the ground station's sticks on to others.
     station, beats : bool
         Whether ground station and vehicle send heartbeats.
+    station_id : int
+        System id of the ground station.
     away : bool
         Nothing comes from it and nothing reaches it.
     beat_s : float
         Heartbeats come so far apart, and at once when the mode changes.
+    channels_told : bool
+        Whether it tells its stick channels.
+    obeys : int
+        Its ground station, where that is none of its parameters.
+    halves : bool
+        Half a message goes out before each of its own, as of somebody behind its router.
+    parameters : dict
+        What it answers when asked; it stays silent about all others, as ArduPilot does.
     """
 
     motion: Motion
@@ -90,15 +113,20 @@ class Vehicle:
     joystick: dict[str, int] | None = None
     forwards: bool = True
     station: bool = True
+    station_id: int = STATION[0]
     beats: bool = True
     away: bool = False
     decoy: bool = True
+    halves: bool = False
+    channels_told: bool = True
+    obeys: int = STATION[0]
     sticks: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     sticks_at: float = -math.inf
     lapsed: bool = True
     speeds: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     speeds_at: float = -math.inf
     beat_at: float = 0.0
+    parameters: dict[str, float] = field(default_factory=lambda: dict(PARAMETERS))
 
     def play(self, event: dict[str, Any]) -> None:
         """Play a scripted event: set what it names."""
@@ -115,7 +143,7 @@ class Vehicle:
         """Obey what ArduSub obeys."""
         kind = message.get_type()
         if kind == "MANUAL_CONTROL":
-            if message.get_srcSystem() == STATION[0] and message.target == 1:
+            if self.is_station(message.get_srcSystem()) and message.target == 1:
                 self.take(message.x, message.y, message.z, message.r, now)
         elif kind == "SET_POSITION_TARGET_LOCAL_NED":
             told = (message.target_system, message.coordinate_frame, message.type_mask)
@@ -123,6 +151,11 @@ class Vehicle:
                 wanted = (message.vx, message.vy, message.vz, message.yaw_rate)
                 shares = zip(wanted, self.motion.full, strict=True)
                 self.speeds, self.speeds_at = tuple(w / full for w, full in shares), now
+
+    def is_station(self, system: int) -> bool:
+        """ArduPilot's `GCS::sysid_is_gcs`."""
+        least = self.parameters.get("MAV_GCS_SYSID", self.parameters.get("SYSID_MYGCS", self.obeys))
+        return least <= system <= max(least, self.parameters.get("MAV_GCS_SYSID_HI", 0))
 
     def take(self, x: int, y: int, z: int, r: int, now: float) -> None:
         """Take stick positions, whoever they are from."""
@@ -149,13 +182,17 @@ class Vehicle:
 class Wire:
     """Two senders on one socket: the vehicle, and the ground station behind its router."""
 
-    def __init__(self, port: int) -> None:
-        self.link = mavutil.mavlink_connection(
-            f"udpin:127.0.0.1:{port}", source_system=1, source_component=1
-        )
+    def __init__(self, port: int, to: int, key: bytes) -> None:
+        url = f"udpout:127.0.0.1:{to}" if to else f"udpin:127.0.0.1:{port}"
+        self.link = mavutil.mavlink_connection(url, source_system=1, source_component=1)
+        if to:
+            self.link.port.bind(("127.0.0.1", port))
         self.port = int(self.link.port.getsockname()[1])
         self.station = mavlink.MAVLink(self.link, *STATION)
         self.extra = mavlink.MAVLink(self.link, 1, 194)
+        if key:
+            self.link.setup_signing(key)
+            self.station.signing = self.extra.signing = self.link.mav.signing
         self.started = time.monotonic()
 
     def tell_fast(self, v: Vehicle) -> None:
@@ -174,7 +211,8 @@ class Wire:
         self.link.mav.ahrs2_send(0.0, 0.0, 0.0, -v.motion.depth - 0.7, 0, 0)
         self.link.mav.scaled_pressure2_send(ms, 1013.0 + 100.5 * v.motion.depth, 0.0, 1500)
         others = [0] * 12
-        self.link.mav.rc_channels_send(ms, 16, *v.channels(), *others, 255)
+        if v.channels_told:
+            self.link.mav.rc_channels_send(ms, 16, *v.channels(), *others, 255)
 
     def tell_beat(self, v: Vehicle) -> None:
         """Send the heartbeats: the vehicle's, a camera manager's, the ground station's."""
@@ -184,7 +222,16 @@ class Wire:
         if v.decoy:
             self.extra.heartbeat_send(30, 8, 128, 0, 4)
         if v.station:
+            self.station.srcSystem = v.station_id
             self.station.heartbeat_send(6, 8, 0, 0, 4)
+
+    def answer(self, message: Any, v: Vehicle) -> None:
+        """Tell a parameter that was asked for."""
+        asked = (message.target_system, message.target_component, message.param_index)
+        if asked == (1, 1, -1) and message.param_id in v.parameters:
+            name, value = message.param_id, v.parameters[message.param_id]
+            kind = mavlink.MAV_PARAM_TYPE_REAL32
+            self.link.mav.param_value_send(name.encode(), value, kind, len(v.parameters), 0)
 
     def tell_sticks(self, v: Vehicle) -> None:
         """Pass the pilot's sticks on, and obey them."""
@@ -221,6 +268,8 @@ def read_all(wire: Wire, v: Vehicle) -> None:
         if message.get_type() != "BAD_DATA" and not v.away:
             heard(message)
             v.hear(message, time.monotonic())
+            if message.get_type() == "PARAM_REQUEST_READ":
+                wire.answer(message, v)
 
 
 def listen(script: "queue.Queue[str]", v: Vehicle) -> None:
@@ -238,6 +287,9 @@ def read_script(script: "queue.Queue[str]") -> None:
 
 
 def speak(wire: Wire, v: Vehicle, i: int, now: float) -> None:
+    if v.halves:
+        # Announces 255 bytes more than follow.
+        wire.link.write(b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00")
     if i % FAST_EVERY == 0:
         wire.tell_fast(v)
     if i % SLOW_EVERY == 0:
@@ -252,6 +304,8 @@ def speak(wire: Wire, v: Vehicle, i: int, now: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--to", type=int, default=0, help="speak to this port first")
+    parser.add_argument("--key", type=bytes.fromhex, default=b"", help="sign, and take signed only")
     parser.add_argument("--distance", type=float, default=0.9)
     parser.add_argument("--angle", type=float, default=0.0)
     parser.add_argument("--gain", type=float, default=1.0)
@@ -260,7 +314,7 @@ def main() -> None:
     args = parser.parse_args()
     script: queue.Queue[str] = queue.Queue()
     threading.Thread(target=read_script, args=(script,), daemon=True).start()
-    wire = Wire(args.port)
+    wire = Wire(args.port, args.to, args.key)
     motion = Motion(args.distance, args.angle)
     v = Vehicle(motion, gain=args.gain, lapse_s=args.lapse, beat_s=args.beat)
     say(port=wire.port)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fake_ardusub import PARAMETERS
 
 from aqualvs.control.autopilot import NetPilot
 from aqualvs.control.mission import HoldMission
@@ -28,10 +29,30 @@ from aqualvs.live.time_filter import FilteredPosture, PostureFilter
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from live_cases import demo_rig
+from waiting import PATIENCE_S
 
-PATIENCE_S = 10.0
 FRAME_S = 0.04
 HELD = Setpoint(0.6)
+MARGIN_S = 0.05
+WITHIN_S = 0.2
+AT_START = {
+    "armed": True,
+    "mode": 2,
+    "joystick": None,
+    "forwards": True,
+    "station": True,
+    "beats": True,
+    "away": False,
+    "halves": False,
+    "channels_told": True,
+    "parameters": PARAMETERS,
+    "station_id": 255,
+    "obeys": 255,
+    "lapsed": True,
+    "sticks": [0.0, 0.0, 0.0, 0.0],
+    "speeds": [0.0, 0.0, 0.0, 0.0],
+    "at": [0.9, 0.0],
+}
 STEERED = ("MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
 
 
@@ -207,10 +228,11 @@ class Dive:
         options: ArduSubOptions | None = None,
         limits: SafetyLimits | None = None,
         setpoint: Setpoint | None = HELD,
+        link: MavlinkLink | None = None,
     ) -> None:
         self.fake = fake
         self.began = time.monotonic()
-        self.link = MavlinkLink(fake.url)
+        self.link = link or MavlinkLink(fake.url)
         self.vehicle = ArduSubLink(self.link, options)
         self.holder = SetpointHolder((0.3, 2.0))
         self.holder.put(setpoint)
@@ -273,3 +295,45 @@ def quiet_since(messages: Sequence[dict[str, Any]], at: float) -> float:
     """How long after a moment the last effort that is not neutral came on the wire; 0 if none."""
     late = [m["at"] - at for m in messages if m["at"] > at and not is_neutral(m)]
     return max(late, default=0.0)
+
+
+def pushing(fake: Fake) -> bool:
+    """Whether the vehicle was just told to move."""
+    told = fake.steered(time.monotonic() - 0.3)
+    return bool(told) and not is_neutral(told[-1])
+
+
+def pushed(one: Dive) -> None:
+    """Engage and wait until the vehicle is told to move."""
+    one.engage()
+    until(lambda: pushing(one.fake), "an effort")
+
+
+def within(one: Dive, at: float, limit_s: float = WITHIN_S) -> float:
+    """A time limit with what the busy machine adds."""
+    return limit_s + MARGIN_S + one.lateness(at)
+
+
+def assert_stopped(one: Dive, at: float, limit_s: float = WITHIN_S) -> None:
+    """Assert that efforts stop in time, and that the vehicle is told so."""
+    time.sleep(max(0.0, at + limit_s + 0.15 - time.monotonic()))
+    assert_quiet(one, at, limit_s)
+
+
+def assert_released(one: Dive, at: float, limit_s: float = WITHIN_S) -> None:
+    """Assert that efforts stop in time, and that nothing at all is sent after a few neutrals."""
+    until(lambda: not one.pilot.engaged, "a stop")
+    # Three neutrals go out frame by frame.
+    time.sleep(4 * FRAME_S + one.lateness(at))
+    assert_quiet(one, at, limit_s)
+    until(lambda: not one.fake.steered(time.monotonic() - 0.2), "silence", 1.0 + one.lateness(at))
+    silent = time.monotonic()
+    time.sleep(0.2)
+    assert not one.fake.steered(silent)
+
+
+def assert_quiet(one: Dive, at: float, limit_s: float) -> None:
+    told = one.fake.steered(at)
+    assert quiet_since(told, at) <= within(one, at, limit_s)
+    assert told
+    assert is_neutral(told[-1])

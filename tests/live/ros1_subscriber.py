@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import PointCloud2, Range
 
-LONGEST_S = 40.0
+LONGEST_S = 180.0
 lock = threading.Lock()
 
 

@@ -1,7 +1,7 @@
 """Sends a clip of H.264 as vehicles do; a program of its own, so that the tests hear a real stream.
 
 RTP and MPEG-TS are made by FFmpeg's muxers, and pass through a relay that loses, damages or
-renumbers datagrams by a fixed seed.
+renumbers datagrams by a fixed seed. The same datagrams go out at any speed of the machine.
 """
 
 import argparse
@@ -10,7 +10,7 @@ import json
 import random
 import socket
 import struct
-import threading
+import sys
 import time
 from fractions import Fraction
 from pathlib import Path
@@ -20,6 +20,10 @@ import numpy as np
 from av.video.frame import VideoFrame
 
 LOOPBACK = "127.0.0.1"
+TS_DATAGRAM = 7 * 188
+# A receiver's buffer is never filled further than this, however slow it is: the least that Linux
+# gives holds five times as much.
+MAX_WAITING_BYTES, LOOK_EVERY = 40_000, 16
 
 
 def make_clip(path, size, n_frames, *, gop=25, bitrate=2_000_000, content=None, **options):
@@ -30,7 +34,8 @@ def make_clip(path, size, n_frames, *, gop=25, bitrate=2_000_000, content=None, 
     codec.pix_fmt = "yuv420p"
     codec.time_base, codec.framerate = Fraction(1, fps), fps
     codec.bit_rate, codec.gop_size = bitrate, gop
-    codec.options = {"preset": "ultrafast", "tune": "zerolatency", **options}
+    # One thread: with more, a picture has as many slices as the machine has cores.
+    codec.options = {"preset": "ultrafast", "tune": "zerolatency", "threads": "1", **options}
     packets = []
     for i, image in enumerate((content or moving_pattern)(size, n_frames)):
         frame = VideoFrame.from_ndarray(image, format="bgr24")
@@ -83,25 +88,19 @@ class Relay:
     """Passes on datagrams, all but those it loses."""
 
     def __init__(self, send, options):
-        self.inlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.inlet.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
-        self.inlet.bind((LOOPBACK, 0))
-        self.port = self.inlet.getsockname()[1]
         self.n_sent = self.n_lost = self.n_damaged = 0
+        self.loses = True
         self._send = send
         self._options = options
         self._random = random.Random(options.seed)
         self._shift = None
-        threading.Thread(target=self._run, daemon=True).start()
 
-    def _run(self):
-        while True:
-            datagram = self.inlet.recv(65536)
-            if self._random.random() < self._options.loss:
-                self.n_lost += 1
-                continue
-            self._send(self._spoilt(datagram))
-            self.n_sent += 1
+    def push(self, datagram):
+        if self.loses and self._random.random() < self._options.loss:
+            self.n_lost += 1
+            return
+        self._send(self._spoilt(datagram))
+        self.n_sent += 1
 
     def _spoilt(self, datagram):
         data = bytearray(datagram)
@@ -110,7 +109,7 @@ class Relay:
             if self._shift is None:
                 self._shift = self._options.first_time - stamp
             data[4:8] = ((stamp + self._shift) % 2**32).to_bytes(4, "big")
-        if self._random.random() < self._options.damage and len(data) > 100:
+        if self.loses and self._random.random() < self._options.damage and len(data) > 100:
             self.n_damaged += 1
             for _ in range(8):
                 data[self._random.randrange(20, len(data))] ^= 1 << self._random.randrange(8)
@@ -120,79 +119,108 @@ class Relay:
 class Muxer:
     """FFmpeg's packing into RTP or MPEG-TS; or none."""
 
-    def __init__(self, kind, port, head, ssrc):
-        self._bare = None
+    def __init__(self, kind, push, head, ssrc):
+        self._kind, self._push, self._written = kind, push, []
         if kind == "bare":
-            self._bare = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._to = (LOOPBACK, port)
             return
         if kind == "rtp":
-            where, form = f"rtp://{LOOPBACK}:{port}?pkt_size=1200", "rtp"
-            options = {"payload_type": "96", "ssrc": str(ssrc)}
+            options = {"payload_type": "96", "ssrc": str(ssrc), "packetsize": "1200"}
         else:
-            where, form, options = f"udp://{LOOPBACK}:{port}?pkt_size=1316", "mpegts", {}
-        self._container = av.open(where, "w", format=form, options=options)
+            options = {"flush_packets": "1"}
+        self._container = av.open(self, "w", format=kind, options=options)
         self._stream = self._container.add_stream("libx264", rate=head["fps"])
         self._stream.width, self._stream.height = head["size"]
         self._stream.pix_fmt = "yuv420p"
         self._fps = head["fps"]
 
+    def write(self, data):
+        """Take what FFmpeg writes: one packet of RTP, or any number of those of MPEG-TS."""
+        self._written.append(bytes(data))
+        return len(data)
+
     def send(self, i, data, *, is_key):
-        if self._bare is not None:
-            for at in range(0, len(data), 1400):
-                self._bare.sendto(data[at : at + 1400], self._to)
-            return
-        packet = av.Packet(data)
-        packet.pts = packet.dts = i
-        packet.time_base = Fraction(1, self._fps)
-        packet.stream = self._stream
-        packet.is_keyframe = is_key
-        self._container.mux(packet)
+        if self._kind == "bare":
+            self._written.append(data)
+        else:
+            packet = av.Packet(data)
+            packet.pts = packet.dts = i
+            packet.time_base = Fraction(1, self._fps)
+            packet.stream = self._stream
+            packet.is_keyframe = is_key
+            self._container.mux(packet)
+        self._push_written()
 
     def close(self):
-        if self._bare is None:
+        if self._kind != "bare":
             self._container.close()
+            self._push_written()
+
+    def _push_written(self):
+        written, self._written = self._written, []
+        if self._kind == "rtp":
+            # RTCP has a port of its own.
+            datagrams = [data for data in written if not 200 <= data[1] <= 211]
+        else:
+            size, data = TS_DATAGRAM if self._kind == "mpegts" else 1400, b"".join(written)
+            datagrams = [data[at : at + size] for at in range(0, len(data), size)]
+        for datagram in datagrams:
+            self._push(datagram)
 
 
 def send_clips(options, send):
-    """Send the clips one after the other, in real time."""
+    """Send the clips one after the other, no faster than in real time."""
     relay = Relay(send, options)
-    n_frames, began, late = 0, time.monotonic(), 0.0
+    n_frames, began = 0, time.monotonic()
     first = began
     for repeat in range(options.repeat):
         for path in options.clips:
             head, pictures = read_clip(Path(path))
             if n_frames == 0 or len(options.clips) > 1:
-                muxer = Muxer(options.kind, relay.port, head, options.ssrc + repeat)
+                muxer = Muxer(options.kind, relay.push, head, options.ssrc + repeat)
             for i, data in enumerate(pictures):
-                if n_frames in options.pause:
-                    time.sleep(options.pause_s)
-                    began += options.pause_s
+                if n_frames in options.hold:
+                    held = time.monotonic()
+                    sys.stdin.readline()
+                    began += time.monotonic() - held
+                relay.loses = n_frames < options.sound_from
                 due = began + n_frames / (head["fps"] * options.speed)
                 time.sleep(max(0.0, due - time.monotonic()))
-                late = max(late, time.monotonic() - due)
                 muxer.send(n_frames, data, is_key=i == 0)
                 n_frames += 1
     muxer.close()
-    time.sleep(0.1)
     return {
         "began": first,
         "frames": n_frames,
         "packets": relay.n_sent,
         "lost": relay.n_lost,
         "damaged": relay.n_damaged,
-        "late_s": late,
     }
 
 
 def to_port(port):
     outlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    n_sent = 0
 
     def send(datagram):
+        nonlocal n_sent
+        if n_sent % LOOK_EVERY == 0:
+            while waiting_bytes(port) > MAX_WAITING_BYTES:
+                time.sleep(0.005)
+        n_sent += 1
         with contextlib.suppress(ConnectionRefusedError):
             outlet.sendto(datagram, (LOOPBACK, port))
 
     return send
+
+
+def waiting_bytes(port):
+    """What the receiver has not taken yet, where the system tells it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+            _, local, _, _, queues, *_ = line.split()
+            if int(local.partition(":")[2], 16) == port:
+                return int(queues.partition(":")[2], 16)
+    return 0
 
 
 class RtspServer:
@@ -254,8 +282,10 @@ def parse_options():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ssrc", type=int, default=1000)
     parser.add_argument("--first-time", type=int, default=None, help="of RTP, 32 bits")
-    parser.add_argument("--pause", type=int, nargs="*", default=[], help="before these frames")
-    parser.add_argument("--pause-s", type=float, default=1.0)
+    parser.add_argument("--sound-from", type=int, default=10**9, help="no loss from this frame on")
+    parser.add_argument(
+        "--hold", type=int, nargs="*", default=[], help="before these frames, for a line of input"
+    )
     return parser.parse_args()
 
 

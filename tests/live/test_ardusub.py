@@ -31,9 +31,25 @@ class Wire:
         self.heard: dict[tuple[str, int, int], Received] = {}
         self.sent: list[Any] = []
         self.works = True
+        self.conflict = ""
+        self.told: dict[str, float] = {}
+        self.asked: list[str] = []
 
-    def send(self, *messages: Any, urgent: bool = False) -> bool:
+    def parameters(self) -> dict[str, float]:
+        return dict(self.told)
+
+    def ask_parameters(self, names: list[str]) -> None:
+        self.asked += names
+
+    def autopilot(self) -> Received | None:
+        return self.latest("HEARTBEAT", system=1)
+
+    def make_packer(self, system: int, component: int) -> Any:
+        return dialect.MAVLink(None, system, component)
+
+    def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
         assert urgent
+        assert to_vehicle
         reader = dialect.MAVLink(None)
         for message in messages if self.works else ():
             self.sent.extend(reader.parse_buffer(message.pack(self.packer)))
@@ -47,10 +63,13 @@ class Wire:
     ) -> Received | None:
         found = [
             entry
-            for (name, s, c), entry in self.heard.items()
-            if name == kind and system in (None, s) and component in (None, c)
+            for entry in self.every(kind)
+            if system in (None, entry.system) and component in (None, entry.component)
         ]
         return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def every(self, kind: str) -> list[Received]:
+        return [entry for (name, *_), entry in self.heard.items() if name == kind]
 
     def put(
         self, kind: str, sender: tuple[int, int] = (1, 1), age_s: float = 0.0, **f: Any
@@ -120,12 +139,24 @@ def test_only_the_autopilots_own_heartbeat_counts(wire: Wire, vehicle: ArduSubLi
 
 def test_no_ground_station_no_efforts(wire: Wire) -> None:
     wire.put("HEARTBEAT", (255, 190), age_s=3.5, type=6, autopilot=8, base_mode=0)
-    assert on(wire).state().mode is Mode.UNKNOWN
+    assert on(wire).state().mode is Mode.NO_STATION
     assert on(wire, station_timeout_s=5.0).state().mode is Mode.OURS
     assert on(wire, station_timeout_s=None).state().mode is Mode.OURS
-    assert on(wire, station_timeout_s=5.0, ground_station=254).state().mode is Mode.UNKNOWN
+    assert on(wire, station_timeout_s=5.0, ground_station=254).state().mode is Mode.NO_STATION
     wire.put("HEARTBEAT", (255, 190), type=18, autopilot=8, base_mode=0)
-    assert on(wire).state().mode is Mode.UNKNOWN
+    assert on(wire).state().mode is Mode.NO_STATION
+
+
+def test_a_missing_ground_station_is_named_with_the_one_that_is_there(wire: Wire) -> None:
+    state = on(wire, ground_station=250).state()
+    assert state.mode_name == "ALT_HOLD; no heartbeat of ground station 250, but of 255"
+
+
+def test_heartbeats_that_contradict_each_other_are_no_mode_of_ours(wire: Wire) -> None:
+    wire.conflict = "heartbeats contradict each other"
+    state = on(wire).state()
+    assert state.mode is Mode.CONFLICT
+    assert "contradict" in state.mode_name
 
 
 def test_heard_between_heartbeats_by_attitude(wire: Wire, vehicle: ArduSubLink) -> None:
@@ -187,9 +218,99 @@ def test_joystick_of_the_ground_station(
     assert not vehicle.state().pilot_moves
 
 
+@pytest.mark.parametrize(
+    ("told", "mode"),
+    [
+        ({}, Mode.OURS),
+        ({"MAV_GCS_SYSID": 255}, Mode.OURS),
+        ({"MAV_GCS_SYSID": 250}, Mode.IGNORED),
+        ({"SYSID_MYGCS": 250}, Mode.IGNORED),
+        ({"MAV_GCS_SYSID": 250, "MAV_GCS_SYSID_HI": 255}, Mode.OURS),
+        ({"MAV_GCS_SYSID": 250, "MAV_GCS_SYSID_HI": 254}, Mode.IGNORED),
+        ({"MAV_GCS_SYSID": 255, "MAV_GCS_SYSID_HI": 3}, Mode.OURS),
+    ],
+)
+def test_whose_sticks_the_vehicle_obeys(wire: Wire, told: dict[str, float], mode: Mode) -> None:
+    wire.told = told
+    state = on(wire).state()
+    assert state.mode is mode
+    if mode is Mode.IGNORED:
+        assert f"set {next(iter(told))} 255, or ground_station 250" in state.mode_name
+
+
+def test_speeds_are_obeyed_whoever_sends_them(wire: Wire) -> None:
+    wire.beat(4)
+    wire.told = {"MAV_GCS_SYSID": 250}
+    assert on(wire, command=Command.GUIDED).state().mode is Mode.OURS
+
+
+def test_parameters_are_asked_for_until_they_are_known(wire: Wire, vehicle: ArduSubLink) -> None:
+    vehicle.state()
+    assert {"MAV_GCS_SYSID", "SYSID_MYGCS", "FS_PILOT_INPUT"} <= set(wire.asked)
+    n = len(wire.asked)
+    vehicle.state()
+    # Not with every frame.
+    assert len(wire.asked) == n
+
+
 def channels(**moved: int) -> dict[str, int]:
     centred = {f"chan{i}_raw": 1500 for i in range(1, 7)}
     return {**centred, **{f"chan{name[1:]}_raw": pulse for name, pulse in moved.items()}}
+
+
+def responding(
+    wire: Wire, vehicle: ArduSubLink, sticks: list[float], answer: Any, monkeypatch: Any
+) -> str:
+    """Send sticks ten times a second while channels answer; return the last doubt."""
+    now_s = time.monotonic()
+    doubt = ""
+    for i, stick in enumerate(sticks):
+        at_s = now_s + 0.1 * i
+        monkeypatch.setattr(time, "monotonic", lambda at_s=at_s: at_s)
+        monkeypatch.setattr(time, "monotonic_ns", lambda at_s=at_s: round(1e9 * at_s))
+        vehicle.send(Effort(forward=stick))
+        told = answer(stick)
+        if told is not None:
+            wire.put("RC_CHANNELS", **channels(c5=told))
+        wire.beat()
+        doubt = vehicle.state().doubt
+    return doubt
+
+
+@pytest.mark.parametrize(
+    ("answer", "doubted"),
+    [
+        (lambda _: 1500, "does not follow"),
+        (lambda _: 0, "does not follow"),
+        (lambda s: 1500 + round(40 * s), ""),
+        (lambda s: 1500 + round(400 * s), ""),
+        (lambda _: None, "is not told"),
+    ],
+)
+def test_sticks_that_are_not_obeyed_are_doubted(
+    wire: Wire, vehicle: ArduSubLink, monkeypatch: pytest.MonkeyPatch, answer: Any, doubted: str
+) -> None:
+    steady = [0.3] * 50
+    swinging = [0.4 * (-1) ** i for i in range(50)]
+    for sticks in (steady, swinging):
+        found = responding(wire, vehicle, sticks, answer, monkeypatch)
+        assert (doubted in found) if doubted else (found == "")
+        monkeypatch.undo()
+        vehicle = on(wire)
+
+
+def test_sticks_too_small_to_tell_are_not_doubted(
+    wire: Wire, vehicle: ArduSubLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert responding(wire, vehicle, [0.02] * 50, lambda _: 1500, monkeypatch) == ""
+
+
+def test_one_who_holds_his_sticks_still_does_not_hide_another(
+    wire: Wire, vehicle: ArduSubLink
+) -> None:
+    wire.put("MANUAL_CONTROL", (255, 190), age_s=0.1, x=500, y=0, z=500, r=0)
+    wire.put("MANUAL_CONTROL", (255, 1), x=0, y=0, z=500, r=0)
+    assert vehicle.state().pilot_moves
 
 
 def test_sticks_seen_by_the_vehicles_channels(wire: Wire, vehicle: ArduSubLink) -> None:

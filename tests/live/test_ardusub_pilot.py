@@ -13,6 +13,8 @@ from aqualvs.control.safety import Reason
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.errors import OptionError
+from aqualvs.live import pilot as live_pilot
+from aqualvs.live import pilot_watchdog
 from aqualvs.live.health import State
 from aqualvs.live.output_worker import OutputWorker
 from aqualvs.live.pilot import Pilot
@@ -23,9 +25,32 @@ from aqualvs.scanning.posture import Refusal
 
 pytest.importorskip("pymavlink")
 
-from fake_ardusub_cases import posture, sample, steering, until
+import fake_ardusub_cases
+from fake_ardusub_cases import posture, sample, steering
+
+from waiting import until
 
 BLIND = Refusal(NoPosture.NO_STRIPES)
+
+
+class Clock:
+    """Stands for the machine's clock, which goes on between any two lines where that is busy."""
+
+    now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(1e9 * self.now_s)
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    for module in (live_pilot, pilot_watchdog, fake_ardusub_cases):
+        monkeypatch.setattr(module, "time", made)
+    return made
 
 
 class Vehicle:
@@ -33,16 +58,19 @@ class Vehicle:
 
     name = "vehicle"
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.now = VehicleState(armed=True, mode=Mode.OURS, mode_name="ALT_HOLD")
         self.sent: list[Effort] = []
+        self.n_tried = 0
         self.fault: Exception | None = None
         self.closed = False
 
     def state(self) -> VehicleState:
-        return replace(self.now, heard_s=time.monotonic())
+        return replace(self.now, heard_s=self.clock.now_s)
 
     def send(self, effort: Effort) -> None:
+        self.n_tried += 1
         if self.fault is not None:
             raise self.fault
         self.sent.append(effort)
@@ -52,8 +80,8 @@ class Vehicle:
 
 
 @pytest.fixture
-def vehicle() -> Vehicle:
-    return Vehicle()
+def vehicle(clock: Clock) -> Vehicle:
+    return Vehicle(clock)
 
 
 @pytest.fixture
@@ -129,7 +157,7 @@ def test_disengaging_is_neutral_at_once(pilot: Pilot, vehicle: Vehicle) -> None:
 
 def test_old_postures_are_none(pilot: Pilot, vehicle: Vehicle) -> None:
     pilot.engage()
-    pilot.send(sample(0, posture(0.9), arrived_s=time.monotonic() - 0.3))
+    pilot.send(sample(0, posture(0.9), arrived_s=vehicle.clock.now_s - 0.3))
     assert vehicle.sent == [NEUTRAL]
     assert pilot.latest is not None
     assert pilot.latest.reason is Reason.NO_POSTURE
@@ -200,13 +228,13 @@ def test_fault_while_engaging_leaves_it_disengaged(pilot: Pilot) -> None:
 
 
 def test_reasons_are_logged_once(
-    pilot: Pilot, vehicle: Vehicle, caplog: pytest.LogCaptureFixture
+    pilot: Pilot, vehicle: Vehicle, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "aqualvs")
     pilot.engage()
     for i in range(3):
         pilot.send(sample(i, posture(0.9)))
-    time.sleep(0.2)
+    clock.now_s += 0.2
     for i in range(3, 6):
         pilot.send(sample(i, BLIND))
     vehicle.now = replace(vehicle.now, mode=Mode.PILOT, mode_name="MANUAL")
@@ -219,24 +247,27 @@ def test_reasons_are_logged_once(
     assert told[2].endswith("(MANUAL)")
 
 
-def test_watchdog_stops_an_effort_that_nobody_renews(vehicle: Vehicle) -> None:
+def test_watchdog_stops_an_effort_that_nobody_renews(vehicle: Vehicle, clock: Clock) -> None:
     watchdog = Watchdog(vehicle, 0.1)
     push = Effort(forward=0.5)
-    assert watchdog.send(push, time.monotonic()) == push
-    until(lambda: vehicle.sent == [push, NEUTRAL], "neutral")
-    assert watchdog.n_barks == 1
+    assert watchdog.send(push, clock.now_s) == push
+    clock.now_s += 0.11
+    until(lambda: watchdog.n_barks == 1, "neutral")
+    assert vehicle.sent == [push, NEUTRAL]
     # Neutral needs no watching, and what is too old already is not sent.
-    assert watchdog.send(push, time.monotonic() - 0.2) == NEUTRAL
+    assert watchdog.send(push, clock.now_s - 0.2) == NEUTRAL
+    clock.now_s += 1.0
     time.sleep(0.2)
     assert watchdog.n_barks == 1
     watchdog.close()
 
 
-def test_watchdog_tries_until_neutral_is_sent(vehicle: Vehicle) -> None:
+def test_watchdog_tries_until_neutral_is_sent(vehicle: Vehicle, clock: Clock) -> None:
     watchdog = Watchdog(vehicle, 0.05)
-    watchdog.send(Effort(yaw=0.5), time.monotonic())
+    watchdog.send(Effort(yaw=0.5), clock.now_s)
     vehicle.fault = OSError("no connection")
-    time.sleep(0.15)
+    clock.now_s += 0.06
+    until(lambda: vehicle.n_tried > 2, "a second try")
     assert watchdog.n_barks == 0
     vehicle.fault = None
     until(lambda: vehicle.sent[-1] == NEUTRAL, "neutral")

@@ -18,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from aqualvs.app.dashboard.access import Access, make_access, token_fault
 from aqualvs.app.dashboard.commands import MAX_MESSAGE_BYTES, Controls
 from aqualvs.app.dashboard.hub import Hub, Watcher
+from aqualvs.app.dashboard.limits import ConnectionLimits, TokenGate
 from aqualvs.app.dashboard.output import Dashboard
 from aqualvs.app.dashboard.picture import page_picture
 from aqualvs.app.dashboard.server import DashboardServer
@@ -25,8 +26,10 @@ from aqualvs.app.live_outputs import host_and_port
 from aqualvs.app.posture_csv import POSTURE_COLUMNS, posture_row
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
+from aqualvs.live.sample import LiveSample
 from browser import open_page
 from live_cases import demo_rig, demo_samples, of_size
+from waiting import PATIENCE_S, until
 
 TOKEN = "let me steer"
 
@@ -67,14 +70,20 @@ class Bench:
             connection.send(json.dumps({"kind": "hello", "token": token}))
             yield connection
 
-    def play(self, seconds: float = 0.3) -> None:
-        """Send samples for a while."""
-        end = time.monotonic() + seconds
-        for sample in demo_samples(4) * 1000:
-            if time.monotonic() > end:
-                return
-            self.dashboard.send(sample)
+    def play(self, n: int = 10) -> None:
+        """Send so many samples."""
+        for i in range(n):
+            self.dashboard.send(demo_samples(4)[i % 4])
             time.sleep(0.03)
+
+    def shown(self, connection: ClientConnection, sample: LiveSample | None = None) -> Any:
+        """Send a sample until a page is told the state, which the server may let in later."""
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            self.dashboard.send(sample or demo_samples(1)[0])
+            with contextlib.suppress(TimeoutError):
+                return state_of(connection, 0.2)
+        raise AssertionError("no state comes")
 
 
 @pytest.fixture
@@ -87,9 +96,9 @@ def bench() -> Iterator[Bench]:
     dashboard.close()
 
 
-def state_of(connection: ClientConnection) -> dict[str, Any]:
+def state_of(connection: ClientConnection, patience_s: float) -> dict[str, Any]:
     while True:
-        message = connection.recv(timeout=5)
+        message = connection.recv(timeout=patience_s)
         if isinstance(message, str) and (found := json.loads(message))["kind"] == "state":
             return dict(found)
 
@@ -147,13 +156,12 @@ def test_without_a_token_this_machine_may_watch_but_not_command(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     with bench.connect() as connection:
-        assert json.loads(connection.recv(timeout=5))["may_command"] is False
-        bench.play()
-        assert state_of(connection)["posture"]["valid"] == "1"
+        assert json.loads(connection.recv(timeout=PATIENCE_S))["may_command"] is False
+        assert bench.shown(connection)["posture"]["valid"] == "1"
         connection.send(json.dumps({"kind": "record", "on": True}))
         answer = ""
         while "refused" not in answer:
-            message = connection.recv(timeout=5)
+            message = connection.recv(timeout=PATIENCE_S)
             answer = message if isinstance(message, str) else ""
     assert bench.button.pressed == []
     assert "record refused" in caplog.text
@@ -168,12 +176,12 @@ def test_elsewhere_nothing_is_shown_without_the_token() -> None:
             with connect(f"ws://127.0.0.1:{server.port}/live") as connection:
                 connection.send(json.dumps({"kind": "hello", "token": token}))
                 with pytest.raises(ConnectionClosed) as closed:
-                    connection.recv(timeout=5)
+                    connection.recv(timeout=PATIENCE_S)
                 assert closed.value.rcvd is not None
                 assert closed.value.rcvd.reason == why
         with connect(f"ws://127.0.0.1:{server.port}/live") as connection:
             connection.send(json.dumps({"kind": "hello", "token": TOKEN}))
-            assert json.loads(connection.recv(timeout=5))["may_command"] is True
+            assert json.loads(connection.recv(timeout=PATIENCE_S))["may_command"] is True
     finally:
         server.close()
 
@@ -194,7 +202,7 @@ def test_foreign_pages_are_refused(bench: Bench, headers: dict[str, str]) -> Non
 
 def receive_until_closed(connection: ClientConnection) -> None:
     while True:
-        connection.recv(timeout=5)
+        connection.recv(timeout=PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -214,23 +222,22 @@ def test_malformed_messages_end_the_connection_and_nothing_else(
     bench: Bench, message: str | bytes
 ) -> None:
     with bench.connect(TOKEN) as bad, bench.connect(TOKEN) as good:
-        bad.recv(timeout=5)
-        good.recv(timeout=5)
+        bad.recv(timeout=PATIENCE_S)
+        good.recv(timeout=PATIENCE_S)
         bad.send(message)
         with pytest.raises(ConnectionClosed):
             receive_until_closed(bad)
-        bench.play()
-        assert state_of(good)["posture"]["valid"] == "1"
+        assert bench.shown(good)["posture"]["valid"] == "1"
     assert bench.button.pressed == []
     assert bench.controls.setpoint.setpoint is None
 
 
 def test_oversized_messages_end_the_connection(bench: Bench) -> None:
     with bench.connect(TOKEN) as connection:
-        connection.recv(timeout=5)
+        connection.recv(timeout=PATIENCE_S)
         connection.send("x" * (MAX_MESSAGE_BYTES + 1))
         with pytest.raises(ConnectionClosed) as closed:
-            connection.recv(timeout=5)
+            connection.recv(timeout=PATIENCE_S)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == 1009
 
@@ -238,41 +245,38 @@ def test_oversized_messages_end_the_connection(bench: Bench) -> None:
 def test_who_says_nothing_is_not_let_in(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("aqualvs.app.dashboard.server._HELLO_S", 0.2)
     with connect(f"ws://{bench.address}/live") as connection, pytest.raises(ConnectionClosed):
-        connection.recv(timeout=5)
+        connection.recv(timeout=PATIENCE_S)
 
 
 def test_a_setpoint_that_cannot_be_held_is_refused(bench: Bench) -> None:
     with bench.connect(TOKEN) as connection:
-        connection.recv(timeout=5)
+        connection.recv(timeout=PATIENCE_S)
         connection.send(json.dumps({"kind": "setpoint", "range_m": 5.0}))
-        answer = json.loads(connection.recv(timeout=5))
+        answer = json.loads(connection.recv(timeout=PATIENCE_S))
         assert answer["kind"] == "refused"
         assert "5 m" in answer["why"]
         connection.send(json.dumps({"kind": "setpoint", "range_m": 0.6, "yaw_deg": 80.0}))
-        assert "80" in json.loads(connection.recv(timeout=5))["why"]
+        assert "80" in json.loads(connection.recv(timeout=PATIENCE_S))["why"]
     assert bench.controls.setpoint.setpoint is None
 
 
 def test_a_page_that_goes_leaves_nothing_behind(bench: Bench) -> None:
     for _ in range(3 * Hub.MAX_WATCHERS):
         with bench.connect() as connection:
-            connection.recv(timeout=5)
+            connection.recv(timeout=PATIENCE_S)
             # As a browser that crashes: without saying good-bye.
             connection.socket.close()
-        bench.play(0.1)
-    end = time.monotonic() + 10.0
-    while bench.server.hub.n_watchers and time.monotonic() < end:
-        bench.play(0.1)
-    assert bench.server.hub.n_watchers == 0
+        bench.play(3)
+    until(lambda: bench.play(1) or not bench.server.hub.n_watchers, "an empty server")
 
 
 def test_too_many_pages_are_refused(bench: Bench) -> None:
     with contextlib.ExitStack() as open_:
         for _ in range(Hub.MAX_WATCHERS):
-            open_.enter_context(bench.connect()).recv(timeout=5)
+            open_.enter_context(bench.connect()).recv(timeout=PATIENCE_S)
         late = open_.enter_context(bench.connect())
         with pytest.raises(ConnectionClosed):
-            late.recv(timeout=5)
+            late.recv(timeout=PATIENCE_S)
 
 
 def test_a_slow_page_gets_the_latest_and_few_pictures() -> None:
@@ -336,7 +340,151 @@ def test_what_is_no_number_becomes_null(bench: Bench) -> None:
     silent = demo_samples(1)[0]
     silent = replace(silent, health=replace(silent.health, quality=float("nan")))
     with bench.connect() as connection:
-        connection.recv(timeout=5)
-        time.sleep(0.05)
-        bench.dashboard.send(silent)
-        assert state_of(connection)["health"]["quality"] is None
+        connection.recv(timeout=PATIENCE_S)
+        assert bench.shown(connection, silent)["health"]["quality"] is None
+
+
+def raw(bench: Bench) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", bench.server.port), timeout=10)
+
+
+def first_line(wire: socket.socket, *lines: str) -> str:
+    """Send a request and return the first line of its answer."""
+    wire.sendall("".join(f"{line}\r\n" for line in (*lines, "")).encode("latin-1"))
+    answer = b""
+    while b"\r\n" not in answer and (part := wire.recv(4096)):
+        answer += part
+    return answer.split(b"\r\n")[0].decode("latin-1")
+
+
+UPGRADE = (
+    "Connection: Upgrade",
+    "Upgrade: websocket",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+)
+
+
+@pytest.mark.parametrize("path", ["/", "/live", "/register_service"])
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("Host: [",),
+        ("Host: [::1",),
+        ("Host: ::1]:80",),
+        ("Host: a b",),
+        ("Host: 127.0.0.1:99999",),
+        ("Host: 127.0.0.1:port",),
+        ("Host: user@127.0.0.1",),
+        ("Host: 127.0.0.1/path",),
+        ("Host: \xff\xfe",),
+        ("Host: 127.0.0.1", "Origin: http://["),
+        ("Host: 127.0.0.1", "Origin: 127.0.0.1"),
+        ("Host: 127.0.0.1", "Origin: http://127.0.0.1:1e3"),
+        ("Host: 127.0.0.1", "Origin: http://127.0.0.1/page"),
+        ("Host: 127.0.0.1", "Origin: http://127.0.0.1", "Origin: http://evil.example"),
+    ],
+    ids=str,
+)
+def test_malformed_addresses_are_a_bad_request(
+    bench: Bench, path: str, lines: tuple[str, ...]
+) -> None:
+    upgrade = UPGRADE if path == "/live" else ()
+    with raw(bench) as wire:
+        answer = first_line(wire, f"GET {path} HTTP/1.1", *lines, *upgrade)
+    assert answer.split()[1:2] == ["400"], answer
+
+
+def test_idle_connections_of_strangers_leave_room_for_the_pilot(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        for _ in range(60):
+            open_.enter_context(raw(bench))
+        for _ in range(20):
+            trickling = open_.enter_context(raw(bench))
+            with contextlib.suppress(OSError):
+                trickling.sendall(b"GET / HTTP/1.1\r\nHo")
+        with raw(bench) as wire:
+            assert first_line(wire, "GET / HTTP/1.1", "Host: boat").endswith("200 OK")
+        with bench.connect(TOKEN) as page:
+            assert json.loads(page.recv(timeout=5))["may_command"] is True
+
+
+def test_one_address_holds_few_connections_without_a_greeting(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        page = open_.enter_context(bench.connect(TOKEN))
+        page.recv(timeout=5)
+        first = open_.enter_context(raw(bench))
+        for _ in range(ConnectionLimits.PER_ADDRESS):
+            open_.enter_context(raw(bench))
+        first.settimeout(10.0)
+        with contextlib.suppress(ConnectionResetError):
+            assert first.recv(1) == b""
+        # Whoever has greeted stays.
+        bench.play()
+        assert state_of(page)["posture"]["valid"] == "1"
+
+
+def test_who_never_asks_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ConnectionLimits, "SILENCE_S", 0.3)
+    rig = demo_rig()
+    controls = Controls(SetpointHolder(rig.working_range), Button())
+    server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", TOKEN), rig, controls)
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as wire:
+            wire.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+            with contextlib.suppress(ConnectionResetError):
+                assert wire.recv(1) == b""
+    finally:
+        server.close()
+
+
+def test_wrong_tokens_cost_time_over_all_connections(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TokenGate, "WRONG_S", 0.3)
+    n_guesses = 6
+    begin = time.monotonic()
+    with contextlib.ExitStack() as open_:
+        guessing = [open_.enter_context(bench.connect(f"guess {i}")) for i in range(n_guesses)]
+        # The pilot's own token waits for its turn at most.
+        with bench.connect(TOKEN) as page:
+            assert json.loads(page.recv(timeout=10))["may_command"] is True
+        for connection in guessing:
+            with pytest.raises(ConnectionClosed):
+                connection.recv(timeout=10)
+    assert time.monotonic() - begin >= n_guesses * 0.3
+
+
+def test_addresses_without_wrong_tokens_are_asked_first() -> None:
+    async def scene() -> list[str]:
+        gate, order = TokenGate(Access("0.0.0.0", TOKEN)), []
+
+        async def ask(address: str, token: str) -> None:
+            await gate.check(address, token)
+            order.append(address)
+
+        await gate.check("192.0.2.66", "guess")
+        await asyncio.gather(
+            *(ask("192.0.2.66", f"guess {i}") for i in range(4)), ask("192.0.2.1", TOKEN)
+        )
+        return order
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TokenGate, "WRONG_S", 0.01)
+        order = asyncio.run(scene())
+    assert order.index("192.0.2.1") <= 1
+
+
+def test_a_page_with_the_token_takes_the_place_of_one_without(bench: Bench) -> None:
+    with contextlib.ExitStack() as open_:
+        pages = [open_.enter_context(bench.connect()) for _ in range(Hub.MAX_WATCHERS)]
+        for page in pages:
+            page.recv(timeout=5)
+        pilot = open_.enter_context(bench.connect(TOKEN))
+        assert json.loads(pilot.recv(timeout=5))["may_command"] is True
+        with pytest.raises(ConnectionClosed) as closed:
+            receive_until_closed(pages[0])
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.reason == "a page with the token took this place"
+        bench.play()
+        assert state_of(pages[1])["posture"]["valid"] == "1"

@@ -11,12 +11,15 @@ import re
 import struct
 import subprocess
 import sys
-import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from waiting import PATIENCE_S, until
+
+_PATHS = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
 TOPICS = ("posture", "points", "picture", "health", "rig", "scene", "transforms")
 
 
@@ -29,7 +32,7 @@ def client(port, n_postures):
     counts, times = dict.fromkeys(TOPICS, 0), []
     with connect(url, subprotocols=["foxglove.sdk.v1"], max_size=None) as server:
         while len(channels) < len(TOPICS):
-            told = json.loads(server.recv(10.0))
+            told = json.loads(server.recv(PATIENCE_S))
             for one in told.get("channels", ()) if told["op"] == "advertise" else ():
                 channels[one["id"]] = one
                 if one["encoding"] == "cdr":
@@ -38,7 +41,7 @@ def client(port, n_postures):
         server.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
         print("ready", flush=True)
         while counts["posture"] < n_postures:
-            told = server.recv(10.0)
+            told = server.recv(PATIENCE_S)
             if isinstance(told, str) or told[0] != 1:
                 continue
             number, at_ns = struct.unpack_from("<IQ", told, 1)
@@ -95,7 +98,7 @@ def watch():
             [sys.executable, __file__, str(port), str(n)],
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "PYTHONPATH": _PATHS, "OMP_NUM_THREADS": "1"},
         )
         processes.append(process)
         assert process.stdout.readline() == "ready\n"
@@ -104,7 +107,7 @@ def watch():
     yield start
     for process in processes:
         process.kill()
-        process.wait(10.0)
+        process.wait(PATIENCE_S)
         process.stdout.close()
 
 
@@ -115,15 +118,8 @@ def samples():
     return demo_samples(8)
 
 
-def wait_for(condition):
-    until = time.monotonic() + 8.0
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.01)
-
-
 def answer(process):
-    text, _ = process.communicate(timeout=15.0)
+    text, _ = process.communicate(timeout=PATIENCE_S)
     return json.loads(text)
 
 
@@ -135,7 +131,7 @@ def test_a_viewer_sees_what_was_sent(output, watch, samples):
         output.send(sample)
     assert "nobody watches" in output.health().detail
     viewer = watch(output.port, 6)
-    wait_for(lambda: "1 watching" in output.health().detail)
+    until(lambda: "1 watching" in output.health().detail)
     for sample in samples[2:]:
         output.send(sample)
     told = answer(viewer)
@@ -167,7 +163,7 @@ def test_a_viewer_sees_what_was_sent(output, watch, samples):
     assert "aqualvs_rig: 1" in found["rig"]["yaml"]
     assert told["kinds"]["/aqualvs/points"] == "sensor_msgs/msg/PointCloud2"
     assert told["kinds"]["/aqualvs/scene"] == "foxglove.SceneUpdate"
-    wait_for(lambda: "nobody watches" in output.health().detail)
+    until(lambda: "nobody watches" in output.health().detail)
 
 
 def test_a_refusal_is_shown_too(output, watch, samples):
@@ -177,7 +173,7 @@ def test_a_refusal_is_shown_too(output, watch, samples):
     silent = Refusal(Reason.NO_FRAMES, "no picture for 0.2 s")
     scan = replace(samples[0].scan, posture=silent, points=ScanPoints.none())
     viewer = watch(output.port, 1)
-    wait_for(lambda: "1 watching" in output.health().detail)
+    until(lambda: "1 watching" in output.health().detail)
     output.send(replace(samples[0], scan=scan, returns={}, frame=None))
     told = answer(viewer)
     assert not told["found"]["posture"]["valid"]
@@ -187,12 +183,12 @@ def test_a_refusal_is_shown_too(output, watch, samples):
 
 def test_a_viewer_that_vanishes_disturbs_nobody(output, watch, samples):
     gone, stays = watch(output.port, 1000), watch(output.port, 8)
-    wait_for(lambda: "2 watching" in output.health().detail)
+    until(lambda: "2 watching" in output.health().detail)
     gone.kill()
     for sample in samples:
         output.send(sample)
     assert answer(stays)["found"]["posture"]["frame"] == 7
-    wait_for(lambda: "nobody watches" in output.health().detail)
+    until(lambda: "nobody watches" in output.health().detail)
 
 
 def test_it_listens_on_this_machine_alone_and_frees_its_port(samples):
@@ -209,7 +205,7 @@ def test_it_listens_on_this_machine_alone_and_frees_its_port(samples):
     output.close()
     output.send(samples[0])
     assert output.health().state is State.OFF
-    wait_for(lambda: not _listening(made.port))
+    until(lambda: not _listening(made.port))
 
 
 def _listening(port):

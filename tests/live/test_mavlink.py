@@ -20,17 +20,20 @@ import pytest
 
 from aqualvs.live import mavlink_link
 from aqualvs.live.health import State
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
 from aqualvs.live.outputs import mavlink_ports
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.scanning.posture import Reason, Refusal
 from live_cases import demo_samples
+from waiting import PATIENCE_S, until
 
 pytest.importorskip("pymavlink")
 
 SAMPLE = demo_samples(1)[0]
 BLIND = replace(SAMPLE, scan=replace(SAMPLE.scan, posture=Refusal(Reason.NO_FRAMES)))
-PATIENCE_S = 5.0
+# No call may wait for the other side, which would take a quarter of a second at least; a busy
+# machine holds up some calls, but not half of them for so long.
+CALL_S = 0.05
 
 
 class Peer:
@@ -123,13 +126,6 @@ def open_files() -> int:
     return len(os.listdir(folder)) if folder.is_dir() else 0
 
 
-def until(condition: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
-    end = time.monotonic() + patience_s
-    while not condition():
-        assert time.monotonic() < end, f"{what} did not happen"
-        time.sleep(0.01)
-
-
 def becomes(output: MavlinkOutput, state: State, words: str) -> None:
     def reached() -> bool:
         found = output.health()
@@ -192,27 +188,29 @@ def test_the_autopilot_gets_what_was_measured(lab: Lab) -> None:
     assert peer.wait_for("NAMED_VALUE_FLOAT", name="aq_range")["fields"]["value"] is None
 
     sequence = []
+    peer.forget()
     output.send(SAMPLE)
-    end = time.monotonic() + 0.3
-    while time.monotonic() < end:
-        sequence += [entry["seq"] for entry in peer.forget()]
-        time.sleep(0.02)
-    assert len(sequence) >= 9
+
+    def nine() -> bool:
+        sequence.extend(entry["seq"] for entry in peer.forget())
+        return len(sequence) >= 9
+
+    until(nine, "nine messages")
     assert all((b - a) % 256 == 1 for a, b in itertools.pairwise(sequence))
 
 
 def test_heartbeats_go_out_without_frames_and_messages_come_in(lab: Lab) -> None:
     peer = lab.peer("udpin:127.0.0.1:0", "--garbage")
     output = lab.output(f"udpout:127.0.0.1:{peer.port}")
-    peer.wait_for("HEARTBEAT")
-    # One a second: after the first, 2.2 s hold two, or three on a machine that is late.
-    assert peer.kinds_during(2.2).count("HEARTBEAT") in (2, 3)
+    at_s = [1e-9 * peer.wait_for("HEARTBEAT")["at_ns"] for _ in range(4)]
+    # One a second; one that comes late is followed by one in time.
+    assert at_s[-1] - at_s[0] > 2.0
     # Sent between pieces of noise.
     until(lambda: output.link.latest("ATTITUDE"), "a message from the peer")
     found = output.link.latest("ATTITUDE", system=1, component=1)
     assert found is not None
     assert found.message.yaw == pytest.approx(0.3)
-    assert found.age_s < 1.0
+    assert found.age_s < PATIENCE_S
     assert output.link.latest("ATTITUDE", system=2) is None
 
 
@@ -232,7 +230,7 @@ def test_a_peer_that_goes_and_returns(lab: Lab, monkeypatch: pytest.MonkeyPatch)
         output, lambda: "nobody listens" in output.health().detail, "the refusal of the system"
     )
     assert output.health().state is State.FAULT
-    assert max(took) < 0.05
+    assert sorted(took)[len(took) // 2] < CALL_S
     # The peer's pipe is closed, nothing else has changed.
     assert open_files() == files - 1
 
@@ -330,8 +328,8 @@ def test_a_peer_that_takes_nothing_holds_nobody_up(lab: Lab, tmp_path: Path, kin
         output.send(SAMPLE)
         took.append(time.perf_counter() - start)
         assert time.monotonic() < end, "the line never filled"
-    # No call waited for the line; the scheduler may take its time once in a while.
-    assert sorted(took)[int(0.99 * len(took))] < 5e-3
+    # No call waited for the line: fifty of them found it full.
+    assert sorted(took)[-25] < CALL_S
     os.kill(peer.process.pid, signal.SIGCONT)
     peer.forget()
     stream(output, lambda: "DISTANCE_SENSOR" in kinds(peer), "a sample after the stall")
@@ -356,7 +354,7 @@ def test_a_connection_that_takes_nothing_for_long_is_made_anew(
 
 def test_several_share_one_link(lab: Lab) -> None:
     peer = lab.peer("udpin:127.0.0.1:0")
-    link = MavlinkLink(f"udpout:127.0.0.1:{peer.port}", component=192)
+    link = MavlinkLink(f"udpout:127.0.0.1:{peer.port}", LinkOptions(component=192))
     with contextlib.closing(link):
         until(link.autopilot, "a heartbeat")
         output = MavlinkOutput(link)
@@ -388,7 +386,13 @@ def test_a_closed_link_is_quiet(lab: Lab) -> None:
 )
 def test_what_cannot_be_opened_is_told_and_tried_again(lab: Lab, url: str) -> None:
     output = lab.output(url)
-    becomes(output, State.FAULT, "tried again every 0.25 s")
-    becomes(output, State.FAULT, "tried again every 0.5 s")
+    becomes(output, State.FAULT, "tried again every")
+    # Each time after a longer pause: a poll of a busy machine may miss the first.
+
+    def pause_s() -> float:
+        return float(output.health().detail.rpartition("every ")[2].split()[0])
+
+    first_s = pause_s()
+    until(lambda: pause_s() > first_s, "a longer pause")
     output.send(SAMPLE)
     assert output.health().n_dropped == 1

@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from waiting import PATIENCE_S, until
+
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes as POSIX has them")
 
 N_KILLS = int(os.environ.get("AQUALVS_KILLS", "24"))
@@ -81,8 +83,8 @@ def launcher():
 @pytest.fixture(scope="module")
 def start():
     """Start a process that records; returns its number."""
-    folders = [str(Path(__file__).parent.parent)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders), "OMP_NUM_THREADS": "1"}
+    folders = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": folders, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [sys.executable, __file__],
         stdin=subprocess.PIPE,
@@ -96,15 +98,12 @@ def start():
         process.stdin.write(f"{path}\t{kind}\n")
         process.stdin.flush()
         pid = int(process.stdout.readline())
-        until = time.monotonic() + 10.0
-        while not path.exists():
-            assert time.monotonic() < until
-            time.sleep(0.0005)
+        until(path.exists, "a recording")
         return pid
 
     yield begin
     process.stdin.close()
-    process.wait(10.0)
+    process.wait(PATIENCE_S)
     process.stdout.close()
 
 
@@ -115,14 +114,15 @@ def kill(pid):
 
 def gone(pid):
     """Wait until a process is no more."""
-    until = time.monotonic() + 20.0
-    while time.monotonic() < until:
+
+    def is_gone():
         try:
             os.kill(pid, 0)
         except ProcessLookupError:
-            return
-        time.sleep(0.002)
-    raise AssertionError(f"process {pid} did not end")
+            return True
+        return False
+
+    until(is_gone, f"the end of process {pid}")
 
 
 def told_by(path):
@@ -158,9 +158,7 @@ def test_a_kill_at_any_moment_leaves_a_readable_file(start, tmp_path):
         kind = ("thread", "plain")[i % 2]
         pid = start(path, kind)
         goal = moments.choice([0, 4, 15, 30, 150]) * moments.random()
-        until = time.monotonic() + 10.0
-        while told_by(path) < goal and time.monotonic() < until:
-            time.sleep(0.001)
+        until(lambda path=path, goal=goal: told_by(path) >= goal, f"{goal} frames")
         time.sleep(0.003 * moments.random())
         kill(pid)
         n, n_linear = check(path)

@@ -27,32 +27,25 @@ from aqualvs.scanning.posture import Reason, Refusal
 pytest.importorskip("pymavlink")
 
 from fake_ardusub_cases import (
+    AT_START,
     FRAME_S,
+    MARGIN_S,
     PATIENCE_S,
+    STEERED,
+    WITHIN_S,
     Dive,
     Fake,
+    assert_released,
+    assert_stopped,
     is_neutral,
     posture,
-    quiet_since,
+    pushed,
+    pushing,
     until,
+    within,
 )
 
-MARGIN_S = 0.05
-WITHIN_S = 0.2
 LAPSE_S = 0.5
-AT_START = {
-    "armed": True,
-    "mode": 2,
-    "joystick": None,
-    "forwards": True,
-    "station": True,
-    "beats": True,
-    "away": False,
-    "lapsed": True,
-    "sticks": [0.0, 0.0, 0.0, 0.0],
-    "speeds": [0.0, 0.0, 0.0, 0.0],
-    "at": [0.9, 0.0],
-}
 MakeDive = Callable[..., Dive]
 
 
@@ -72,7 +65,7 @@ def fake(vehicle: Fake) -> Iterator[Fake]:
     yield vehicle
     for message in vehicle.wire[n:]:
         kind, sender = message["kind"], (message["system"], message["component"])
-        assert kind in ("HEARTBEAT", "MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
+        assert kind in ("HEARTBEAT", "PARAM_REQUEST_READ", *STEERED)
         if kind == "MANUAL_CONTROL":
             fields = message["fields"]
             assert sender == (255, 191)
@@ -94,48 +87,6 @@ def dive(fake: Fake) -> Iterator[MakeDive]:
     yield make
     for one in made:
         one.close()
-
-
-def pushing(fake: Fake) -> bool:
-    """Whether the vehicle was just told to move."""
-    told = fake.steered(time.monotonic() - 0.3)
-    return bool(told) and not is_neutral(told[-1])
-
-
-def pushed(one: Dive) -> None:
-    """Engage and wait until the vehicle is told to move."""
-    one.engage()
-    until(lambda: pushing(one.fake), "an effort")
-
-
-def within(one: Dive, at: float, limit_s: float = WITHIN_S) -> float:
-    """A time limit with what the busy machine adds."""
-    return limit_s + MARGIN_S + one.lateness(at)
-
-
-def assert_stopped(one: Dive, at: float, limit_s: float = WITHIN_S) -> None:
-    """Assert that efforts stop in time, and that the vehicle is told so."""
-    time.sleep(max(0.0, at + limit_s + 0.15 - time.monotonic()))
-    assert_quiet(one, at, limit_s)
-
-
-def assert_released(one: Dive, at: float, limit_s: float = WITHIN_S) -> None:
-    """Assert that efforts stop in time, and that nothing at all is sent after a few neutrals."""
-    until(lambda: not one.pilot.engaged, "a stop")
-    # Three neutrals go out frame by frame.
-    time.sleep(4 * FRAME_S + one.lateness(at))
-    assert_quiet(one, at, limit_s)
-    until(lambda: not one.fake.steered(time.monotonic() - 0.2), "silence", 1.0 + one.lateness(at))
-    silent = time.monotonic()
-    time.sleep(0.2)
-    assert not one.fake.steered(silent)
-
-
-def assert_quiet(one: Dive, at: float, limit_s: float) -> None:
-    told = one.fake.steered(at)
-    assert quiet_since(told, at) <= within(one, at, limit_s)
-    assert told
-    assert is_neutral(told[-1])
 
 
 def test_holds_range_and_yaw(fake: Fake, dive: MakeDive) -> None:
@@ -205,11 +156,11 @@ def test_never_closer_than_the_least_range(fake: Fake, dive: MakeDive) -> None:
     fake.play(at=[0.45, 0.0])
     one.engage()
     at = time.monotonic()
-    time.sleep(0.3)
-    assert all(m["fields"]["x"] < 0 for m in fake.steered(at))
-    assert one.pilot.health().state is State.WARN
-    assert "closer" in one.pilot.health().detail
+    until(lambda: "closer" in one.pilot.health().detail, "a warning")
+    until(lambda: one.pilot.health().state is State.WARN, "a warning")
     until(lambda: fake.truth["range"] > 0.5, "a retreat")
+    # Neutral comes between where a frame was held up.
+    assert all(x <= 0 for x in told_forward(fake, at))
 
 
 def test_brakes_where_it_closes_in_too_fast(fake: Fake, dive: MakeDive) -> None:
@@ -354,7 +305,7 @@ def test_killed_process_leaves_the_vehicle_to_its_own_fail_safe(fake: Fake) -> N
     script = KILLED.format(paths=[str(here), str(here.parent)], url=fake.url)
     process = subprocess.Popen([sys.executable, "-c", script])
     try:
-        until(lambda: pushing(fake), "an effort", 30.0)
+        until(lambda: pushing(fake), "an effort", PATIENCE_S)
         n = len(fake.events)
     finally:
         process.send_signal(signal.SIGKILL)

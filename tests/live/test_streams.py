@@ -18,14 +18,22 @@ import pytest
 import stream_sender
 
 from aqualvs.live.health import State
-from aqualvs.live.sources import open_feed
+from aqualvs.live.sources import inbox, open_feed, reception, remote
 from aqualvs.live.sources.remote import RemoteFeed
+from waiting import PATIENCE_S, until
 
 SD, HD = (720, 576), (1920, 1080)
 SENDER = Path(stream_sender.__file__)
 
-# A stalled machine must not fail a test that waits; what it waits for is timed by itself.
-PATIENCE_S = 15.0
+# An end that waits for nothing takes a fifth of a second; this is what a busy machine may add.
+END_S = 5.0
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A machine that is busy is no silence, and what it does not keep up with is kept."""
+    monkeypatch.setattr(reception, "_SILENT_S", PATIENCE_S)
+    monkeypatch.setattr(inbox, "_MAX_LAG_S", PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -66,17 +74,19 @@ class Listener:
     def __init__(self, feed):
         self.feed = feed
         self.indices, self.times, self.contents = [], [], []
-        self.sizes, self.arrivals = [], []
+        self.sizes, self.arrivals, self.states = [], [], []
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self):
         for frame in self.feed:
             self.arrivals.append(time.monotonic())
-            self.indices.append(frame.index)
             self.times.append(frame.time_s)
             self.sizes.append(frame.luma.shape[::-1])
             self.contents.append(digest(frame.luma))
+            self.states.append(self.feed.health().state)
+            # The last of all: who waits for a frame finds the rest.
+            self.indices.append(frame.index)
 
     def wait(self, condition):
         end = time.monotonic() + PATIENCE_S
@@ -99,7 +109,7 @@ def listening(feed):
     try:
         yield listener
     finally:
-        assert listener.close() < 1.0
+        assert listener.close() < END_S
     assert all(b > a for a, b in pairwise(listener.indices))
     assert all(b >= a for a, b in pairwise(listener.times))
     assert feed.health().state is State.OFF
@@ -120,13 +130,21 @@ def sender(*clips, port, **options):
     for name, value in options.items():
         command.append("--" + name.replace("_", "-"))
         command += [] if value is True else [str(value)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def go_on(process):
+    """Let a sender that holds go on; returns when."""
+    at = time.monotonic()
+    process.stdin.write("\n")
+    process.stdin.flush()
+    return at
 
 
 def send(*clips, port, **options):
     """Send clips and return what the sender tells."""
     with sender(*clips, port=port, **options) as process:
-        text, _ = process.communicate(timeout=PATIENCE_S + 10)
+        text, _ = process.communicate(timeout=2 * PATIENCE_S)
     return json.loads(text.splitlines()[-1])
 
 
@@ -137,21 +155,20 @@ def free_port():
 
 @pytest.mark.parametrize(("name", "size", "n"), [("sd", SD, 50), ("hd", HD, 30)])
 def test_rtp_at_25_frames_a_second_arrives_whole(clips, name, size, n):
-    """Also where the 32 bits of its time run out, one second in."""
+    """Also where the 32 bits of its time run out, one second in.
+
+    No picture waits for the next one: the last one, after which nothing comes, arrives as well.
+    """
     with udp_listener() as heard:
         told = send(clips[name], port=heard.feed.port, first_time=2**32 - 90_000)
         heard.wait(lambda: len(heard.indices) == n)
-        assert heard.feed.health().state is State.OK
+    assert set(heard.states) == {State.OK}
     assert told["frames"] == n
     assert heard.indices == list(range(n))
     assert heard.times == pytest.approx([i / 25 for i in range(n)], abs=1e-4)
     assert set(heard.sizes) == {size}
     known = pictures_of(clips[name])
     assert [known[content] for content in heard.contents] == list(range(n))
-    # Loopback adds next to nothing; a picture held back would come 40 ms later, but the machine
-    # may be busy for longer than that now and then.
-    delays = [at - told["began"] - i / 25 for i, at in enumerate(heard.arrivals)]
-    assert np.median(delays) < 0.035
 
 
 @pytest.mark.parametrize(("kind", "n_held"), [("mpegts", 0), ("bare", 1)])
@@ -166,15 +183,21 @@ def test_other_kinds_over_udp_are_recognised(clips, kind, n_held):
         assert heard.times == pytest.approx([i / 25 for i in range(50)], abs=1e-3)
 
 
+# The last key frame of the stripes; nothing is lost from it on, so that the end arrives.
+SOUND_FROM = 144
+
+
 @pytest.mark.parametrize("kind", ["rtp", "mpegts"])
 def test_five_percent_of_loss_costs_frames_but_shows_no_false_one(clips, kind):
     """Every frame is exact, and its number counts those that were lost."""
     with udp_listener() as heard:
-        told = send(clips["stripes"], port=heard.feed.port, kind=kind, loss=0.05, seed=3, speed=8)
-        heard.wait(lambda: len(heard.indices) > 10)
+        known = pictures_of(clips["stripes"])
+        options = {"loss": 0.05, "seed": 3, "sound_from": SOUND_FROM, "speed": 8}
+        told = send(clips["stripes"], port=heard.feed.port, kind=kind, **options)
+        # A picture of MPEG-TS may wait for the next one after a loss, so the last may be missing.
+        heard.wait(lambda: heard.indices and known[heard.contents[-1]] >= 148)
         health = heard.feed.health()
     assert told["lost"] > 0.03 * told["packets"]
-    known = pictures_of(clips["stripes"])
     true = [known[content] for content in heard.contents]
     assert 15 <= len(true) < 150
     assert health.n_dropped > 0
@@ -186,47 +209,51 @@ def test_five_percent_of_loss_costs_frames_but_shows_no_false_one(clips, kind):
 
 def test_damaged_packets_cost_frames_and_the_rest_is_exact(clips):
     with udp_listener() as heard:
-        told = send(clips["stripes"], port=heard.feed.port, damage=0.01, seed=2, speed=8)
-        heard.wait(lambda: len(heard.indices) > 40)
+        known = pictures_of(clips["stripes"])
+        options = {"damage": 0.02, "seed": 2, "sound_from": SOUND_FROM, "speed": 8}
+        told = send(clips["stripes"], port=heard.feed.port, **options)
+        heard.wait(lambda: heard.indices and known[heard.contents[-1]] == 149)
     assert told["damaged"] >= 5
-    known = pictures_of(clips["stripes"])
     true = [known[content] for content in heard.contents]
     assert 40 < len(true) < 150
-    assert max(true) > 100
 
 
-def test_a_stream_that_stops_is_a_fault_and_goes_on_when_it_returns(clips):
+def test_a_stream_that_stops_is_a_fault_and_goes_on_when_it_returns(clips, monkeypatch):
     """First the same sender pauses; then another one comes, with pictures of another size."""
     with udp_listener() as heard:
         port = heard.feed.port
-        with sender(clips["sd"], port=port, pause=30, pause_s=1.2, speed=2):
+        with sender(clips["sd"], port=port, hold=30, speed=2, first_time=1000) as first:
             heard.wait(lambda: len(heard.indices) >= 30)
-            heard.wait(lambda: heard.feed.health().state is State.FAULT)
-            assert "silent" in heard.feed.health().detail
+            with monkeypatch.context() as usual:
+                usual.setattr(reception, "_SILENT_S", 0.1)
+                heard.wait(lambda: heard.feed.health().state is State.FAULT)
+                assert "silent" in heard.feed.health().detail
             assert len(heard.indices) == 30
+            last_sent = go_on(first)
             heard.wait(lambda: len(heard.indices) == 50)
-        told = send(clips["hd"], port=port, ssrc=77)
+        told = send(clips["hd"], port=port, ssrc=77, first_time=2**31)
         heard.wait(lambda: len(heard.indices) == 80)
-        assert heard.feed.health().state is State.OK
+    assert set(heard.states) == {State.OK}
     assert heard.indices == list(range(80))
     assert heard.sizes == 50 * [SD] + 30 * [HD]
-    assert heard.arrivals[50] - told["began"] < 1.0
-    gap = heard.arrivals[50] - heard.arrivals[49]
-    # The second sender's time begins anywhere; ours goes on by the clock.
-    assert heard.times[50] - heard.times[49] == pytest.approx(gap, abs=0.1)
+    # The second sender's time begins anywhere; ours goes on by the clock, from the arrival of one
+    # picture to that of the next. Each arrived after it was sent and before it was heard of.
+    gap = heard.times[50] - heard.times[49]
+    assert told["began"] - heard.arrivals[49] <= gap <= heard.arrivals[50] - last_sent
+    assert gap > 0.0
     assert heard.times[79] - heard.times[50] == pytest.approx(29 / 25, abs=1e-4)
 
 
 def test_rtsp_connects_again_when_the_server_returns(clips):
+    """The first pictures come while the server holds the others back: probing is short."""
     port = free_port()
     with listening(open_feed(f"rtsp://127.0.0.1:{port}/camera")) as heard:
         heard.wait(lambda: "Connection refused" in heard.feed.health().detail)
         for n in (50, 100):
-            told = send(clips["sd"], port=port, rtsp=True, speed=4)
-            heard.wait(lambda n=n: len(heard.indices) == n)
-            # The server plays as soon as it is asked, so this holds probing and decoding.
-            assert heard.arrivals[n - 50] - told["began"] < 1.0
-            assert heard.feed.health().state in (State.OK, State.FAULT)
+            with sender(clips["sd"], port=port, rtsp=True, speed=4, hold=25) as server:
+                heard.wait(lambda n=n: len(heard.indices) >= n - 49)
+                go_on(server)
+                heard.wait(lambda n=n: len(heard.indices) == n)
     assert heard.indices == list(range(100))
     known = pictures_of(clips["sd"])
     assert [known[content] for content in heard.contents] == 2 * list(range(50))
@@ -240,7 +267,8 @@ def test_without_a_sender_it_waits_and_says_so(clips):
         assert "waiting for the stream" in health.detail
 
 
-def test_a_server_that_is_mute_does_not_delay_the_end():
+def test_a_server_that_is_mute_does_not_delay_the_end(monkeypatch):
+    monkeypatch.setattr(remote, "_OPEN_S", 4 * END_S)
     with (
         socket.create_server(("127.0.0.1", 0)) as mute,
         listening(open_feed(f"rtsp://127.0.0.1:{mute.getsockname()[1]}/camera")) as heard,
@@ -296,7 +324,4 @@ def test_many_reconnections_leave_no_handle_open(tmp_path):
     for _ in range(10):
         with udp_listener():
             pass
-    end = time.monotonic() + PATIENCE_S
-    while (n_handles(), threading.active_count()) > (before, threads) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert (n_handles(), threading.active_count()) <= (before, threads)
+    until(lambda: (n_handles(), threading.active_count()) <= (before, threads), "an end of all")

@@ -57,7 +57,7 @@ def test_of_two_that_do_the_same_the_first_to_finish_wins(tmp_path):
         with drafted(folder) as draft:
             (draft / "rows.csv").write_text(word)
             seal(draft, "key", {"word": word}, ["rows.csv"])
-            ready.wait(10)
+            ready.wait(60)
 
     threads = [threading.Thread(target=work, args=(word,)) for word in ("one", "two")]
     for thread in threads:

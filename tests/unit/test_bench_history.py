@@ -101,7 +101,7 @@ def test_the_commit_says_whether_files_differ(tmp_path: Path) -> None:
     who = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
     (tmp_path / "file").write_text("1")
     for words in (["init", "-q"], ["add", "file"], [*who, "commit", "-q", "-m", "first"]):
-        subprocess.run(["git", *words], cwd=tmp_path, check=True, timeout=30)
+        subprocess.run(["git", *words], cwd=tmp_path, check=True, timeout=300)
     clean = history.commit_of(tmp_path)
     assert len(clean) >= 7
     (tmp_path / "file").write_text("2")

@@ -206,7 +206,7 @@ def test_a_viewer_shows_what_was_written(tmp_path):
     _printed(tmp_path, kind="charuco", squares_x=7, squares_y=5)
     # 76.2 dots per inch are 3 per millimetre.
     command = ["pdftoppm", "-r", "76.2", "-gray", "-png", "-singlefile", "t.pdf", "seen"]
-    subprocess.run(command, cwd=tmp_path, check=True, timeout=60)
+    subprocess.run(command, cwd=tmp_path, check=True, timeout=300)
     image = cv2.imread(str(tmp_path / "seen.png"), cv2.IMREAD_GRAYSCALE)
     board = load_board(tmp_path / "t.yaml")
     view = detect_board(cv2.GaussianBlur(image, (0, 0), 0.7), board, "seen")

@@ -179,7 +179,7 @@ for _ in range({threads}):
 print(context().get_start_method())
 """
     said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300
     )
     assert said.stdout.strip() == how
 
@@ -205,7 +205,7 @@ def test_the_command_shares_a_dive_by_default(tmp_path):
             "--no-report",
         ]
         command += ["-o", str(out), "--workers", str(n)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         assert done.returncode == 0, done.stderr
         assert "108 frames" in done.stdout
         assert done.stderr == ""
@@ -267,7 +267,7 @@ def test_so_do_those_that_are_too_large_for_their_place(block, ends, monkeypatch
     monkeypatch.setattr(crew_post, "_SLOT_BYTES", 4096)
     sent = thread.submit(sender.send, block)
     assert_like(block, receiver.receive())
-    sent.result(timeout=10)
+    sent.result(timeout=60)
 
 
 def test_a_sender_waits_until_there_is_a_place(block, ends):
@@ -288,7 +288,7 @@ def test_a_sender_waits_until_there_is_a_place(block, ends):
         assert_like(message, receiver.receive())
     assert receiver.receive() is Ended.WHOLE
     receiver.give_part(5)
-    assert sent.result(timeout=10) == 5
+    assert sent.result(timeout=60) == 5
 
 
 def breaking_off(n):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from aqualvs.app import doctor
+from aqualvs.app import doctor, doctor_autopilot
 from aqualvs.app.doctor import EXIT_NOT_READY, EXIT_READY, DoctorRequest, run_doctor
 
 DEMO = Path(doctor.__file__).parents[1] / "data" / "demo"
@@ -37,7 +37,7 @@ def test_a_source_that_fits_the_rig(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_silence_is_not_ready_and_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_STREAM_S", 0.5)
-    monkeypatch.setattr(doctor, "_HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(doctor_autopilot, "_HEARTBEAT_S", 0.5)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
         found.bind(("127.0.0.1", 0))
         port = found.getsockname()[1]

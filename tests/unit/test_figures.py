@@ -11,7 +11,7 @@ from pyarrow import parquet
 
 from aqualvs.app.figures import figures
 from aqualvs.app.net_figures import Reflections, draw_figures
-from aqualvs.errors import OptionError, SourceError
+from aqualvs.errors import OptionError, OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rigfile import rig_to_mapping
@@ -93,6 +93,20 @@ def test_the_frame_and_laser_that_show_most_are_drawn(tmp_path: Path) -> None:
     figure_14 = tmp_path / "out" / "figure_14.png"
     assert share_of(figure_14, PINK) > 1e-3
     assert share_of(figure_14, BLUE) > 1e-3
+
+
+def test_pictures_of_others_stay(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "figure_14.png").write_text("precious")
+    with pytest.raises(OutputError, match=r"figure_14\.png: exists, and 'aqualvs figures' did not"):
+        figures(write_run(tmp_path), out, lambda _: None, overwrite=True)
+    assert (out / "figure_14.png").read_text() == "precious"
+    (out / "figure_14.png").unlink()
+    figures(write_run(tmp_path), out, lambda _: None)
+    with pytest.raises(OutputError, match="add --overwrite"):
+        figures(write_run(tmp_path), out, lambda _: None)
+    figures(write_run(tmp_path), out, lambda _: None, overwrite=True)
 
 
 def test_a_chosen_frame_and_laser_are_drawn(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from aqualvs.app.cli_follow import follow
 from aqualvs.app.follow import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, simulate_and_tell
 from aqualvs.app.follow_vehicle import listen
+from aqualvs.app.overwriting import RECORD
 from aqualvs.control.follow_log import FOLLOW_COLUMNS
 from aqualvs.errors import OptionError
 
@@ -26,7 +27,7 @@ def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.7), seconds=3.0)
     assert simulate_and_tell(request, lambda line: told.append(line)) == 0
-    made = {path.name for path in request.out.iterdir()}
+    made = {path.name for path in request.out.iterdir()} - {RECORD}
     assert made == {FOLLOW_CSV, TRUTH_CSV, "figure_22.png", "figure_23.png", "follow.html"}
     with (request.out / FOLLOW_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -113,7 +114,7 @@ def test_enter_engages_and_gives_back() -> None:
     told: list[str] = []
     pilot = Switch()
     keys = io.StringIO("\n\n\n")
-    listen(pilot, keys, lambda line: told.append(line)).join(5.0)  # type: ignore[arg-type]
+    listen(pilot, keys, lambda line: told.append(line)).join(60.0)  # type: ignore[arg-type]
     assert told == ["pilot: not engaged: the vehicle is disarmed", "engaged", "disengaged"]
     assert not pilot.engaged
 

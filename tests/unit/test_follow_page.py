@@ -25,7 +25,8 @@ from aqualvs.simulation.example_rigs import example_rig
 from browser import open_page
 from live_cases import Collector
 
-PATIENCE_S = 40.0
+# A vehicle takes seconds to its setpoint; a busy machine more.
+PATIENCE_S = 120.0
 HELD = Setpoint(0.6)
 
 

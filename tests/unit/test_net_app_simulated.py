@@ -80,7 +80,7 @@ def test_simulate_writes_log_and_holes_beside_a_dive_along_a_net(tmp_path, capsy
     out = tmp_path / "dive"
     body.simulate(str(short), None, out, print, camera="ideal", overwrite=False)
     names = ["dive.mp4", "rig.yaml", "truth.csv", "truth_holes.csv", "vehicle.csv"]
-    assert sorted(path.name for path in out.iterdir()) == names
+    assert sorted(path.name for path in out.glob("[!.]*")) == names
     (hole,) = rows(out / "truth_holes.csv")
     expected = {"right_m": 0.1, "up_m": 0.05, "diameter_mm": 60.0, "depth_m": NET_DEPTH - 0.05}
     assert {name: float(hole[name]) for name in expected} == pytest.approx(expected)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.scanning.stripe import (
     HEIGHT,
+    N_MEASURES,
     POSITION,
     STEP_U,
     STEP_V,
@@ -104,10 +105,19 @@ def _peaks_of_run(
     return found
 
 
-def finder(
-    shape: tuple[int, int], low: IntArray, high: IntArray, reach: int, capacity: int = 100_000
-) -> PeakFinder:
-    return PeakFinder(shape[1], low, high, reach, capacity, GREEN)
+def find(
+    image: SearchImage,
+    band: tuple[IntArray, IntArray],
+    reach: int,
+    contrast: int,
+    *,
+    every: int = 1,
+    capacity: int = 100_000,
+) -> tuple[IntArray, FloatArray]:
+    line, table = np.empty(capacity, np.int64), np.empty((N_MEASURES, capacity))
+    finder = PeakFinder(image.lines.shape[1], *band, reach, GREEN)
+    n = finder.find(image, contrast, every, line, table)
+    return line[:n], table[:, :n]
 
 
 def picture(rng: np.random.Generator, shape: tuple[int, int], kind: str) -> U8:
@@ -151,8 +161,8 @@ def test_peaks_are_those_of_the_reference(
     lines = picture(rng, (n_lines, length), kind)
     # Bands of all kinds, empty ones among them.
     low, high = rng.integers(0, length, (2, n_lines))
-    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, True, 1)
-    found = finder(lines.shape, low, high, reach).find(image, contrast, every)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1)
+    found = find(image, (low, high), reach, contrast, every=every)
     expected = [
         peak
         for x in range(0, n_lines, every)
@@ -169,12 +179,12 @@ def test_the_background_is_the_higher_of_the_two_sliding_minima() -> None:
     row[30:] = 90
     row[28:31] = [120, 150, 120]
     whole = np.array([0]), np.array([59])
-    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, True, 1)
-    _, table = finder((1, 60), *whole, 10).find(image, 6)
+    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, 1)
+    _, table = find(image, whole, 10, 6)
     # A stripe on the edge of a box counts from the brighter side.
     np.testing.assert_array_equal(table[HEIGHT], [60.0])
     row[40:] = 20
-    _, table = finder((1, 60), *whole, 40).find(image, 6)
+    _, table = find(image, whole, 40, 6)
     # Within reach the box has another side, and is dark behind it: all of it stands out.
     np.testing.assert_array_equal(table[HEIGHT], [130.0])
 
@@ -183,11 +193,11 @@ def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
     rng = np.random.default_rng(4)
     lines = picture(rng, (20, 400), "noise")
     low, high = np.zeros(20, np.int64), np.full(20, 399)
-    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, True, 1)
-    roomy = finder(lines.shape, low, high, 12)
-    sizes = {contrast: len(roomy.find(image, contrast)[0]) for contrast in (10, 20, 40, 80, 160)}
-    tight = finder(lines.shape, low, high, 12, capacity=sizes[40] + 1)
-    line, table = tight.find(image, 10)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1)
+    sizes = {
+        contrast: len(find(image, (low, high), 12, contrast)[0]) for contrast in (10, 20, 40, 80)
+    }
+    line, table = find(image, (low, high), 12, 10, capacity=sizes[40] + 1)
     assert sizes[10] > sizes[40] == len(line) > 0
     assert_same(
         line,
@@ -201,8 +211,7 @@ def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
 
 
 @pytest.mark.parametrize("line_px", [1, 2])
-@pytest.mark.parametrize("along_x", [True, False])
-def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(along_x: bool, line_px: int) -> None:
+def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(line_px: int) -> None:
     length, n_lines = 80, 24
     lines = np.full((n_lines, length), 60, np.uint8)
     lines[:, 38:43] = [80, 120, 160, 120, 80]
@@ -212,11 +221,9 @@ def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(along_x: bool, line_p
         np.full((half_lines, 40), 124, np.uint8),
     )
     u[:, 18:23], v[:, 18:23] = 108, 94
-    if not along_x:
-        u, v = u.T.copy(), v.T.copy()
     low, high = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    image = SearchImage(lines, u, v, along_x, line_px)
-    line, table = finder(lines.shape, low, high, 12).find(image, 6)
+    image = SearchImage(lines, u, v, line_px)
+    line, table = find(image, (low, high), 12, 6)
     np.testing.assert_array_equal(line, np.arange(n_lines))
     np.testing.assert_allclose(table[STEP_U], -10.0)
     np.testing.assert_allclose(table[STEP_V], -30.0)

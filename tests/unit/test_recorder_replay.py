@@ -238,7 +238,7 @@ def test_an_old_recording_goes_with_its_run(demo, tmp_path):
     out = tmp_path / "out"
     few = {"rig": demo / "rig.yaml", "frames": FrameWindow(0, 2)}
     again(demo / "dive.mp4", out, mcap=True, **few)
-    with pytest.raises(OutputError, match="already holds a run"):
+    with pytest.raises(OutputError, match="exists; choose another place"):
         again(demo / "dive.mp4", out, mcap=True, **few)
     again(demo / "dive.mp4", out, overwrite=True, **few)
     assert not (out / "dive.mcap").exists()

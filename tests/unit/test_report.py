@@ -1,3 +1,4 @@
+import errno
 import json
 import re
 from html import unescape
@@ -296,7 +297,7 @@ def test_interrupted_run_still_gives_a_report(tmp_path: Path) -> None:
         ("points.parquet", b"PAR1 cut", "points.parquet cannot be read"),
         ("points.parquet", None, "points.parquet is missing"),
         ("run.yaml", None, "run.yaml is missing"),
-        ("run.yaml", b"- a\n- list\n", "run.yaml is empty or not a mapping"),
+        ("run.yaml", b"- a\n- list\n", "run.yaml cannot be read"),
         ("run.yaml", b"\xff\xfe\x00", "run.yaml cannot be read"),
     ],
 )
@@ -510,3 +511,32 @@ def test_page_of_a_long_dive_stays_small(tmp_path: Path) -> None:
     assert max(len(strip["x"]) for strip in data["posture"]["strips"]) <= 4000
     again = data_of(write_report(tmp_path, out=tmp_path / "again.html").read_text())
     assert again["cloud"] == data["cloud"]
+
+
+def test_a_run_killed_before_its_first_bare_row_is_reported(tmp_path: Path) -> None:
+    run = make_dive(tmp_path).folder
+    bare = run / "posture_bare.csv"
+    for content in ("", (run / "posture.csv").read_text().splitlines()[0] + "\n"):
+        bare.write_text(content)
+        assert "bare lens." not in visible(write_report(run).read_text("utf-8"))
+    bare.write_bytes(b"frame,time_s\nx,y\n\xff")
+    assert "no comparison with a bare lens" in visible(write_report(run).read_text("utf-8"))
+
+
+def test_a_report_that_cannot_be_written_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_dive(tmp_path).folder
+    good = write_report(run).read_bytes()
+
+    def full(path: Path, text: str, **_: Any) -> int:
+        with path.open("w") as file:
+            file.write(text[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OutputError, match="No space left"):
+        write_report(run)
+    monkeypatch.undo()
+    assert (run / "report.html").read_bytes() == good
+    assert not list(run.glob("*.part"))

@@ -403,8 +403,10 @@ def _with_notes(rig: Rig, notes: dict[str, Any]) -> Rig:
 def test_saving_replaces_whole_files_and_leaves_no_draft(tmp_path: Path) -> None:
     rig = rig_from_mapping(hand_written(), source_name="x")
     path = tmp_path / "rig.yaml"
-    path.write_text("old")
-    save_rig(rig, path)
+    save_rig(replace(rig, name="old"), path)
+    copy = save_rig(rig, path)
+    assert copy is not None
+    copy.unlink()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["rig.yaml"]
     with pytest.raises(OutputError, match="cannot write the rig"):
         save_rig(rig, tmp_path / "no" / "rig.yaml")

@@ -35,7 +35,9 @@ def test_nothing_passes_before_engaging() -> None:
     [
         ({"pilot_moves": True}, Reason.PILOT_STICKS),
         ({"mode": Mode.PILOT}, Reason.PILOT_MODE),
-        ({"mode": Mode.UNKNOWN}, Reason.PILOT_MODE),
+        ({"mode": Mode.NO_STATION}, Reason.NO_STATION),
+        ({"mode": Mode.CONFLICT}, Reason.CONFLICT),
+        ({"mode": Mode.UNKNOWN}, Reason.UNKNOWN_MODE),
         ({"armed": False}, Reason.DISARMED),
         ({"heard_s": 98.9}, Reason.NO_HEARTBEAT),
         ({"heard_s": -math.inf}, Reason.NO_HEARTBEAT),

@@ -109,7 +109,7 @@ def test_results_that_fit_no_dive_are_refused(name, content, words, benchmark, t
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "cannot be read"),
+        (None, "no such file"),
         ("[1, 2", "not YAML"),
         ("name: x\n", "not a benchmark set"),
         ("aqualvs_benchmark: 1\nname: x\n", "'checksum' is missing"),

@@ -88,7 +88,7 @@ def test_a_faulty_file_gets_one_line_with_file_value_and_remedy(tmp_path, text, 
 
 
 def test_missing_file_and_unknown_name_are_told_apart(tmp_path):
-    with pytest.raises(OptionError, match="No such file"):
+    with pytest.raises(OptionError, match="no such file"):
         load_scenario(tmp_path / "none.yaml")
     with pytest.raises(OptionError, match="choose one of wall, wall_range"):
         load_scenario("walll")

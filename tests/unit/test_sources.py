@@ -1,6 +1,9 @@
 """Sources: what arrives is what was encoded, and what is missing is said."""
 
 import gc
+import os
+import struct
+import zlib
 
 import av
 import cv2
@@ -368,3 +371,43 @@ def test_decoding_takes_one_pass(tmp_path):
     path = write_video(tmp_path / "a.mp4", 5, size=SMALL)
     with VideoSource(path) as source:
         assert sum(1 for _ in source) == 5
+
+
+def huge_png(path, side=60_000):
+    """A file of a few bytes that claims a picture of gigabytes."""
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(bytes(100_000))), (b"IEND", b""))
+    chunks = [
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in parts
+    ]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+
+
+def test_a_huge_picture_is_refused_and_those_before_it_kept(tmp_path):
+    huge_png(tmp_path / "img9.png")
+    with pytest.raises(SourceError, match=r"img9\.png: not a readable image, or too large"):
+        open_source(tmp_path)
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"img{i}.png"), picture(i, (64, 48)))
+    delivered = []
+    with open_source(tmp_path) as source, pytest.raises(SourceError, match="too large"):
+        delivered.extend(source)
+    assert len(delivered) == 3
+
+
+def test_what_is_neither_file_nor_folder_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.mp4")
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "loop.mp4").symlink_to(tmp_path / "loop.mp4")
+    for name, why in (
+        ("pipe.mp4", "is a pipe"),
+        ("pipe.png", "is a pipe"),
+        ("loop.mp4", "no such"),
+    ):
+        with pytest.raises(SourceError, match=why):
+            open_source(tmp_path / name)
+    with pytest.raises(SourceError, match="is a device"):
+        open_source("/dev/zero")
+    with pytest.raises(SourceError, match="not a readable image"):
+        open_source(tmp_path)

@@ -8,9 +8,11 @@ from fractions import Fraction
 import av
 import cv2
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.recorder.reader import decompressed
 from aqualvs.live.sources import open_feed, open_source
 from aqualvs.live.sources.image_messages import ImageMessage, planes_of_message
 from aqualvs.live.sources.image_schemas import protobuf_fields
@@ -401,3 +403,42 @@ def test_protobuf_fields():
     for cut in (b"\x0a", b"\x0a\x05ab", b"\xff" * 12, b"\x0b"):
         with pytest.raises(ValueError, match=r"cut short|wire type"):
             protobuf_fields(cut)
+
+
+@pytest.mark.parametrize("finish", [True, False], ids=["with index", "without"])
+@pytest.mark.parametrize("codec", ["lz4", "zstd"])
+def test_a_chunk_that_would_fill_the_memory_is_refused_and_what_is_before_it_kept(
+    tmp_path, codec, finish
+):
+    path = tmp_path / "bomb.mcap"
+    *head, messages = compressed_image(6)
+    name, schema, (kind, text), encoding = head
+    with path.open("wb") as stream:
+        compression = getattr(mcap_writer.CompressionType, codec.upper())
+        writer = mcap_writer.Writer(stream, chunk_size=1, compression=compression)
+        writer.start()
+        schema_id = writer.register_schema(schema, kind, text)
+        channel = writer.register_channel(name, encoding, schema_id)
+        for i, data in enumerate([*messages, bytes(3_000_000)]):
+            at = START_NS + i * STEP_NS
+            writer.add_message(channel, at, data, at)
+        if finish:
+            writer.finish()
+    data = path.read_bytes()
+    # What a chunk claims to hold is what is believed.
+    at = data.index((3_000_000 + 31).to_bytes(8, "little"))
+    path.write_bytes(data[:at] + (1 << 40).to_bytes(8, "little") + data[at + 8 :])
+    delivered = []
+    with open_source(path) as source, pytest.raises(SourceError, match="damaged, or cut short"):
+        delivered.extend(source)
+    assert len(delivered) == 6
+
+
+@pytest.mark.parametrize("codec", ["lz4", "zstd"])
+def test_a_chunk_larger_than_it_claims_is_damaged(codec):
+    packed = pa.compress(bytes(500_000), codec=codec, asbytes=True)
+    assert len(decompressed(codec, packed, 500_000)) == 500_000
+    with pytest.raises((ValueError, OSError)):
+        decompressed(codec, packed, 1_000)
+    with pytest.raises(ValueError, match="1099511627776"):
+        decompressed(codec, packed, 1 << 40)

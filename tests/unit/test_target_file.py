@@ -34,7 +34,7 @@ def test_file(tmp_path: Path) -> None:
         ("kind: net\nmesh_filter: {dd_mm: wide}", "mesh_filter.dd_mm is 'wide'"),
         ("kind: net\nmesh_filter: {dd_mm: -1}", "dd is -1 mm"),
         ("- net", "holds no keys"),
-        ("kind: [", "cannot be read as YAML"),
+        ("kind: [", "is not YAML"),
     ],
 )
 def test_bad_files_are_named(tmp_path: Path, content: str, words: str) -> None:

@@ -1,6 +1,8 @@
 """A file that grows by whole pieces: a piece is in it entirely, or not at all."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 try:
@@ -19,6 +21,8 @@ class AppendFile:
     ----------
     path : Path
         Written anew.
+    exclusive : bool
+        Whether to raise `FileExistsError` where there is a file.
 
     Raises
     ------
@@ -26,8 +30,8 @@ class AppendFile:
         From the constructor and from `append`, as the system says it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("wb", buffering=0)
+    def __init__(self, path: Path, *, exclusive: bool = False) -> None:
+        self._file = path.open("xb" if exclusive else "wb", buffering=0)
         self._n_bytes = 0
 
     def append(self, piece: bytes | memoryview) -> None:
@@ -54,6 +58,21 @@ class AppendFile:
     def close(self) -> None:
         """Close the file; further calls do nothing."""
         self._file.close()
+
+
+@contextlib.contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Let one process at a time in; where folders cannot be locked, all."""
+    number = None
+    try:
+        if fcntl is not None:
+            with contextlib.suppress(OSError):
+                number = os.open(folder, os.O_RDONLY)
+                fcntl.flock(number, fcntl.LOCK_EX)
+        yield
+    finally:
+        if number is not None:
+            os.close(number)
 
 
 def is_locked(path: Path) -> bool:

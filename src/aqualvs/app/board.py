@@ -12,6 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.pdf import Page, pdf_bytes
 from aqualvs.app.sheets import FIT, best_paper, outline, papers, sheet
 from aqualvs.calibration.box_markers import BoxPlan, Patch, box_patches
@@ -64,6 +65,8 @@ class BoardRequest:
         Where the plate's first corner (top left of its first marker) is in `dome`.
     rotation_deg : (float, float, float)
         Rotation vector in `dome`, applied to a plate that faces the camera upright.
+    overwrite : bool
+        Whether to replace files that this command wrote before.
     """
 
     kind: Literal["charuco", "chessboard", "box", "plate"]
@@ -81,6 +84,7 @@ class BoardRequest:
     first_id: int = 0
     position_mm: tuple[float, float, float] | None = None
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    overwrite: bool = False
 
 
 def print_board(request: BoardRequest, tell: Tell) -> None:
@@ -95,17 +99,18 @@ def print_board(request: BoardRequest, tell: Tell) -> None:
     """
     out = request.out.with_suffix("") if request.out.suffix == ".pdf" else request.out
     pdf, yaml = out.with_name(f"{out.name}.pdf"), out.with_name(f"{out.name}.yaml")
-    try:
-        if request.kind == "box":
-            pages, words = _print_box(request, yaml)
-        elif request.kind == "plate":
-            pages, words = _print_plate(request, yaml)
-        else:
-            pages, words = _print_squares(request, yaml)
-    except CalibrationError as fault:
-        raise OptionError(str(fault)) from None
-    with writing(pdf):
-        pdf.write_bytes(pdf_bytes(pages, f"aqualvs {request.kind}"))
+    with Claim("board", [pdf, yaml], overwrite=request.overwrite):
+        try:
+            if request.kind == "box":
+                pages, words = _print_box(request, yaml)
+            elif request.kind == "plate":
+                pages, words = _print_plate(request, yaml)
+            else:
+                pages, words = _print_squares(request, yaml)
+        except CalibrationError as fault:
+            raise OptionError(str(fault)) from None
+        with writing(pdf):
+            pdf.write_bytes(pdf_bytes(pages, f"aqualvs {request.kind}"))
     n = len(pages)
     tell(f"pages: {pdf} ({n} page{'s' if n > 1 else ''}; print at 100 %, then measure the ruler)")
     tell(f"file: {yaml}")

@@ -18,6 +18,7 @@ from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.rigfile import check_rig_place
 from aqualvs.optics.solved import SolvedStep, with_step, with_uncertainty
 
 
@@ -41,6 +42,7 @@ def calibrate_camera(request: CameraRequest, tell: Tell) -> None:
     AqualvsError
         If a file, a picture or what they say cannot be used.
     """
+    check_rig_place(request.out)
     nominal = Nominal() if request.nominal is None else load_nominal(request.nominal)
     board = load_board(request.board)
     found = find_targets(

@@ -1,6 +1,5 @@
 """What all calibrations share: finding targets in pictures, keeping and writing the rig."""
 
-import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,7 +16,9 @@ from aqualvs.app.progress import progress
 from aqualvs.app.run_inputs import checked_index
 from aqualvs.calibration.view import View
 from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.live.sources.images import read_image
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_copies import keep_dated
 from aqualvs.optics.rigfile import save_rig
 
 Tell: TypeAlias = Callable[[str], object]
@@ -160,23 +161,28 @@ def medium_index(word: str | None, rig: Rig, default: float) -> float:
         ) from None
 
 
-def finish(rig: Rig, page: Page, out: Path, step: str, tell: Tell) -> None:
+def finish(
+    rig: Rig, page: Page, out: Path, step: str, tell: Tell, *, comments_of: Path | None = None
+) -> None:
     """Write the rig and the page of a calibration, and tell where they are.
+
+    A rig and a page that are there already are kept under dated names.
 
     Raises
     ------
     OutputError
-        If one cannot be written.
+        If one cannot be written, or `out` is a file but no rig.
     """
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        if out.exists():
-            before = out.with_suffix(f".before{out.suffix}")
-            shutil.copyfile(out, before)
-            tell(f"kept: {before}")
-    save_rig(rig, out)
+    copy = save_rig(rig, out, comments_of=comments_of)
+    if copy is not None:
+        tell(f"kept: {copy}")
     tell(f"rig: {out}")
-    tell(f"report: {write_page(page, out.with_suffix(f'.{step}.html'))}")
+    report = out.with_suffix(f".{step}.html")
+    if report.exists():
+        keep_dated(report)
+    tell(f"report: {write_page(page, report)}")
 
 
 def check_same_size(rig: Rig, found: Found) -> None:
@@ -196,14 +202,12 @@ def check_same_size(rig: Rig, found: Found) -> None:
 
 
 def _read(path: Path, how: int) -> Image:
-    level = cv2.utils.logging.setLogLevel(0)
-    try:
-        image = cv2.imread(str(path), how)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    image = read_image(path, how)
     if image is None:
-        raise CalibrationError(f"{path}: not a readable picture; remove or replace it")
-    return np.asarray(image, np.uint8)
+        raise CalibrationError(
+            f"{path}: not a readable picture, or too large; remove or replace it"
+        )
+    return image
 
 
 def _common_size(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:

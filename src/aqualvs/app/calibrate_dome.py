@@ -31,7 +31,7 @@ from aqualvs.errors import OptionError
 from aqualvs.optics.assumed import N_WATER, completed_uncertainty
 from aqualvs.optics.camera import DOME_PARAMETERS, POSE_PARAMETERS, Dome
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import (
     ASSUMED,
     SolvedStep,
@@ -83,6 +83,7 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
     AqualvsError
         If a file, a picture or what they say cannot be used.
     """
+    check_rig_place(request.out)
     rig = _with_dome(load_rig(request.rig, need_lasers=False), request)
     shots = _all_shots(request, rig)
     known = rig_uncertainty(rig)
@@ -94,7 +95,14 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
     solved = _noted(rig, result)
     for line in (*_summary(result, shots), *result.findings):
         tell(line)
-    finish(solved, _page(rig, solved, result, shots, request), request.out, "dome", tell)
+    finish(
+        solved,
+        _page(rig, solved, result, shots, request),
+        request.out,
+        "dome",
+        tell,
+        comments_of=request.rig,
+    )
 
 
 def _summary(result: DomeCalibration, shots: Sequence[_Shots]) -> list[str]:

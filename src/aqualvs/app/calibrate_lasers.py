@@ -48,7 +48,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.assumed import completed_uncertainty
 from aqualvs.optics.rig import Laser, Rig
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
 from aqualvs.optics.solved import (
     ASSUMED,
@@ -101,6 +101,7 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
     AqualvsError
         If a file, a picture or what they say cannot be used.
     """
+    check_rig_place(request.out)
     before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
     wavelength_nm = _wavelength(request, before)
     target = _target(request, before)
@@ -128,7 +129,14 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
         tell(f"note: {warning}")
     for figures, laser in zip(result.lasers, rig.lasers, strict=True):
         tell(_words(figures, laser))
-    finish(rig, _page(before, rig, result, target, views, request), request.out, "lasers", tell)
+    finish(
+        rig,
+        _page(before, rig, result, target, views, request),
+        request.out,
+        "lasers",
+        tell,
+        comments_of=request.rig,
+    )
 
 
 def _known(rig: Rig, request: LasersRequest, *, in_air: bool) -> RigUncertainty:

@@ -26,7 +26,7 @@ from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.live.sources import FrameSource, open_source
 from aqualvs.live.sources.images import IMAGE_SUFFIXES, ImageSource
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import (
     SolvedStep,
     merged,
@@ -63,6 +63,7 @@ def calibrate_water(request: WaterRequest, tell: Tell) -> None:
     AqualvsError
         If a file, a picture or what they say cannot be used.
     """
+    check_rig_place(request.out)
     rig = load_rig(request.rig, need_lasers=False)
     markers = load_target(request.target)
     prior = _prior(request, rig)
@@ -88,7 +89,14 @@ def calibrate_water(request: WaterRequest, tell: Tell) -> None:
     tell(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(shots)} pictures")
     for line in (*result.remarks, *map(step_words, result.steps)):
         tell(line)
-    finish(solved, _page(solved, result, prior, request), request.out, "water", tell)
+    finish(
+        solved,
+        _page(solved, result, prior, request),
+        request.out,
+        "water",
+        tell,
+        comments_of=request.rig,
+    )
 
 
 def index_options(place_sigma_mm: float, turn_sigma_deg: float) -> IndexOptions:

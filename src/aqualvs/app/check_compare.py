@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,15 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera_params import POSE_PARAMETERS
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.rig_copies import dated_copies
 from aqualvs.optics.rig_difference import RigDifference, rig_difference, same_lens_model
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.sheet import sheet_in
-from aqualvs.optics.solved import file_parameter_name, rig_uncertainty
+from aqualvs.optics.solved import file_parameter_name, rig_uncertainty, solved_steps
 from aqualvs.optics.uncertainty import LASER_PARAMETERS, RigUncertainty, tangent_basis
 
+# The steps of one calibration are done in a day's work, two calibrations days or months apart.
+_PAUSE = timedelta(hours=12)
 _WALL_M = 0.6
 # Changes that matter to a dive: about 0.1 % of range or 0.1 degrees.
 _LENS_M, _TURN, _FOCAL_SHARE, _CENTRE_PX = 5e-4, math.radians(0.1), 0.002, 2.0
@@ -73,6 +77,41 @@ class Part:
             return f"{self.name} {self.stayed} ({told})"
         hardly = "" if self.matters else ", too little to matter"
         return f"{self.name} {self.did} ({told}){hardly}"
+
+
+def last_calibration(path: Path) -> Path:
+    """Return the dated copy of a rig file as it was before its latest calibration.
+
+    Steps that follow one another within half a day are one calibration, of which every step leaves
+    a copy.
+
+    Raises
+    ------
+    RigError
+        If the rig notes no calibration, or no copy of an earlier one is kept beside it.
+    """
+    dates = {
+        name: step.date for name, step in solved_steps(load_rig(path, need_lasers=False)).items()
+    }
+    if not dates:
+        raise RigError(f"{path}: notes no date of a calibration; name an older rig file instead")
+    latest = set()
+    begun = max(dates.values())
+    for name, date in sorted(dates.items(), key=lambda one: one[1], reverse=True):
+        if begun - date <= _PAUSE:
+            latest.add((name, date))
+            begun = date
+    for copy in dated_copies(path):
+        try:
+            found = solved_steps(load_rig(copy, need_lasers=False))
+        except RigError:
+            continue
+        steps = {(name, step.date) for name, step in found.items()}
+        if steps and not steps & latest:
+            return copy
+    raise RigError(
+        f"{path}: no dated copy of an earlier calibration is kept beside it; name an older rig file"
+    )
 
 
 def run_compare(new: Path, old: Path, console: Console | None = None) -> int:

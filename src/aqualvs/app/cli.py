@@ -4,6 +4,8 @@ Bodies live in their own modules and are imported when their command runs, so th
 neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
 """
 
+import errno
+import functools
 import gc
 import os
 import sys
@@ -15,6 +17,7 @@ import typer
 from aqualvs import __version__
 from aqualvs.app.cli_batch import batch
 from aqualvs.app.cli_calibrate import board, calibrate
+from aqualvs.app.cli_command import CheckedCommand
 from aqualvs.app.cli_control import tune
 from aqualvs.app.cli_design import design
 from aqualvs.app.cli_follow import follow
@@ -23,6 +26,7 @@ from aqualvs.app.cli_net_change import net_change
 from aqualvs.app.cli_reproduce import reproduce
 from aqualvs.app.cli_run import check, demo, figures, net, report, run, simulate
 from aqualvs.app.cli_score import benchmark, score
+from aqualvs.app.standard_output import LenientStream, drop_output, lenient_output
 from aqualvs.errors import AqualvsError
 
 # Matrices here are small: threads of the linear algebra gain nothing, and where another process
@@ -40,93 +44,95 @@ app = typer.Typer(
     add_completion=False,
 )
 
+_command = functools.partial(app.command, cls=CheckedCommand)
 
-app.command(
+
+_command(
     help="Run the bundled dive and compare it with its truth.",
     epilog="Example: aqualvs demo -o out/demo",
 )(demo)
-app.command(
+_command(
     help="Measure a dive: range, pitch and yaw for every frame, all points, and a report. "
     "SOURCE is a video, a folder of images, an address (rtsp://, udp://, http://), or a recording "
     "(dive.mcap), which brings its own rig and options.",
     epilog="Example: aqualvs run dive.mp4 --rig rig.yaml -o out/dive",
 )(run)
-app.command(
+_command(
     help="Measure live: a stream, a camera or a file in real time, to pilot, autopilot, ROS, "
     "Foxglove and recording. Ctrl-C ends it.",
     epilog="Example: aqualvs live udp://0.0.0.0:5600 --rig rig.yaml --dashboard "
     "--mavlink udpout:192.168.2.2:14550",
 )(live)
-app.command(
+_command(
     help="Tell the state of a net: meshes, twine, fouling, holes, and a map. SOURCE is a dive "
     "(video or images, which is run into DIR first) or the folder of a run.",
     epilog="Example: aqualvs net out/dive --log vehicle.tlog",
 )(net)
-app.command(
+_command(
     "net-change",
     help="Compare a net between dates: how fouling grew and where, which holes are new, grown, "
     "gone, or were not passed. RUN is the folder of a run with the state of its net, or of a "
     "batch.",
     epilog="Example: aqualvs net-change out/2026-05-01 out/2026-05-22 -o out/change",
 )(net_change)
-app.command(
+_command(
     help="Measure many dives, on this machine or on many, each as aqualvs run does it; writes a "
     "summary and one Parquet data set. Run it again to go on after an interruption: what is "
     "finished is kept. Exit code 1 if a dive could not be finished.",
     epilog="Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026",
 )(batch)
-app.command(
+_command(
     help="Write the report of a run again. After a run that was killed, its points are completed "
     "first.",
     epilog="Example: aqualvs report out/dive --truth truth.csv",
 )(report)
-app.command(
+_command(
     help="Draw a run's reflections in a laser's plane, with what the filters take for net: "
     "pictures after figures 13 and 14 of the paper, and the filter's binary image.",
     epilog="Example: aqualvs figures out/dive -o out/figures",
 )(figures)
 app.add_typer(calibrate)
-app.command(
+_command(
     help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
     epilog="Example: aqualvs board charuco --paper a3 -o board",
 )(board)
-app.command(
+_command(
     help="Say in words whether a rig is sane and what it can measure.",
-    epilog="Example: aqualvs check rig.yaml --against rig.before.yaml",
+    epilog="Example: aqualvs check rig.yaml --against last",
 )(check)
-app.command(
+_command(
     help="Predict what a camera, a dome and lasers would measure, and tilt the lasers best. "
     "DESIGN is a file; options take the place of what it says, or of the example's numbers.",
     epilog="Example: aqualvs design --image 1920x1080 --fov-deg 69 --dome-mm 51:6 "
     "--baseline-mm 150 --lasers 3 --range-mm 300:1200 -o out/design",
 )(design)
-app.command(
+_command(
     help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
     "SCENARIO is a name from --list or a YAML file.",
     epilog="Example: aqualvs simulate net_diamond --camera webcam -o out/net",
 )(simulate)
-app.command(
+_command(
     help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",
     epilog="Example: aqualvs follow --sim -o out/follow",
 )(follow)
-app.command(
+_command(
     help="Make gains for a vehicle model, and say what margins they leave.",
     epilog="Example: aqualvs tune bluerov2_heavy -o gains.yaml",
 )(tune)
-app.command(
+_command(
     help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
     epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",
 )(doctor)
-app.command(
+_command(
     help="Repeat the paper's experiments in a simulated tank, each beside what the paper prints: "
     "figures, tables and one page, reproduce.html. Without a name, all of them.",
     epilog="Example: aqualvs reproduce distance angles -o out/reproduce",
 )(reproduce)
-app.command(
+_command(
     help="Render the public benchmark set: dives by difficulty, each with its truth and its rig.",
     epilog="Example: aqualvs benchmark sun fouled -o bench",
 )(benchmark)
-app.command(
+_command(
     help="Score what systems answered on a benchmark set, side by side: plain CSV in, scores out.",
     epilog="Example: aqualvs score mine=out/mine --truth bench --own out/own -o scores",
 )(score)
@@ -135,6 +141,7 @@ app.command(
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
+_EXIT_BROKEN_PIPE = 141
 
 
 @app.callback(invoke_without_command=True)
@@ -159,9 +166,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     exit_code : int
-        0, or 2 for bad input, or 128 + signal for a run that was stopped.
+        0, or 2 for bad input, or 128 + signal for a run that was stopped; 141 where all went well
+        but nobody read the output to its end.
     """
-    code = _exit_code(arguments)
+    with lenient_output() as output:
+        code = _exit_code(arguments)
+    code = _complete(code, output, ends=arguments is None)
     if arguments is None:
         # The process ends here. To look once more through all that was imported for what refers to
         # itself would take a third of a second.
@@ -177,6 +187,10 @@ def _exit_code(arguments: Sequence[str] | None) -> int:
         return _complain(str(fault), _EXIT_BAD_INPUT)
     except (KeyboardInterrupt, typer.Abort):
         return _complain("interrupted", _EXIT_INTERRUPTED)
+    except OSError as fault:
+        if fault.filename is None:
+            raise
+        return _complain(f"{os.fsdecode(fault.filename)}: {fault.strerror}", _EXIT_BAD_INPUT)
     except _USAGE_ERROR as fault:
         return _complain(f"{_usage(fault)}; see aqualvs --help", _EXIT_BAD_INPUT)
     return int(code or 0)
@@ -189,5 +203,19 @@ def _usage(fault: Exception) -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"aqualvs: error: {message}", file=sys.stderr)
+    # Names of files, and values in them, may hold line feeds and other control characters.
+    line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message)
+    print(f"aqualvs: error: {line}", file=sys.stderr)
     return code
+
+
+def _complete(code: int, output: LenientStream | None, *, ends: bool) -> int:
+    """Return the exit code with regard to whether the output was read."""
+    fault = None if output is None else output.fault
+    if fault is None:
+        return code
+    if ends:
+        drop_output()
+    if fault.errno == errno.EPIPE:
+        return code or _EXIT_BROKEN_PIPE
+    return _complain(f"standard output: cannot be written ({fault.strerror})", _EXIT_BAD_INPUT)

@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.app.cli_options import Celsius, Salinity
+from aqualvs.app.cli_command import CheckedCommand
+from aqualvs.app.cli_options import Celsius, Overwrite, Salinity
 
 calibrate = typer.Typer(
     name="calibrate",
@@ -28,7 +29,7 @@ RigOut = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="Rig file to write; a file that is there is kept as NAME.before.yaml.",
+        help="Rig file to write; one that is there is kept under a dated name.",
         show_default=False,
     ),
 ]
@@ -43,6 +44,7 @@ Medium = Annotated[
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Intrinsics of the camera, from a board in air, without the dome.",
     epilog="Example: aqualvs calibrate camera air/*.png --board board.yaml -o rig.yaml",
 )
@@ -82,6 +84,7 @@ def camera(
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Place of the lens in the dome, from a board outside it, in air, in water, or both. "
     "With poses (distance only, or full) the camera's rotation is found too.",
     epilog="Example: aqualvs calibrate dome rail/*.png --board board.yaml --poses poses.csv "
@@ -168,6 +171,7 @@ def dome(
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Laser planes, all lasers on at once, from a box of markers (--box), or from stripes on "
     "a plane that carries a board (--board).",
     epilog="Example: aqualvs calibrate lasers box/*.png --box box.yaml --rig rig.yaml -o rig.yaml",
@@ -230,6 +234,7 @@ def lasers(
 
 
 @calibrate.command(
+    cls=CheckedCommand,
     help="Refractive index of the water, from a target fixed on the vehicle. SOURCE is a video, "
     "pictures, or a folder of them.",
     epilog="Example: aqualvs calibrate water dive.mp4 --target target.yaml --rig rig.yaml "
@@ -324,6 +329,7 @@ def board(
         tuple[float, float, float],
         typer.Option(metavar="X Y Z", help="Rotation vector of the plate in the dome's frame."),
     ] = (0.0, 0.0, 0.0),
+    overwrite: Overwrite = False,
 ) -> None:
     """Print a target."""
     from aqualvs.app import board as body
@@ -345,6 +351,7 @@ def board(
             first_id=first_id,
             position_mm=position_mm,
             rotation_deg=rotation_deg,
+            overwrite=overwrite,
         ),
         typer.echo,
     )

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from aqualvs.app.cli_options import Overwrite
+
 
 def tune(
     model: Annotated[
@@ -14,6 +16,7 @@ def tune(
         Path | None,
         typer.Option("-o", "--output", help="Gains file; printed if left out.", show_default=False),
     ] = None,
+    overwrite: Overwrite = False,
     delay_ms: Annotated[
         float,
         typer.Option(help="Usual delay from the exposure to the vehicle. Less makes it faster."),
@@ -37,4 +40,7 @@ def tune(
         frame=1.0 / rate_hz,
         current=current,
     )
-    body.tune_and_tell(body.TuneRequest(model=model, output=output, options=options), typer.echo)
+    body.tune_and_tell(
+        body.TuneRequest(model=model, output=output, overwrite=overwrite, options=options),
+        typer.echo,
+    )

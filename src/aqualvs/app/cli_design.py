@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
+from aqualvs.app.cli_options import Overwrite
+
 
 def design(
     file: Annotated[
@@ -66,6 +68,7 @@ def design(
         bool, typer.Option("--tilt/--no-tilt", help="Look for the lasers' best angles.")
     ] = True,
     changes: Annotated[bool, typer.Option(help="Say which changes would help most.")] = True,
+    overwrite: Overwrite = False,
 ) -> None:
     """Predict what a design measures."""
     from aqualvs.app.design import command
@@ -97,6 +100,7 @@ def design(
         turn=turn,
         tilt=tilt,
         try_changes=changes,
+        overwrite=overwrite,
     )
     command.design_and_tell(request)
 

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from aqualvs.app.cli_options import MavlinkKey, MavlinkPeer, Overwrite, VehicleFileOption
+
 
 def follow(
     source: Annotated[
@@ -40,6 +42,9 @@ def follow(
         str | None,
         typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.", show_default=False),
     ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
     dashboard: Annotated[
         bool,
         typer.Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time."),
@@ -51,6 +56,16 @@ def follow(
         str | None,
         typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.", show_default=False),
     ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Vehicle: record from the start.")
+    ] = False,
+    record_to: Annotated[
+        Path | None,
+        typer.Option(help="Vehicle: folder of recordings; that of -o if left out."),
+    ] = None,
+    record_video: Annotated[
+        bool, typer.Option("--record-video", help="Vehicle: record the pictures too.")
+    ] = False,
     target: Annotated[
         str,
         typer.Option(
@@ -90,6 +105,7 @@ def follow(
     ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
     seed: Annotated[int, typer.Option(help="Sim: of waves and noise.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Hold a distance to a net, or follow it."""
     from aqualvs.app import follow as body
@@ -97,7 +113,7 @@ def follow(
 
     aim = body.Aim(plan=plan, range=hold_range, yaw=math.radians(yaw))
     if sim:
-        if source is not None or mavlink is not None:
+        if source is not None or any((mavlink, vehicle_file, mavlink_peer, mavlink_key)):
             raise OptionError("--sim: has no source and no --mavlink; leave them out")
         request = body.SimRequest(
             out=out,
@@ -117,6 +133,7 @@ def follow(
             seed=seed,
             dashboard=dashboard_address if dashboard else None,
             token=token,
+            overwrite=overwrite,
         )
         raise typer.Exit(body.simulate_and_tell(request, typer.echo))
     if source is None or rig is None or mavlink is None or gains is None:
@@ -124,18 +141,24 @@ def follow(
             "follow: give SOURCE, --rig, --mavlink and --gains for a vehicle, or --sim to try it"
         )
     from aqualvs.app.follow_vehicle import FollowRequest, follow_and_tell
+    from aqualvs.app.mavlink_options import vehicle_setup
     from aqualvs.app.run_inputs import Water, scanner_options
 
     dive = FollowRequest(
         source=source,
         rig=rig,
         mavlink=mavlink,
+        vehicle=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key),
         gains=gains,
         out=out,
         aim=aim,
         dashboard=dashboard_address if dashboard else None,
         token=token,
+        record=record,
+        record_to=record_to,
+        record_video=record_video,
         water=Water(n_water=water_n, temperature_c=None, salinity=None),
         scanner=scanner_options(target, "ridge", "none", "robust"),
+        overwrite=overwrite,
     )
     raise typer.Exit(follow_and_tell(dive, typer.echo))

@@ -5,7 +5,16 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.app.cli_options import Celsius, IndexTarget, Salinity, Target, WaterIndex
+from aqualvs.app.cli_options import (
+    Celsius,
+    IndexTarget,
+    MavlinkKey,
+    MavlinkPeer,
+    Salinity,
+    Target,
+    VehicleFileOption,
+    WaterIndex,
+)
 
 
 def live(
@@ -17,6 +26,9 @@ def live(
         list[str] | None,
         typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
     ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
     json: Annotated[
         list[str] | None, typer.Option(help="Send lines of JSON by UDP to HOST:PORT; repeatable.")
     ] = None,
@@ -83,6 +95,7 @@ def live(
     """Measure live."""
     from aqualvs.app import live as body
     from aqualvs.app.live_outputs import OutputRequest
+    from aqualvs.app.mavlink_options import vehicle_setup
     from aqualvs.app.run_inputs import Water, scanner_options
 
     request = body.LiveRequest(
@@ -91,6 +104,7 @@ def live(
         feed=body.FeedRequest(fps=fps, size=size, pixel_format=pixel_format, transport=transport),
         outputs=OutputRequest(
             mavlink=tuple(mavlink or ()),
+            link=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key).link,
             json=tuple(json or ()),
             ros2=ros2,
             ros1=ros1,
@@ -120,8 +134,14 @@ def doctor(
     mavlink: Annotated[
         str | None, typer.Option(help="Autopilot to listen for.", show_default=False)
     ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
 ) -> None:
     """Look at the machine."""
     from aqualvs.app.doctor import DoctorRequest, run_doctor
+    from aqualvs.app.mavlink_options import vehicle_setup
 
-    raise typer.Exit(run_doctor(DoctorRequest(source=source, rig=rig, mavlink=mavlink)))
+    setup = vehicle_setup(vehicle_file, mavlink_peer, mavlink_key)
+    request = DoctorRequest(source=source, rig=rig, mavlink=mavlink, vehicle=setup)
+    raise typer.Exit(run_doctor(request))

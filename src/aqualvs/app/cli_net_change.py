@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from aqualvs.app.cli_options import Overwrite
+
 
 def net_change(
     runs: Annotated[
@@ -26,7 +28,7 @@ def net_change(
         ),
     ] = None,
     cell_m: Annotated[float, typer.Option(help="Side of the map's cells.")] = 1.0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare a net between dates."""
     from aqualvs.app.net_change import command as body

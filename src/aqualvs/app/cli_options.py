@@ -9,6 +9,9 @@ import typer
 OutFolder = Annotated[
     Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
 ]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what this command wrote there before.")
+]
 Target = Annotated[
     str,
     typer.Option(metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."),
@@ -41,6 +44,31 @@ IndexTarget = Annotated[
     Path | None,
     typer.Option(
         help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
+        show_default=False,
+    ),
+]
+VehicleFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--vehicle-file",
+        metavar="FILE",
+        help="MAVLink: system ids, ground station, modes, peers, key (YAML; docs/ardusub.md).",
+        show_default=False,
+    ),
+]
+MavlinkPeer = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="MAVLink, listening: hear nobody else, such as 192.168.2.2 or 192.168.2.0/24; "
+        "repeatable.",
+    ),
+]
+MavlinkKey = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="MAVLink: sign, and hear nobody without this key; a passphrase or 64 hex digits.",
         show_default=False,
     ),
 ]

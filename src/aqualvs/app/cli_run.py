@@ -15,6 +15,7 @@ from aqualvs.app.cli_options import (
     IndexTarget,
     MeshFilter,
     OutFolder,
+    Overwrite,
     Refraction,
     Salinity,
     Target,
@@ -32,9 +33,7 @@ def run(
         Path | None,
         typer.Option("--rig", help="Rig file; a recording has its own.", show_default=False),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a run that is there.")
-    ] = False,
+    overwrite: Overwrite = False,
     target: Target = "auto",
     detector: Detector = "ridge",
     mesh_filter: MeshFilter = "none",
@@ -138,7 +137,7 @@ def net(
         typer.Option(help="Diameter of the bare twine, where it is known.", show_default=False),
     ] = None,
     stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Tell the state of a net."""
     from aqualvs.app import net as body
@@ -167,11 +166,14 @@ def figures(
             show_default=False,
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw a run's reflections."""
     from aqualvs.app import figures as body
 
-    body.figures(folder, out, typer.echo, frame=frame, laser=laser, target=target)
+    body.figures(
+        folder, out, typer.echo, frame=frame, laser=laser, target=target, overwrite=overwrite
+    )
 
 
 def report(
@@ -181,12 +183,14 @@ def report(
     ] = None,
 ) -> None:
     """Write a report again."""
-    from aqualvs.app.outputs import recover
+    from aqualvs.app.outputs import REPORT_HTML, claim_run, recover
     from aqualvs.app.report import write_report
 
     if recover(folder):
         typer.echo(f"{folder}: points completed from the journal of a run that was killed")
-    typer.echo(f"report: {write_report(folder, truth=truth)}")
+    # To write it again is what the command is for.
+    with claim_run(folder, [REPORT_HTML], overwrite=True):
+        typer.echo(f"report: {write_report(folder, truth=truth)}")
 
 
 def simulate(
@@ -202,9 +206,7 @@ def simulate(
     camera: Annotated[
         str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
     ] = "ideal",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a dive that is there.")
-    ] = False,
+    overwrite: Overwrite = False,
     list_: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
 ) -> None:
     """Render a dive."""
@@ -218,25 +220,31 @@ def simulate(
 
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out/demo"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Run the bundled dive."""
     from aqualvs.app import demo as body
 
-    raise typer.Exit(body.demo(out, typer.echo))
+    raise typer.Exit(body.demo(out, typer.echo, overwrite=overwrite))
 
 
 def check(
     rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")],
     against: Annotated[
         Path | None,
-        typer.Option(help="Older rig file: say what has moved since.", show_default=False),
+        typer.Option(
+            metavar="last|FILE",
+            help="Say what has moved since the last calibration, or an older rig file.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Check a rig."""
     if against is not None:
-        from aqualvs.app.check_compare import run_compare
+        from aqualvs.app.check_compare import last_calibration, run_compare
 
-        raise typer.Exit(run_compare(rig, against))
+        is_word = str(against) == "last" and not against.exists()
+        raise typer.Exit(run_compare(rig, last_calibration(rig) if is_word else against))
     from aqualvs.app.check import run_check
 
     raise typer.Exit(run_check(rig))

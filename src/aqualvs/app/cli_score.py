@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from aqualvs.app.cli_options import Overwrite
+
 
 def benchmark(
     names: Annotated[
@@ -22,9 +24,7 @@ def benchmark(
         int | None,
         typer.Option(help="Frames of every dive, for a quick look.", show_default=False),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a set that is there.")
-    ] = False,
+    overwrite: Overwrite = False,
     list_: Annotated[bool, typer.Option("--list", help="List levels and dives and exit.")] = False,
 ) -> None:
     """Render the benchmark set."""
@@ -66,8 +66,11 @@ def score(
         ),
     ] = None,
     dives: Annotated[bool, typer.Option("--dives", help="Show every dive in the table.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Score systems."""
     from aqualvs.app import score as body
 
-    body.score_and_tell(results or [], truth, typer.echo, own=own, out=out, dives=dives)
+    body.score_and_tell(
+        results or [], truth, typer.echo, own=own, out=out, dives=dives, overwrite=overwrite
+    )

@@ -11,15 +11,17 @@ from aqualvs.errors import SourceError
 _FILES = ("dive.mp4", "rig.yaml", "truth.csv")
 
 
-def demo(out: Path, tell: Callable[[str], object]) -> int:
+def demo(out: Path, tell: Callable[[str], object], *, overwrite: bool = False) -> int:
     """Run the bundled dive, tell posture and error, and return the exit code.
 
     Parameters
     ----------
     out : Path
-        Folder to write; a run that is already there is replaced.
+        Folder to write.
     tell : callable
         Takes one line of text.
+    overwrite : bool
+        Whether to replace a run that is already there.
 
     Raises
     ------
@@ -28,7 +30,7 @@ def demo(out: Path, tell: Callable[[str], object]) -> int:
     """
     with importlib.resources.as_file(bundled_dive()) as folder:
         dive, rig, truth = (_present(folder / name) for name in _FILES)
-        request = RunRequest(source=str(dive), rig=rig, truth=truth, out=out, overwrite=True)
+        request = RunRequest(source=str(dive), rig=rig, truth=truth, out=out, overwrite=overwrite)
         return run_and_tell(request, tell)
 
 

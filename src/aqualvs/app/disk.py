@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +33,22 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as fault:
         raise OutputError(explain(path, fault)) from fault
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all: the old one stays until the new one is complete.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    draft = path.with_name(path.name + ".part")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def explain(path: Path, fault: OSError) -> str:

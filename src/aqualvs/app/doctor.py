@@ -9,7 +9,7 @@ import shutil
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -17,8 +17,10 @@ from rich.console import Console
 from aqualvs import __version__
 from aqualvs.app.check_finding import Finding, Severity, findings_table
 from aqualvs.app.demo import bundled_dive
+from aqualvs.app.doctor_autopilot import autopilot
 from aqualvs.errors import AqualvsError
 from aqualvs.live.sources import open_source
+from aqualvs.live.vehicle_file import VehicleSetup
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner
@@ -37,7 +39,7 @@ _EXTRAS = {
 
 _N_FRAMES, _FRAME_RATE = 40, 25.0
 _LEAST_FREE_GB = 2.0
-_STREAM_S, _HEARTBEAT_S = 8.0, 6.0
+_STREAM_S = 8.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,11 +54,14 @@ class DoctorRequest:
         Rig that the pictures should fit.
     mavlink : str or None
         Address of an autopilot.
+    vehicle : VehicleSetup
+        Who is to be there, and how it is to be steered.
     """
 
     source: str | None = None
     rig: Path | None = None
     mavlink: str | None = None
+    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
 
 def run_doctor(request: DoctorRequest, console: Console | None = None) -> int:
@@ -73,7 +78,7 @@ def run_doctor(request: DoctorRequest, console: Console | None = None) -> int:
     if request.source is not None:
         looks.append(lambda: _stream(str(request.source), request.rig))
     if request.mavlink is not None:
-        looks.append(lambda: _autopilot(str(request.mavlink)))
+        looks.append(lambda: autopilot(str(request.mavlink), request.vehicle, request.rig))
     worst = Severity.OK
     for look in looks:
         found = list(_guarded(look))
@@ -216,25 +221,3 @@ def _fit(rig: Rig, frames: list[Frame]) -> Finding:
         reason = scanner.process(frames[-1]).posture
         return Finding(Severity.WARN, f"{words}: {getattr(reason, 'detail', '')}")
     return Finding(Severity.OK, words)
-
-
-def _autopilot(address: str) -> Iterator[Finding]:
-    """Wait for the heartbeat of an autopilot."""
-    from aqualvs.live.mavlink_link import MavlinkLink
-
-    link = MavlinkLink(address)
-    try:
-        end = time.monotonic() + _HEARTBEAT_S
-        while link.autopilot() is None and time.monotonic() < end:
-            time.sleep(0.05)
-        heard, health = link.autopilot(), link.health()
-    finally:
-        link.close()
-    if heard is None:
-        yield Finding(
-            Severity.BAD,
-            f"{address}: no heartbeat of an autopilot in {_HEARTBEAT_S:.0f} s ({health.detail}); "
-            "add this machine as an endpoint in BlueOS, or check address and port",
-        )
-    else:
-        yield Finding(Severity.OK, f"{address}: {health.detail}")

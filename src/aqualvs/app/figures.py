@@ -9,8 +9,9 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from aqualvs.app.disk import writing
-from aqualvs.app.net_figures import Reflections, draw_figures
+from aqualvs.app.net_figures import FIGURES, Reflections, draw_figures
 from aqualvs.app.outputs import POINTS_PARQUET
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.report_rig import LaserFacts, lasers_of, working_range_m
 from aqualvs.app.report_run import read_run_file
 from aqualvs.app.target_file import target_facts
@@ -58,6 +59,7 @@ def figures(
     frame: int | None = None,
     laser: str | None = None,
     target: Path | None = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Draw figures 13 and 14 of the paper, and its laser-plane image, from a run's folder.
 
@@ -78,6 +80,8 @@ def figures(
         Name of the laser, likewise.
     target : Path, optional
         Target file with the parameters of the paper's filter; those of the run if left out.
+    overwrite : bool
+        Whether to replace pictures that this command wrote there before.
 
     Returns
     -------
@@ -112,8 +116,8 @@ def figures(
         reflections = max(shown, key=_worth)
     except (pa.ArrowInvalid, OSError, KeyError) as fault:
         raise SourceError(f"{points}: cannot be read ({_line(fault)}); run again") from fault
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
+    files = [out / f"{name}.png" for name in FIGURES]
+    with Claim("figures", files, overwrite=overwrite), writing(out):
         written = draw_figures(reflections, options, out)
     for line in _summary(reflections):
         tell(line)

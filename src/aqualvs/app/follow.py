@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from aqualvs.app.disk import writing
 from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_figures import FIGURE_FILES
 from aqualvs.app.follow_rendered import RenderedEye
-from aqualvs.app.follow_report import RunFacts, summary_lines, write_report
+from aqualvs.app.follow_report import PAGE, RunFacts, summary_lines, write_report
 from aqualvs.app.follow_sim import Eye, SimulatedLoop, Timing
 from aqualvs.app.follow_sim_case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.app.follow_sim_log import write_log
 from aqualvs.app.follow_sim_page import LoopPage
 from aqualvs.app.follow_sim_watch import RunWatch
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.follow_log import FollowLog
@@ -109,6 +110,8 @@ class SimRequest:
         Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
     token : str or None
         Its password.
+    overwrite : bool
+        Whether to replace what this command wrote to `out` before.
     """
 
     out: Path
@@ -128,6 +131,7 @@ class SimRequest:
     seed: int = 0
     dashboard: str | None = None
     token: str | None = None
+    overwrite: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what cannot be simulated.
@@ -167,8 +171,8 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     rig = example_rig()
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     case = _case(request, limits, setpoint)
-    with writing(request.out):
-        request.out.mkdir(parents=True, exist_ok=True)
+    files = [request.out / name for name in (FOLLOW_CSV, TRUTH_CSV, PAGE, *FIGURE_FILES)]
+    claim = Claim("follow", files, overwrite=request.overwrite)
     rng = np.random.default_rng([request.seed, 53])
     eye: Eye = SampledEye(case.net, rng, working_range=rig.working_range)
     if request.rendered:
@@ -192,6 +196,7 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
         fps=request.fps,
     )
     report = write_report(loop.log, facts, request.out)
+    claim.settle()
     for line in summary_lines(loop.log, facts):
         tell(line)
     tell(f"written: {report}")

@@ -36,6 +36,9 @@ _STYLE: dict[Any, Any] = {
 _LEAST_DEPTH, _LEAST_RANGE, _LEAST_ANGLE = 0.2, 0.1, 6.0
 
 
+FIGURE_FILES = ("figure_22.png", "figure_23.png")
+
+
 def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
     """Write `figure_22.png` and `figure_23.png`.
 

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from aqualvs.app.disk import writing
+from aqualvs.app.disk import replace_text, writing
 from aqualvs.app.follow_figures import draw_follow_figures
 from aqualvs.app.follow_sim_log import LoopLog
 from aqualvs.app.follow_sim_measures import hold_measures, safety_measures
@@ -82,7 +82,7 @@ def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
         figures = draw_follow_figures(log, out)
     path = out / PAGE
     with writing(path):
-        path.write_text(_page(log, facts, [figure.name for figure in figures]), encoding="utf-8")
+        replace_text(path, _page(log, facts, [figure.name for figure in figures]))
     return path
 
 

@@ -1,5 +1,6 @@
 """`aqualvs follow SOURCE`: hold and follow with a real vehicle."""
 
+import contextlib
 import sys
 import threading
 from collections.abc import Callable
@@ -10,8 +11,9 @@ from typing import TextIO
 
 from aqualvs.app.follow import FOLLOW_CSV, Aim
 from aqualvs.app.follow_vehicle_log import FollowLogOutput
-from aqualvs.app.live import SWITCH_S, FeedRequest
+from aqualvs.app.live import SWITCH_S, FeedRequest, recorder_options
 from aqualvs.app.live_console import Console
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.stopping import StopSignals
@@ -22,10 +24,14 @@ from aqualvs.control.safety import SafetyGate
 from aqualvs.control.setpoint import SetpointHolder
 from aqualvs.errors import AqualvsError
 from aqualvs.live.ardusub_link import ArduSubLink
+from aqualvs.live.mavlink_link import MavlinkLink
 from aqualvs.live.outputs.base import Output
+from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.pilot import Pilot
+from aqualvs.live.recorder import RecorderSwitch
 from aqualvs.live.runner import FixedScanner, LiveRunner
 from aqualvs.live.time_filter import PostureFilter
+from aqualvs.live.vehicle_file import VehicleSetup
 from aqualvs.live.warm_up import warm_up
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 
@@ -41,6 +47,8 @@ class FollowRequest:
     rig : Path
     mavlink : str
         Address of the vehicle.
+    vehicle : VehicleSetup
+        Who is there, and how it is steered.
     gains : str
         Gains file, or the name of a vehicle whose gains come with the package.
     out : Path
@@ -51,6 +59,11 @@ class FollowRequest:
         Address HOST:PORT of the pilot's page.
     token : str or None
         Its password.
+    record : bool
+        Whether to record from the start; the page's button begins and ends recordings, too.
+    record_to : Path or None
+        Folder of recordings; `out` if left out.
+    record_video : bool
     water : Water
     scanner : ScannerOptions
     """
@@ -61,11 +74,16 @@ class FollowRequest:
     gains: str
     out: Path
     aim: Aim
+    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
     feed: FeedRequest = field(default_factory=FeedRequest)
     dashboard: str | None = None
     token: str | None = None
+    record: bool = False
+    record_to: Path | None = None
+    record_video: bool = False
     water: Water = field(default_factory=Water)
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    overwrite: bool = False
 
 
 def follow_and_tell(
@@ -80,6 +98,7 @@ def follow_and_tell(
     AqualvsError
         If an input cannot be used, or the source can never work.
     """
+    claim = Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite)
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)
@@ -87,26 +106,51 @@ def follow_and_tell(
     steering = NetPilot(mission, RangeYawController(load_gains(request.gains)), SafetyGate(limits))
     scanner = Scanner(rig, request.scanner)
     warm_up(scanner)
-    feed = request.feed.opened(request.source, realtime=True)
-    sys.setswitchinterval(SWITCH_S)
-    with ExitStack() as undo:
-        undo.callback(feed.close)
-        pilot = Pilot(steering, ArduSubLink(request.mavlink), holder)
-        undo.callback(pilot.close)
-        outputs: list[Output] = [pilot, FollowLogOutput(request.out / FOLLOW_CSV, pilot)]
-        undo.callback(outputs[1].close)
-        outputs.append(Console())
-        if request.dashboard is not None:
-            outputs.append(serve_page(request.dashboard, request.token, rig, holder, None, tell))
-        runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
-        undo.pop_all()
-    tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
-    listen(pilot, sys.stdin if keys is None else keys, tell)
-    with StopSignals() as stop:
-        fault = runner.run(lambda: stop.caught is not None)
+    with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
+        pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
+        runner = _runner(request, scanner, link, pilot, holder, tell)
+        tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
+        listen(pilot, sys.stdin if keys is None else keys, tell)
+        with StopSignals() as stop:
+            fault = runner.run(lambda: stop.caught is not None)
+    claim.settle()
     if fault is not None:
         raise fault
     return 0
+
+
+def _runner(
+    request: FollowRequest,
+    scanner: Scanner,
+    link: MavlinkLink,
+    pilot: Pilot,
+    holder: SetpointHolder,
+    tell: Callable[[str], object],
+) -> LiveRunner:
+    """Make the live loop; what was made before a part that fails is closed."""
+    sys.setswitchinterval(SWITCH_S)
+    with ExitStack() as undo:
+        undo.callback(pilot.close)
+        feed = request.feed.opened(request.source, realtime=True)
+        undo.callback(feed.close)
+        # The pilot first: what others do must not hold an effort up.
+        outputs: list[Output] = [pilot, MavlinkOutput(link)]
+        outputs.append(FollowLogOutput(request.out / FOLLOW_CSV, pilot))
+        undo.callback(outputs[-1].close)
+        recorder = RecorderSwitch(
+            request.out if request.record_to is None else request.record_to,
+            recorder_options(request.scanner, video=request.record_video),
+        )
+        undo.callback(recorder.close)
+        outputs += [recorder, Console()]
+        if request.record:
+            tell(f"recording: {recorder.start()}")
+        if request.dashboard is not None:
+            page = serve_page(request.dashboard, request.token, scanner.rig, holder, recorder, tell)
+            outputs.append(page)
+        runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
+        undo.pop_all()
+    return runner
 
 
 def listen(pilot: Pilot, keys: TextIO, tell: Callable[[str], object]) -> threading.Thread:

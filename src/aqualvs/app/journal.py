@@ -46,6 +46,8 @@ class PointsJournal:
     ----------
     path : Path
         Written anew.
+    exclusive : bool
+        As for `AppendFile`.
 
     Raises
     ------
@@ -53,8 +55,8 @@ class PointsJournal:
         From the constructor and from `write`, as the system says it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = AppendFile(path)
+    def __init__(self, path: Path, *, exclusive: bool = False) -> None:
+        self._file = AppendFile(path, exclusive=exclusive)
         self._file.lock()
         self._waiting = io.BytesIO()
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._waiting, "w"), POINTS_SCHEMA)

@@ -155,7 +155,8 @@ def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
 
 def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> list[Output]:
     """Make all outputs; those made before one that fails are closed."""
-    recorder = RecorderSwitch(request.record_to, _recorder_options(request))
+    options = recorder_options(request.scanner, video=request.record_video)
+    recorder = RecorderSwitch(request.record_to, options)
     with ExitStack() as made:
         outputs: list[Output] = [recorder, Console()]
         made.callback(recorder.close)
@@ -173,9 +174,9 @@ def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> l
     return outputs
 
 
-def _recorder_options(request: LiveRequest) -> RecorderOptions:
-    pictures = PictureFormat.JPEG if request.record_video else None
-    return RecorderOptions(pictures=pictures, scanner=request.scanner)
+def recorder_options(scanner: ScannerOptions, *, video: bool) -> RecorderOptions:
+    """Return what recordings hold: with `video` the pictures, too."""
+    return RecorderOptions(pictures=PictureFormat.JPEG if video else None, scanner=scanner)
 
 
 def _supply(request: LiveRequest, rig: Rig) -> ScannerSupply:

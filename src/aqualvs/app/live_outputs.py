@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from aqualvs.errors import OptionError
+from aqualvs.live.mavlink_link import LinkOptions
 from aqualvs.live.outputs.base import Output
 
 FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
@@ -19,6 +20,8 @@ class OutputRequest:
     ----------
     mavlink, json : tuple of str
         Addresses; one output for each.
+    link : LinkOptions
+        Of every MAVLink connection.
     ros2, ros1 : bool
     foxglove : str or None
         Address HOST:PORT to listen on.
@@ -26,6 +29,7 @@ class OutputRequest:
 
     mavlink: tuple[str, ...] = ()
     json: tuple[str, ...] = ()
+    link: LinkOptions = field(default_factory=LinkOptions)
     ros2: bool = False
     ros1: bool = False
     foxglove: str | None = None
@@ -40,7 +44,9 @@ def make_outputs(request: OutputRequest) -> list[Output]:
         If an address cannot be understood, or the extra that an output needs is not installed; the
         outputs made before it are closed.
     """
-    makers: list[Callable[[], Output]] = [partial(_mavlink, url) for url in request.mavlink]
+    makers: list[Callable[[], Output]] = [
+        partial(_mavlink, url, request.link) for url in request.mavlink
+    ]
     if request.json:
         makers.append(partial(_json, request.json))
     if request.ros2:
@@ -72,10 +78,10 @@ def host_and_port(text: str, default_port: int, option: str) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", int(port) if port else default_port
 
 
-def _mavlink(url: str) -> Output:
+def _mavlink(url: str, options: LinkOptions) -> Output:
     from aqualvs.live.outputs.mavlink import MavlinkOutput
 
-    return MavlinkOutput(url)
+    return MavlinkOutput(url, options)
 
 
 def _json(receivers: tuple[str, ...]) -> Output:

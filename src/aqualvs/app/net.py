@@ -5,9 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from aqualvs.app.disk import writing
 from aqualvs.app.net_pass import NetPass
 from aqualvs.app.net_request import NetRequest
 from aqualvs.app.outputs import (
@@ -16,15 +13,17 @@ from aqualvs.app.outputs import (
     POSTURE_CSV,
     REPORT_HTML,
     RUN_YAML,
+    claim_run,
     recover,
 )
 from aqualvs.app.progress import progress
 from aqualvs.app.report import write_report
 from aqualvs.app.run import RunRequest, run_and_tell
 from aqualvs.app.run_inputs import scanner_options
+from aqualvs.app.runfile import read_run_yaml
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.stored_scans import check_stored, stored_scans
-from aqualvs.errors import OptionError, OutputError, SourceError
+from aqualvs.errors import OptionError, SourceError
 from aqualvs.optics.rigfile import rig_from_mapping
 
 
@@ -104,7 +103,7 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
         tell(f"{run_folder}: points completed from the journal of a run that was killed")
     stored = StoredDive(run_folder)
     net = stored.net_pass(request)
-    _prepare(folder, overwrite=place.overwrite)
+    claim = claim_run(folder, NET_FILES, overwrite=place.overwrite)
     with StopSignals() as stop, progress(str(run_folder), stored.n_frames) as tick:
         for scan in stored_scans(run_folder):
             net.add(scan)
@@ -112,12 +111,15 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
             if stop.caught:
                 break
     result = net.write(folder, stored.video)
+    claim.settle()
     for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
         tell(line)
     if stop.caught:
         tell(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
     if folder == run_folder and (run_folder / REPORT_HTML).exists():
-        tell(f"report: {write_report(run_folder)}")
+        # The run's own page, brought up to date.
+        with claim_run(folder, [REPORT_HTML], overwrite=True):
+            tell(f"report: {write_report(run_folder)}")
     return stop.exit_code
 
 
@@ -165,25 +167,8 @@ class StoredDive:
         return NetPass(rig, request)
 
 
-def _prepare(folder: Path, *, overwrite: bool) -> None:
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        found = [folder / name for name in NET_FILES if (folder / name).exists()]
-        if found and not overwrite:
-            raise OutputError(
-                f"{folder}: already holds the state of a net ({found[0].name}); choose another "
-                "folder or add --overwrite"
-            )
-
-
 def _run_file(run_folder: Path) -> dict[str, Any]:
-    path = run_folder / RUN_YAML
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as fault:
-        raise SourceError(
-            f"{path}: cannot be read, and the rig with it; run the dive again"
-        ) from fault
-    if not isinstance(content, dict) or not isinstance(content.get("rig"), dict):
-        raise SourceError(f"{path}: holds no rig; run the dive again")
+    content = read_run_yaml(run_folder)
+    if not isinstance(content.get("rig"), dict):
+        raise SourceError(f"{run_folder / RUN_YAML}: holds no rig; run the dive again")
     return content

@@ -73,6 +73,10 @@ class Reflections:
         return "bright pixels" if self.every_pixel else "reflections"
 
 
+FIGURES = ("figure_13", "figure_14", "laser_plane_image")
+"""Names of the pictures."""
+
+
 def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path) -> list[Path]:
     """Write `figure_13.png`, `figure_14.png` and `laser_plane_image.png`.
 

@@ -12,7 +12,7 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.rig import Laser
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.rigschema import LaserWavelength
-from aqualvs.optics.rigtext import read_yaml
+from aqualvs.yamlfile import read_yaml
 
 WATER_N = 1.3340
 """Index assumed until something better is known: fresh water of 15 °C under green light."""
@@ -91,7 +91,7 @@ def load_nominal(path: Path) -> Nominal:
     RigError
         One line that names the file, the place in it, the value and the remedy.
     """
-    content = read_yaml(path)
+    content = read_yaml(path, "a nominal rig or a rig file", RigError)
     if not isinstance(content, Mapping):
         raise RigError(f"{path}: is not a nominal rig; write keys such as 'dome: ...'")
     return _of_rig_file(path) if "aqualvs_rig" in content else _of_mapping(content, path)

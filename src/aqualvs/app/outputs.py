@@ -13,20 +13,20 @@ The report, the state of a net and the overlay video are written beside them by 
 """
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import yaml
-
+from aqualvs.app.append_file import locked_folder
 from aqualvs.app.disk import explain, writing
 from aqualvs.app.journal import PointsJournal, check_idle
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.points_export import DRAFT, PointsExport, export_points
 from aqualvs.app.posture_csv import PostureCsv
-from aqualvs.app.runfile import RunFile, Status, now, write_yaml
+from aqualvs.app.runfile import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.app.tally import Tally, tally_of
-from aqualvs.errors import OutputError
+from aqualvs.errors import OutputError, SourceError
 from aqualvs.scanning.scan import Scan
 
 POSTURE_CSV = "posture.csv"
@@ -36,6 +36,7 @@ POINTS_PARQUET = "points.parquet"
 POINTS_PLY = "points.ply"
 RUN_YAML = "run.yaml"
 OVERLAY_MP4 = "overlay.mp4"
+DIVE_MCAP = "dive.mcap"
 REPORT_HTML = "report.html"
 NET_CSV = "net.csv"
 HOLES_CSV = "holes.csv"
@@ -54,6 +55,7 @@ RUN_FILES = (
     POINTS_PARQUET + DRAFT,
     POINTS_PLY + DRAFT,
     OVERLAY_MP4,
+    DIVE_MCAP,
     REPORT_HTML,
     *NET_FILES,
 )
@@ -98,9 +100,10 @@ class RunOutputs:
         self.tally = Tally()
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
+            # First of all: of two runs that begin at the same moment, one gets no further.
+            self._points = stack.enter_context(_new_journal(folder))
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
-            self._points = stack.enter_context(PointsJournal(folder / JOURNAL))
             self._export: PointsExport | None = PointsExport(
                 folder / POINTS_PARQUET, folder / POINTS_PLY
             )
@@ -170,8 +173,8 @@ class RunOutputs:
         return self.tally.facts()
 
 
-def prepare_folder(folder: Path, *, overwrite: bool) -> None:
-    """Make sure that a run can be written to `folder`.
+def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
+    """Make sure that a run can be written to `folder`, and remove the one that it replaces.
 
     Parameters
     ----------
@@ -180,23 +183,45 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> None:
     overwrite : bool
         Whether to remove the files of a run that is already there (`RUN_FILES`, no others).
 
+    Returns
+    -------
+    claim : Claim
+        To be settled when the folder is complete.
+
     Raises
     ------
     OutputError
-        If the folder holds a run and `overwrite` is not set, if another process is writing to it,
-        or if it cannot be written.
+        If the folder holds a run and `overwrite` is not set, or files under a run's names that are
+        none of a run's, if another process is writing to it, or if it cannot be written.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        found = [folder / name for name in RUN_FILES if (folder / name).exists()]
-        check_idle(folder / JOURNAL)
-        if found and not overwrite:
-            raise OutputError(
-                f"{folder}: already holds a run ({found[0].name}); "
-                "choose another folder or add --overwrite"
-            )
-        for path in found:
-            path.unlink()
+        with locked_folder(folder):
+            check_idle(folder / JOURNAL)
+            claim = claim_run(folder, RUN_FILES, overwrite=overwrite)
+            for path in claim.found:
+                path.unlink()
+    return claim
+
+
+def claim_run(folder: Path, names: Sequence[str], *, overwrite: bool) -> Claim:
+    """Return a claim on files of a run's folder, which all commands share that write to it.
+
+    Raises
+    ------
+    OutputError
+        As `Claim` does.
+    """
+    paths = [folder / name for name in names]
+    known = [folder / name for name in RUN_FILES] if _is_run(folder) else []
+    return Claim("run", paths, overwrite=overwrite, known=known)
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        return {"status", "source", "versions"} <= read_run_yaml(folder).keys()
+    except SourceError:
+        return False
 
 
 def recover(folder: Path) -> bool:
@@ -225,6 +250,23 @@ def recover(folder: Path) -> bool:
     return True
 
 
+def _new_journal(folder: Path) -> PointsJournal:
+    """Begin the journal of a run.
+
+    Raises
+    ------
+    OutputError
+        If another run has begun one since `prepare_folder`.
+    """
+    try:
+        with locked_folder(folder):
+            return PointsJournal(folder / JOURNAL, exclusive=True)
+    except FileExistsError:
+        raise OutputError(
+            f"{folder}: another run has just begun here; choose another folder"
+        ) from None
+
+
 def _export_journal(folder: Path) -> None:
     export_points(folder / JOURNAL, folder / POINTS_PARQUET, folder / POINTS_PLY)
 
@@ -233,10 +275,10 @@ def _mend_run_file(folder: Path) -> None:
     """Replace the status of a run that could not say how it ended."""
     path = folder / RUN_YAML
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError):
+        content = read_run_yaml(folder)
+    except SourceError:
         return
-    if not isinstance(content, dict) or content.get("status") != Status.RUNNING:
+    if content.get("status") != Status.RUNNING:
         return
     known = {"status", "started", "ended", "error", "summary"}
     head = {

@@ -7,6 +7,7 @@ from plotly.offline import get_plotlyjs
 
 from aqualvs.app import report_charts as charts
 from aqualvs.app import report_html as html
+from aqualvs.app.disk import replace_text
 from aqualvs.app.net_report import net_cards, net_view
 from aqualvs.app.report_findings import headline
 from aqualvs.app.report_material import Material, gather
@@ -44,7 +45,7 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
     text = html.page(_parts(material) | _machinery(material))
     path = out or run_dir / "report.html"
     try:
-        path.write_text(text, encoding="utf-8")
+        replace_text(path, text)
     except OSError as fault:
         raise OutputError(
             f"{path}: cannot write the report ({fault.strerror}); free the disk or choose a "

@@ -18,7 +18,7 @@ from aqualvs.app.report_points import FramePoints
 from aqualvs.app.report_run import Track
 from aqualvs.app.report_series import stretches
 from aqualvs.geometry.arrays import IntArray
-from aqualvs.live.sources.images import IMAGE_SUFFIXES, images_in
+from aqualvs.live.sources.images import IMAGE_SUFFIXES, images_in, read_image
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import ImagePlane
 
@@ -172,9 +172,9 @@ def _from_images(files: list[Path], track: Track, rows: list[int]) -> dict[int, 
     pictures = {}
     for row in rows:
         frame = int(track.frame[row])
-        image = cv2.imread(str(files[frame]), cv2.IMREAD_COLOR) if frame < len(files) else None
+        image = read_image(files[frame], cv2.IMREAD_COLOR) if frame < len(files) else None
         if image is not None:
-            pictures[row] = np.asarray(image, dtype=np.uint8)
+            pictures[row] = image
     return pictures
 
 

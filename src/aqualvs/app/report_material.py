@@ -98,13 +98,14 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     lasers = _lasers(rig, points)
     names = [laser.name for laser in lasers]
     net, no_net = read_net(run_dir)
+    bare, no_bare = read_bare(run_dir, track)
     told = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
         title=_title(run_dir, run),
         run=run,
         track=track,
         truth=None if truth is None else read_truth(truth, track),
-        bare=read_bare(run_dir, track),
+        bare=bare,
         points=points,
         lasers=lasers,
         picture_rows=picture_rows,
@@ -114,7 +115,15 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
         net=net,
         warnings=[
             text
-            for text in (trouble, no_points, no_pictures, no_net, *told, *net_warnings(net))
+            for text in (
+                trouble,
+                no_points,
+                no_pictures,
+                no_bare,
+                no_net,
+                *told,
+                *net_warnings(net),
+            )
             if text
         ],
     )
@@ -150,7 +159,7 @@ def _source(run_dir: Path, run: Mapping[str, Any]) -> Path | str:
         return "run.yaml names no source: sample frames come without pictures."
     try:
         for place in (Path(path), run_dir / path):
-            if place.exists():
+            if place.is_file() or place.is_dir():
                 return place
     except OSError:
         # A name that the file system refuses is no file of it.

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import yaml
 from pyarrow import csv
 
 from aqualvs.app.outputs import POSTURE_BARE_CSV
+from aqualvs.app.runfile import read_run_yaml
 from aqualvs.app.truth import read_truth as truth_by_frame
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -30,11 +30,13 @@ _NUMBERS = (
     "n_water",
 )
 _TOTALS = tuple(name for name in _NUMBERS if "_total_" in name)
-# The one in C is ten times as fast; not every build of PyYAML has it.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TRUE = ("true", "1", "yes")
 POSTURE = ("range_m", "pitch_deg", "yaw_deg")
 """The three columns of a posture, in the order of every (N, 3) array of the report."""
+
+
+class NoFrameError(SourceError):
+    """A table without a row, as of a run that was killed before its first frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,16 +82,12 @@ def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
 
     An interrupted run may have left none or half of one; the report is still worth having.
     """
-    path = run_dir / "run.yaml"
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_LOADER)
-    except FileNotFoundError:
+    if not (run_dir / "run.yaml").exists():
         return {}, "run.yaml is missing: rig, options and source are unknown."
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+    try:
+        return read_run_yaml(run_dir), ""
+    except SourceError:
         return {}, "run.yaml cannot be read: rig, options and source are unknown."
-    if not isinstance(content, dict):
-        return {}, "run.yaml is empty or not a mapping: rig, options and source are unknown."
-    return content, ""
 
 
 def read_track(path: Path) -> Track:
@@ -150,19 +148,27 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     return truth
 
 
-def read_bare(run_dir: Path, track: Track) -> FloatArray | None:
-    """Return the posture that a bare-lens camera gives on the same pixels, if the run has it.
+def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:
+    """Read the posture that a bare-lens camera gives on the same pixels, if the run has it.
 
     Returns
     -------
     posture : array, shape (N, 3), or None
         As `Track.posture`, on the frames of `track`.
+    trouble : str
+        What is wrong with the file, in words; "" if nothing is, or the run was killed before it
+        had a row.
     """
     path = run_dir / POSTURE_BARE_CSV
-    if not path.is_file():
-        return None
-    bare = read_track(path)
-    return _onto(track.frame, bare.frame.astype(np.float64), bare.posture)
+    if not path.is_file() or path.stat().st_size == 0:
+        return None, ""
+    try:
+        bare = read_track(path)
+    except NoFrameError:
+        return None, ""
+    except SourceError as fault:
+        return None, f"{fault}: no comparison with a bare lens."
+    return _onto(track.frame, bare.frame.astype(np.float64), bare.posture), ""
 
 
 def number(value: object) -> float:
@@ -202,7 +208,9 @@ def _read_columns(
     # With NumPy: filtering an Arrow table imports all of its functions first.
     whole = np.isfinite(_numbers(table["frame"]))
     if not whole.any():
-        raise SourceError(f"{path}: holds no frame; there is nothing to report, run the dive again")
+        raise NoFrameError(
+            f"{path}: holds no frame; there is nothing to report, run the dive again"
+        )
     words = table.unify_dictionaries()
     return (
         {name: _numbers(table[name])[whole] for name in numbers},
@@ -218,7 +226,11 @@ def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) ->
     )
     parse = csv.ParseOptions(invalid_row_handler=lambda _row: "skip")
     try:
-        return csv.read_csv(path, parse_options=parse, convert_options=convert)
+        content = path.read_bytes()
+        if not content.isascii():
+            # Arrow prints its own complaint of a damaged row that is not UTF-8.
+            content = content.decode("utf-8", "replace").encode()
+        return csv.read_csv(pa.BufferReader(content), parse_options=parse, convert_options=convert)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; name the folder of a run, or run it") from None
     except (pa.ArrowInvalid, OSError) as fault:

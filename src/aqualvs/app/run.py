@@ -172,7 +172,7 @@ def run(
             net, agreement = RunNet(rig, request.net), agreement_for(request, rig)
             check = net_check(request.target, rig)
             measuring.await_first()
-            folder.prepare(request)
+            claim = folder.prepare(request)
             started = time.perf_counter()
             try:
                 with (
@@ -186,7 +186,7 @@ def run(
                         folder.write_all(blocks, writers, stop, tick)
             except SourceError as broken_off:
                 fault = broken_off
-    return RunResult(
+    result = RunResult(
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
         tally=writers.tally,
@@ -198,6 +198,8 @@ def run(
         comparison=folder.comparison(request),
         fault=fault,
     )
+    claim.settle()
+    return result
 
 
 def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:

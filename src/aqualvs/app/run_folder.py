@@ -6,12 +6,13 @@ from pathlib import Path
 
 from aqualvs.app.measuring import Measured
 from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.progress import Tick
 from aqualvs.app.report import write_report
 from aqualvs.app.run import RunRequest
 from aqualvs.app.run_bare_lens import RunBareLens
 from aqualvs.app.run_inputs import source_facts
-from aqualvs.app.run_mcap import RunMcap, prepare_mcap
+from aqualvs.app.run_mcap import RunMcap, check_source_stays
 from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay
 from aqualvs.app.run_writers import RunWriters
@@ -22,16 +23,16 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping
 
 
-def prepare(request: RunRequest) -> None:
-    """Make sure that the run can be written.
+def prepare(request: RunRequest) -> Claim:
+    """Make sure that the run can be written; returns the claim to be settled at its end.
 
     Raises
     ------
     OutputError
         If it cannot, or its folder holds another that may not be replaced.
     """
-    prepare_mcap(request.out, request.source, overwrite=request.overwrite)
-    prepare_folder(request.out, overwrite=request.overwrite)
+    check_source_stays(request.out, request.source)
+    return prepare_folder(request.out, overwrite=request.overwrite)
 
 
 @contextmanager

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Self
 
 from aqualvs.app.disk import writing
 from aqualvs.app.measuring import ScansFrames
-from aqualvs.app.outputs import RUN_FILES
+from aqualvs.app.outputs import DIVE_MCAP, RUN_FILES
 from aqualvs.app.run_replay import Replay
 from aqualvs.app.run_water import WaterFollowingScanner
-from aqualvs.errors import OptionError, OutputError
+from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame, Scan
@@ -20,8 +20,6 @@ from aqualvs.scanning.stripe import Returns
 if TYPE_CHECKING:
     from aqualvs.live.recorder import Recording
     from aqualvs.live.sample import LiveSample
-
-DIVE_MCAP = "dive.mcap"
 
 Measured = tuple[Rig, Scan, dict[SearchAxis, Returns]]
 
@@ -119,29 +117,18 @@ def _recording(path: Path, options: ScannerOptions) -> "Recording":
     return Recording(path, RecorderOptions(scanner=options))
 
 
-def prepare_mcap(folder: Path, source: str, *, overwrite: bool) -> None:
-    """Make sure that a recording can be written to a folder, or that none of another run is there.
+def check_source_stays(folder: Path, source: str) -> None:
+    """Make sure that a run in a folder does not replace what it reads.
 
     Raises
     ------
     OptionError
         If the run's own source would be replaced.
-    OutputError
-        If the folder holds a recording and `overwrite` is not set, or it cannot be removed.
     """
     path = Path(source)
-    is_ours = path.is_file() and path.name in (DIVE_MCAP, *RUN_FILES)
+    is_ours = path.is_file() and path.name in RUN_FILES
     if is_ours and path.resolve().parent == folder.resolve():
         raise OptionError(f"{path}: is what the run reads; write to another folder")
-    old = folder / DIVE_MCAP
-    if not old.exists():
-        return
-    if not overwrite:
-        raise OutputError(
-            f"{folder}: already holds a run ({DIVE_MCAP}); choose another folder or add --overwrite"
-        )
-    with writing(old):
-        old.unlink()
 
 
 def _measured(scanner: ScansFrames, frame: Frame) -> Measured:

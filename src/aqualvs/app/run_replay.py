@@ -93,10 +93,10 @@ class Replay:
 
         self._recording = recording = DiveRecording(path)
         self.name = str(path)
-        self.size_px, self.fps = recording.rig.size_px, recording.fps
-        self.n_frames = recording.n_frames
         self.options = _options(recording, request)
         self.rig = _rig(recording, request)
+        self.size_px, self.fps = (recording.rig or self.rig).size_px, recording.fps
+        self.n_frames = recording.n_frames
         self._follows = request.rig is None and request.water == Water()
         self._detects = _detects(recording, request, self.options)
         self._pictures = self._detects or request.pictures
@@ -120,7 +120,7 @@ class Replay:
             yield ReplayedFrame(recorded.index, recorded.time_s, luma, chroma, recorded)
         if self._recording.n_torn:
             raise SourceError(
-                f"{self.name}: {self._recording.n_torn} of its parts are torn, as by a loss of "
+                f"{self.name}: {self._recording.n_torn} of its parts are damaged, as by a loss of "
                 "power, and were left out; the others were measured"
             )
 
@@ -177,7 +177,7 @@ def replay_of(source: str, request: ReplayRequest) -> Replay | None:
 
 
 def _options(recording: "DiveRecording", request: ReplayRequest) -> ScannerOptions:
-    if request.chosen is None:
+    if request.chosen is None or recording.options is None:
         return request.scanner
     own = {name: getattr(request.scanner, name) for name in request.chosen}
     return replace(recording.options, **own)
@@ -186,12 +186,12 @@ def _options(recording: "DiveRecording", request: ReplayRequest) -> ScannerOptio
 def _rig(recording: "DiveRecording", request: ReplayRequest) -> Rig:
     if request.rig is not None:
         return prepared_rig(request.rig, request.water, no_dome=request.no_dome)
-    return in_water(recording.rig, request.water, no_dome=request.no_dome)
+    return in_water(recording.need_rig(), request.water, no_dome=request.no_dome)
 
 
 def _detects(recording: "DiveRecording", request: ReplayRequest, options: ScannerOptions) -> bool:
     """Return whether stripes must be looked for again, in the recorded pictures."""
-    if options.detector != recording.options.detector:
+    if recording.options is not None and options.detector != recording.options.detector:
         wanted = "--detector: this detector needs the pictures, which"
     elif request.index_target is not None:
         wanted = "--index-target: the target is looked for in the pictures, which"

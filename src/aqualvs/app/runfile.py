@@ -1,7 +1,6 @@
 """`run.yaml`: what was run, on what, with what, and how it went."""
 
 import functools
-import os
 import platform
 import sys
 from collections.abc import Mapping
@@ -15,7 +14,10 @@ from typing import Any
 import yaml
 
 from aqualvs import __version__
+from aqualvs.app.disk import replace_text
+from aqualvs.errors import SourceError
 from aqualvs.optics.rigtext import TidyDumper
+from aqualvs.yamlfile import read_yaml
 
 # A list stays on one line, however many digits it has.
 _WIDTH = 1000
@@ -78,15 +80,25 @@ class RunFile:
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a mapping as YAML in its own order; the old file stays until the new one is whole."""
-    draft = path.with_name(path.name + ".part")
     text = yaml.dump(
         dict(content), Dumper=TidyDumper, sort_keys=False, allow_unicode=True, width=_WIDTH
     )
-    try:
-        draft.write_text(text, encoding="utf-8")
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    replace_text(path, text)
+
+
+def read_run_yaml(folder: Path) -> dict[str, Any]:
+    """Return the content of a run's `run.yaml`.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read, or holds no keys.
+    """
+    path = folder / "run.yaml"
+    content = read_yaml(path, "the run.yaml of a run", SourceError)
+    if not isinstance(content, dict):
+        raise SourceError(f"{path}: holds no keys; run the dive again")
+    return content
 
 
 def versions() -> dict[str, str]:

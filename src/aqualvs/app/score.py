@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.score_own import run_own
 from aqualvs.app.score_results import read_system
 from aqualvs.app.score_set import load_set
-from aqualvs.app.score_table import lines, score_systems, write_scores
+from aqualvs.app.score_table import SCORE_FILES, lines, score_systems, write_scores
 from aqualvs.errors import OptionError
 
 
@@ -19,6 +20,7 @@ def score_and_tell(
     own: Path | None,
     out: Path | None,
     dives: bool,
+    overwrite: bool = False,
 ) -> None:
     """Score systems side by side and tell the table.
 
@@ -36,6 +38,8 @@ def score_and_tell(
         Folder for `scores.csv`, `scores.json` and `scores.md`.
     dives : bool
         Whether the table shows every dive.
+    overwrite : bool
+        Whether to replace what this command wrote to `own` and `out` before.
 
     Raises
     ------
@@ -47,10 +51,12 @@ def score_and_tell(
             "RESULTS: missing; give NAME=PATH of what a system answered, or --own DIR"
         )
     benchmark = load_set(truth)
+    files = [] if out is None else [out / name for name in SCORE_FILES]
+    claim = Claim("score", files, overwrite=overwrite)
     arguments = list(results)
     systems = [read_system(argument, benchmark) for argument in arguments]
     if own is not None:
-        mine = run_own(benchmark, own, tell)
+        mine = run_own(benchmark, own, tell, overwrite=overwrite)
         systems += [read_system(argument, benchmark) for argument in mine]
     names = [system.name for system in systems]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -65,4 +71,5 @@ def score_and_tell(
     if out is not None:
         with writing(out):
             written = write_scores(scores, out)
+        claim.settle()
         tell(f"scores: {', '.join(map(str, written))}")

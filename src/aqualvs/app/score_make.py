@@ -9,10 +9,11 @@ import yaml
 
 from aqualvs import __version__
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.progress import progress
 from aqualvs.app.score_readme import README
 from aqualvs.app.score_set import SET_FILE, TARGET_FILE
-from aqualvs.errors import OptionError, OutputError
+from aqualvs.errors import OptionError
 from aqualvs.simulation.benchmark_dive import render_benchmark_dive
 from aqualvs.simulation.benchmark_scenarios import (
     BENCHMARK_NAME,
@@ -25,6 +26,8 @@ from aqualvs.simulation.benchmark_scenarios import (
 )
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.visible import CONTRAST_LIMIT, VISIBLE_LIMIT
+
+_README_MD = "README.md"
 
 
 def make_set(
@@ -58,21 +61,21 @@ def make_set(
         If the folder holds a set already or cannot be written.
     """
     dives = chosen_dives(names, n_frames)
-    if (out / SET_FILE).exists() and not overwrite:
-        raise OutputError(f"{out / SET_FILE}: exists; choose another folder or add --overwrite")
+    files = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
+    claim = Claim("benchmark", files, overwrite=overwrite)
     renderer = Renderer(benchmark_rig(), threads=os.cpu_count() or 1)
     total = sum(dive.scenario.n_frames for dive in dives)
-    with writing(out), progress(BENCHMARK_NAME, total) as tick:
+    with claim, writing(out), progress(BENCHMARK_NAME, total) as tick:
         # Written last: a set that was interrupted is none.
         (out / SET_FILE).unlink(missing_ok=True)
         for dive in dives:
             render_benchmark_dive(dive, renderer, out / dive.name, tick=tick)
             (out / dive.name / TARGET_FILE).write_text(target_text(dive), encoding="utf-8")
-        (out / "README.md").write_text(README, encoding="utf-8")
+        (out / _README_MD).write_text(README, encoding="utf-8")
         content = yaml.safe_dump(set_facts(dives), sort_keys=False, width=100)
         (out / SET_FILE).write_text(content, encoding="utf-8")
     tell(f"{len(dives)} dives, {total} frames: {out}")
-    tell(f"what is in it, and what to write: {out / 'README.md'}")
+    tell(f"what is in it, and what to write: {out / _README_MD}")
     tell(f"next: aqualvs score mine=RESULTS --truth {out}")
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from aqualvs.app.disk import writing
 from aqualvs.app.outputs import POSTURE_BARE_CSV
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.run import RunRequest, run
 from aqualvs.app.run_inputs import scanner_options
 from aqualvs.app.score_set import TARGET_FILE, BenchmarkSet
@@ -48,16 +49,20 @@ BARE_LENS = "bare-lens"
 """What aqualvs found, triangulated again without the dome: the stripes are told apart with it."""
 
 
-def run_own(benchmark: BenchmarkSet, folder: Path, tell: Callable[[str], object]) -> list[str]:
+def run_own(
+    benchmark: BenchmarkSet, folder: Path, tell: Callable[[str], object], *, overwrite: bool
+) -> list[str]:
     """Measure every dive of a set with every system of `OWN_SYSTEMS`.
 
     Parameters
     ----------
     benchmark : BenchmarkSet
     folder : Path
-        A run goes to SYSTEM/DIVE in it; what is there is replaced.
+        A run goes to SYSTEM/DIVE in it.
     tell : callable
         Takes one line of text.
+    overwrite : bool
+        Whether to replace runs that are there.
 
     Returns
     -------
@@ -71,11 +76,18 @@ def run_own(benchmark: BenchmarkSet, folder: Path, tell: Callable[[str], object]
     """
     for system in OWN_SYSTEMS:
         for dive in benchmark.dives:
-            run(_request(system, benchmark.folder / dive.name, folder / system.name / dive.name))
+            run(
+                _request(
+                    system,
+                    benchmark.folder / dive.name,
+                    folder / system.name / dive.name,
+                    overwrite,
+                )
+            )
         tell(f"{system.name}: {len(benchmark.dives)} dives measured into {folder / system.name}")
     bare = folder / BARE_LENS
-    with writing(bare):
-        bare.mkdir(exist_ok=True)
+    files = [bare / f"{dive.name}.csv" for dive in benchmark.dives]
+    with Claim("score", files, overwrite=overwrite), writing(bare):
         for dive in benchmark.dives:
             found = folder / OWN_SYSTEMS[0].name / dive.name / POSTURE_BARE_CSV
             shutil.copyfile(found, bare / f"{dive.name}.csv")
@@ -83,7 +95,7 @@ def run_own(benchmark: BenchmarkSet, folder: Path, tell: Callable[[str], object]
     return [f"{name}={folder / name}" for name in names]
 
 
-def _request(system: OwnSystem, source: Path, out: Path) -> RunRequest:
+def _request(system: OwnSystem, source: Path, out: Path, overwrite: bool) -> RunRequest:
     """Return what to run; a wall is no net, so no filter for nets is laid over it."""
     target, mesh_filter = "auto", "none"
     if system.mesh_filter == "paper":
@@ -94,7 +106,7 @@ def _request(system: OwnSystem, source: Path, out: Path) -> RunRequest:
         source=str(source / "dive.mp4"),
         rig=source / "rig.yaml",
         out=out,
-        overwrite=True,
+        overwrite=overwrite,
         no_dome=system.no_dome,
         scanner=scanner_options(target, system.detector, mesh_filter, system.fit),
         report=False,

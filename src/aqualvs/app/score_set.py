@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.yamlfile import read_yaml
 
 SET_FILE = "benchmark.yaml"
 TRUTH_FILE = "truth.csv"
@@ -165,15 +165,7 @@ def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> flo
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as fault:
-        raise SourceError(
-            f"{path}: cannot be read ({fault.strerror}); give the folder that "
-            "'aqualvs benchmark -o DIR' wrote"
-        ) from fault
-    except (yaml.YAMLError, UnicodeDecodeError) as fault:
-        raise SourceError(f"{path}: not YAML; make the set again") from fault
+    content = read_yaml(path, "a set that 'aqualvs benchmark -o DIR' wrote", SourceError)
     if not isinstance(content, dict) or content.get(_VERSION_KEY) != 1:
         raise SourceError(f"{path}: not a benchmark set of version 1; make the set again")
     return content

@@ -138,6 +138,10 @@ def markdown(scores: Scores, *, dives: bool) -> str:
     return f"{scores.title}\n\n{table}\n\n{bars}"
 
 
+SCORE_FILES = ("scores.csv", "scores.json", "scores.md")
+"""What `write_scores` writes."""
+
+
 def write_scores(scores: Scores, folder: Path) -> list[Path]:
     """Write `scores.csv`, `scores.json` and `scores.md`; return their paths.
 
@@ -147,7 +151,7 @@ def write_scores(scores: Scores, folder: Path) -> list[Path]:
         If the folder or a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    table, data, text = (folder / f"scores.{kind}" for kind in ("csv", "json", "md"))
+    table, data, text = (folder / name for name in SCORE_FILES)
     records = [_record(entry) for entry in scores.entries]
     with table.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(records[0]))

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.progress import progress
-from aqualvs.errors import OptionError, OutputError
+from aqualvs.errors import OptionError
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
@@ -67,8 +68,8 @@ def simulate(
         return
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
-    _check_free(out, _FILES, overwrite=overwrite)
-    with writing(out), progress(scenario, course.n_frames) as tick:
+    claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
+    with claim, writing(out), progress(scenario, course.n_frames) as tick:
         _write_net_truth(course, out)
         dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1), camera=eye)
         save_rig(with_exact_numbers(rig), out / "rig.yaml")
@@ -101,8 +102,8 @@ def _simulate_calibration(
     overwrite: bool,
 ) -> None:
     rig = example_rig() if rig_file is None else load_rig(rig_file)
-    _check_free(out, _CALIBRATION_FILES, overwrite=overwrite)
-    with writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
+    claim = Claim("simulate", [out / name for name in _CALIBRATION_FILES], overwrite=overwrite)
+    with claim, writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
         files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1), camera=camera)
     tell(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
     tell("next:")
@@ -143,9 +144,3 @@ def tell_scenarios(tell: Callable[[str], object]) -> None:
     width = max(map(len, scenarios))
     for name, about in scenarios.items():
         tell(f"{name:{width}}  {about}")
-
-
-def _check_free(out: Path, names: tuple[str, ...], *, overwrite: bool) -> None:
-    found = [out / name for name in names if (out / name).exists()]
-    if found and not overwrite:
-        raise OutputError(f"{found[0]}: exists; choose another folder or add --overwrite")

@@ -1,6 +1,8 @@
 """Summary numbers of a run, gathered frame by frame."""
 
+import contextlib
 import csv
+import math
 import statistics
 from array import array
 from collections import Counter
@@ -90,15 +92,21 @@ class Tally:
 
 
 def tally_of(posture_csv: Path) -> Tally:
-    """Gather the summary of a run from its `posture.csv`; a row cut short is left out."""
+    """Gather the summary of a run from its `posture.csv`; damaged and cut rows are left out."""
     tally = Tally()
-    with posture_csv.open(newline="", encoding="ascii", errors="replace") as file:
+    with (
+        posture_csv.open(newline="", encoding="ascii", errors="replace") as file,
+        contextlib.suppress(csv.Error),
+    ):
         for row in csv.DictReader(file):
-            if row["n_water"] is None:
+            if row.get("n_water") is None:
                 continue
-            tally.n_frames += 1
-            if row["valid"] == "1":
-                tally.ranges.append(float(row["range_m"]))
+            if row.get("valid") != "1":
+                tally.refused[str(row.get("reason"))] += 1
             else:
-                tally.refused[row["reason"]] += 1
+                try:
+                    tally.ranges.append(float(row.get("range_m") or math.nan))
+                except ValueError:
+                    continue
+            tally.n_frames += 1
     return tally

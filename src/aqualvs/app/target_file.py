@@ -22,11 +22,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aqualvs.errors import OptionError
 from aqualvs.scanning.mesh import MeshFilterOptions
 from aqualvs.scanning.target import TargetKind
+from aqualvs.yamlfile import read_yaml
 
 _KINDS = ", ".join(kind.value for kind in TargetKind)
 _LENGTHS = ("rd_theta_mm", "dd_mm", "r_min_mm", "r_max_mm")
@@ -109,12 +108,9 @@ def target_facts(text: str) -> TargetFacts:
     if text in set(TargetKind):
         return TargetFacts(TargetKind(text))
     path = Path(text)
-    if not path.is_file():
+    if not path.exists():
         raise OptionError(f"--target {text}: neither a file nor one of {_KINDS}")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as fault:
-        raise OptionError(f"{path}: cannot be read as YAML; check the file") from fault
+    content = read_yaml(path, "a net.yaml", OptionError)
     if not isinstance(content, dict):
         raise OptionError(f"{path}: holds no keys; write for example 'kind: net'")
     _refuse_unknown(path, "", content, ("kind", "mesh_filter", "net"))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from aqualvs.app.overwriting import Claim
 from aqualvs.control.gains_file import gains_text, save_gains
 from aqualvs.control.tune import Tuned, TuneOptions, tune
 from aqualvs.control.tune_margins import Margins
@@ -23,12 +24,15 @@ class TuneRequest:
         Name of a vehicle model.
     output : Path or None
         Gains file; None prints the gains.
+    overwrite : bool
+        Whether to replace a file that this command wrote before.
     options : TuneOptions
         What the loops must stand.
     """
 
     model: str
     output: Path | None = None
+    overwrite: bool = False
     options: TuneOptions = field(default_factory=TuneOptions)
 
 
@@ -45,6 +49,8 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
     model = VEHICLES.get(request.model)
     if model is None:
         raise OptionError(f"tune {request.model}: no such model; use one of {', '.join(VEHICLES)}")
+    files = [] if request.output is None else [request.output]
+    claim = Claim("tune", files, overwrite=request.overwrite)
     tuned = tune(model, request.options)
     for line in report(model, tuned, request.options):
         tell(line)
@@ -52,6 +58,7 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
         tell(gains_text(tuned.gains))
     else:
         save_gains(tuned.gains, request.output)
+        claim.settle()
         tell(f"written to {request.output}")
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aqualvs.errors import CalibrationError
+from aqualvs.special_files import refuse_special
 
 PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 """What a folder is searched for."""
@@ -51,6 +52,7 @@ def _meant(argument: str) -> list[Path]:
             )
         return sorted(found, key=_natural)
     if path.exists():
+        refuse_special(path, CalibrationError)
         return [path]
     if glob.has_magic(argument):
         matches = [Path(match) for match in glob.glob(argument, recursive=True)]

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from aqualvs.calibration.pictures import picture_paths
-from aqualvs.calibration.target_text import read_text
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3
+from aqualvs.yamlfile import read_text
 
 __all__ = ["BoardPose", "load_poses", "match_poses", "picture_paths"]
 
@@ -60,7 +60,7 @@ def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
         One line that names the file, the line, the value and the remedy.
     """
     source = Path(path)
-    text = read_text(source, "a poses.csv")
+    text = read_text(source, "a poses.csv", CalibrationError)
     reader = csv.reader(io.StringIO(text))
     rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     if len(rows) < 2:

@@ -20,6 +20,7 @@ from aqualvs.control.settings_text import (
     write_settings,
 )
 from aqualvs.errors import OptionError
+from aqualvs.yamlfile import parse_yaml
 
 VERSION = 1
 """Version of the format that this package reads and writes."""
@@ -113,7 +114,8 @@ def load_gains(source: Path | str) -> ControlGains:
     """
     if str(source) in VEHICLES:
         text = _packaged(str(source))
-        return _gains(parse_settings(yaml.safe_load(text), GainsFile, _KEY, VERSION, str(source)))
+        content = parse_yaml(text, str(source), OptionError)
+        return _gains(parse_settings(content, GainsFile, _KEY, VERSION, str(source)))
     path = Path(source)
     if path.suffix == "" and not path.exists():
         raise OptionError(

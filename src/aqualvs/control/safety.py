@@ -21,6 +21,10 @@ class Reason(StrEnum):
     NO_HEARTBEAT = "no_heartbeat"
     DISARMED = "disarmed"
     PILOT_MODE = "pilot_mode"
+    NO_STATION = "no_station"
+    IGNORED = "ignored"
+    CONFLICT = "conflict"
+    UNKNOWN_MODE = "unknown_mode"
     PILOT_STICKS = "pilot_sticks"
     CLOCK = "clock"
     NO_POSTURE = "no_posture"
@@ -47,6 +51,10 @@ _WORDS = {
     Reason.NO_HEARTBEAT: "the vehicle is silent; stopped until engaged again",
     Reason.DISARMED: "the vehicle is disarmed; arm it and engage again",
     Reason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
+    Reason.NO_STATION: "no ground station heard; stopped until engaged again",
+    Reason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
+    Reason.CONFLICT: "somebody else speaks as the vehicle; stopped until engaged again",
+    Reason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
     Reason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
     Reason.CLOCK: "time ran backwards; stopped for this update",
     Reason.NO_POSTURE: "no valid posture; neutral until it is back",
@@ -63,10 +71,22 @@ _TAKES_OVER = frozenset(
         Reason.NO_HEARTBEAT,
         Reason.DISARMED,
         Reason.PILOT_MODE,
+        Reason.NO_STATION,
+        Reason.IGNORED,
+        Reason.CONFLICT,
+        Reason.UNKNOWN_MODE,
         Reason.PILOT_STICKS,
         Reason.GAVE_UP,
     }
 )
+
+_REFUSED_MODES = {
+    Mode.PILOT: Reason.PILOT_MODE,
+    Mode.NO_STATION: Reason.NO_STATION,
+    Mode.IGNORED: Reason.IGNORED,
+    Mode.CONFLICT: Reason.CONFLICT,
+    Mode.UNKNOWN: Reason.UNKNOWN_MODE,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,7 +237,7 @@ class SafetyGate:
         if not state.armed:
             return Reason.DISARMED
         if state.mode is not Mode.OURS:
-            return Reason.PILOT_MODE
+            return _REFUSED_MODES[state.mode]
         if state.pilot_moves:
             return Reason.PILOT_STICKS
         return None

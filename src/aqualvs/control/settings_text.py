@@ -1,15 +1,15 @@
 """Files that people write for the controllers: strict YAML, faults told in one line."""
 
 import difflib
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from aqualvs.errors import OptionError, OutputError
+from aqualvs.yamlfile import read_yaml
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -23,19 +23,6 @@ class Part(BaseModel):
 
 
 AnyPart = TypeVar("AnyPart", bound=Part)
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that appears twice, of which YAML would quietly drop one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise yaml.constructor.ConstructorError(
-                    problem=f"key '{key}' appears twice", problem_mark=node.value[i][0].start_mark
-                )
-        return super().construct_mapping(node, deep)
 
 
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
@@ -56,7 +43,8 @@ def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> An
     OptionError
         One line: file, place, value, remedy.
     """
-    return parse_settings(_read(path, key), kind, key, version, str(path))
+    content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
+    return parse_settings(content, kind, key, version, str(path))
 
 
 def parse_settings(
@@ -98,27 +86,6 @@ def write_settings(path: Path, text: str) -> None:
         raise OutputError(
             f"{path}: cannot be written ({fault.strerror}); choose another place"
         ) from None
-
-
-def _read(path: Path, key: str) -> Any:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise OptionError(f"{path}: no such file; give a file that begins with '{key}'") from None
-    except OSError as fault:
-        raise OptionError(f"{path}: cannot be read ({fault.strerror})") from None
-    except UnicodeDecodeError:
-        raise OptionError(f"{path}: is not text; give a YAML file") from None
-    try:
-        # The loader is a SafeLoader: it makes nothing but plain values.
-        return yaml.load(text, Loader=_StrictLoader)
-    except yaml.MarkedYAMLError as error:
-        problem = " ".join((error.problem or error.context or "malformed").split())
-        mark = error.problem_mark
-        where = "; mend it" if mark is None else f" in line {mark.line + 1}; mend that line"
-        raise OptionError(f"{path}: is not YAML: {problem}{where}") from None
-    except yaml.YAMLError:
-        raise OptionError(f"{path}: is not YAML; give a YAML file") from None
 
 
 def _first_fault(error: ValidationError, kind: type[Part]) -> str:

@@ -40,8 +40,14 @@ class Mode(StrEnum):
     """A mode in which the vehicle takes our efforts (depth hold: it keeps its own depth)."""
     PILOT = "pilot"
     """Any other: manual, stabilise, surface."""
+    NO_STATION = "no_station"
+    """Ours, but the ground station that must be there is not heard."""
+    IGNORED = "ignored"
+    """Ours, but the vehicle takes efforts in another ground station's name only."""
+    CONFLICT = "conflict"
+    """Messages in the vehicle's name contradict each other."""
     UNKNOWN = "unknown"
-    """Nothing heard yet."""
+    """Nothing heard yet, or nothing that could be steered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +68,8 @@ class VehicleState:
         Metres, down positive.
     heading, roll, pitch : float or None
         Radians; heading clockwise from north.
+    doubt : str
+        Why it seems not to do what it is told; empty if it does, or nothing is known.
     """
 
     heard_s: float = float("-inf")
@@ -73,6 +81,7 @@ class VehicleState:
     heading: float | None = None
     roll: float | None = None
     pitch: float | None = None
+    doubt: str = ""
 
 
 class VehicleLink(Protocol):

@@ -5,6 +5,7 @@ Never arms or disarms, never changes the mode, never presses a button: what goes
 """
 
 import contextlib
+import logging
 import math
 import threading
 import time
@@ -22,7 +23,17 @@ from aqualvs.live.ardusub_link_commands import (
     sticks_of,
 )
 from aqualvs.live.ardusub_link_depth import DepthChoice
+from aqualvs.live.ardusub_link_response import StickResponse
 from aqualvs.live.ardusub_link_sticks import PilotSticks
+from aqualvs.live.ardusub_parameters import (
+    FOR_STICKS,
+    PILOT_TIMEOUT,
+    ParameterWatch,
+    StationRange,
+    Weight,
+    advise_on_fail_safe,
+    advise_on_station,
+)
 from aqualvs.live.logs.tlog import SUB_MODES
 from aqualvs.live.mavlink_link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
 
@@ -43,6 +54,7 @@ _KEEPS_DEPTH: Final = {
     Command.STICKS: ("ALT_HOLD", "POSHOLD", "SURFTRAK"),
     Command.GUIDED: ("GUIDED",),
 }
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,6 +132,8 @@ class ArduSubLink:
         Address as in `parse_address`, or a link that others use too; such a one is not closed here.
     options : ArduSubOptions, optional
         Defaults if left out.
+    advises : bool
+        Whether settings of the vehicle that are not safe are logged.
 
     Raises
     ------
@@ -127,7 +141,13 @@ class ArduSubLink:
         If the address makes no sense, or pymavlink is not installed.
     """
 
-    def __init__(self, link: str | MavlinkLink, options: ArduSubOptions | None = None) -> None:
+    def __init__(
+        self,
+        link: str | MavlinkLink,
+        options: ArduSubOptions | None = None,
+        *,
+        advises: bool = True,
+    ) -> None:
         self.options = options or ArduSubOptions()
         self._owns_link = isinstance(link, str)
         self.link = MavlinkLink(link) if isinstance(link, str) else link
@@ -140,6 +160,9 @@ class ArduSubLink:
             dead_band=self.options.stick_dead_band,
         )
         self._depth = DepthChoice(self.link, _FRESH_S)
+        self._response = StickResponse(self.link)
+        self._watch = ParameterWatch(self.link, FOR_STICKS)
+        self._advised = not advises
         # A watchdog sends from a thread of its own.
         self._sending = threading.Lock()
         self._sent_s = float("-inf")
@@ -150,7 +173,9 @@ class ArduSubLink:
         beat = self.link.latest("HEARTBEAT", system=self.link.system, component=_AUTOPILOT)
         if beat is None:
             return VehicleState()
-        mode, mode_name = self._mode(beat)
+        parameters = self._watch.read()
+        self._advise(parameters)
+        mode, mode_name = self._mode(beat, parameters)
         roll, pitch, heading = self._attitude()
         return VehicleState(
             heard_s=self._heard_s(beat),
@@ -162,6 +187,7 @@ class ArduSubLink:
             heading=heading,
             roll=roll,
             pitch=pitch,
+            doubt=self._response.doubt(),
         )
 
     def send(self, effort: Effort) -> None:
@@ -206,31 +232,55 @@ class ArduSubLink:
                 speed=options.speed,
                 turning_rate=options.turning_rate,
             )
-        return StickCommander(
-            link.dialect,
-            target=link.system,
-            system=options.ground_station,
-            component=_SENDER,
-        )
+        packer = link.make_packer(options.ground_station, _SENDER)
+        return StickCommander(link.dialect, packer, target=link.system)
 
     def _send(self, effort: Effort) -> bool:
         with self._sending:
             if self.options.command is Command.STICKS:
-                self._sticks.note(sticks_of(effort))
-            sent = self.link.send(self._commander.message(effort), urgent=True)
+                sticks = sticks_of(effort)
+                self._sticks.note(sticks)
+                self._response.note(sticks)
+            message = self._commander.message(effort)
+            sent = self.link.send(message, urgent=True, to_vehicle=True)
             self._sent_s = time.monotonic() if sent else self._sent_s
         return sent
 
-    def _mode(self, beat: Received) -> tuple[Mode, str]:
+    def _advise(self, parameters: dict[str, float]) -> None:
+        """Log once what the vehicle's settings mean, as soon as they are known or silent."""
+        if self._advised or self.options.command is not Command.STICKS:
+            return
+        if not (StationRange(parameters).known or self._watch.was_patient):
+            return
+        if PILOT_TIMEOUT not in parameters and not self._watch.was_patient:
+            return
+        self._advised = True
+        advice = advise_on_station(parameters, self.options.ground_station)
+        for one in (advice, *advise_on_fail_safe(parameters)):
+            if one.weight is not Weight.FINE:
+                _log.warning("%s: %s", self.name, one.text)
+
+    def _mode(self, beat: Received, parameters: dict[str, float]) -> tuple[Mode, str]:
         heard = beat.message
         if heard.autopilot != _ARDUPILOT or heard.type != _SUBMARINE:
             return Mode.UNKNOWN, f"not ArduSub (vehicle type {heard.type})"
         name = SUB_MODES.get(heard.custom_mode, f"mode {heard.custom_mode}")
         if name not in self.options.own_modes:
             return Mode.PILOT, name
+        if self.link.conflict:
+            return Mode.CONFLICT, f"{name}; {self.link.conflict}"
+        if self._is_ignored(parameters):
+            advice = advise_on_station(parameters, self.options.ground_station)
+            return Mode.IGNORED, f"{name}; {advice.text}"
         if not self._is_supervised():
-            return Mode.UNKNOWN, f"{name}, no ground station"
+            return Mode.NO_STATION, f"{name}; {self._missing_station()}"
         return Mode.OURS, name
+
+    def _is_ignored(self, parameters: dict[str, float]) -> bool:
+        """Return whether the vehicle has told that it takes sticks of others only."""
+        obeyed = StationRange(parameters)
+        by_sticks = self.options.command is Command.STICKS
+        return by_sticks and obeyed.known and self.options.ground_station not in obeyed
 
     def _is_supervised(self) -> bool:
         """Return whether the ground station is there, or need not be."""
@@ -241,6 +291,16 @@ class ArduSubLink:
         if beat is None or beat.message.type != _GROUND_STATION:
             return False
         return beat.age_s < timeout_s
+
+    def _missing_station(self) -> str:
+        """Say which ground station is missing, and which is there instead."""
+        wanted = f"no heartbeat of ground station {self.options.ground_station}"
+        others = {
+            beat.system
+            for beat in self.link.every("HEARTBEAT")
+            if beat.message.type == _GROUND_STATION and beat.age_s < _BEATS_WITHIN_S
+        } - {self.options.ground_station}
+        return f"{wanted}, but of {', '.join(map(str, sorted(others)))}" if others else wanted
 
     def _heard_s(self, beat: Received) -> float:
         """Return when the vehicle was heard last.

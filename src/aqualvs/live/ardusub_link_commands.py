@@ -78,16 +78,17 @@ class StickCommander:
     ----------
     dialect : module
         pymavlink's messages.
+    packer : object
+        Of the sender, see `MavlinkLink.make_packer`; its system id must be the vehicle's
+        MAV_GCS_SYSID (SYSID_MYGCS), its component must not be the ground station's own, or a router
+        would take the two for one.
     target : int
         System id of the vehicle.
-    system, component : int
-        Sender; the system id must be the vehicle's MAV_GCS_SYSID (SYSID_MYGCS), the component must
-        not be the ground station's own, or a router would take the two for one.
     """
 
-    def __init__(self, dialect: Any, *, target: int, system: int, component: int) -> None:
+    def __init__(self, dialect: Any, packer: Any, *, target: int) -> None:
         self._message = dialect.MAVLink_manual_control_message(target, 0, 0, MIDDLE, 0, 0)
-        self._packer = dialect.MAVLink(None, system, component)
+        self._packer = packer
 
     def message(self, effort: Effort) -> Packable:
         """Return the message; no button is ever pressed."""

@@ -15,7 +15,7 @@ from collections import deque
 from typing import Any
 
 from aqualvs.live.ardusub_link_commands import FULL, MIDDLE, Sticks
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.live.mavlink_link import MavlinkLink, Received
 
 FRESH_S = 1.0
 """An older message says nothing of now; ground stations send sticks 5 to 50 times a second."""
@@ -53,10 +53,11 @@ class PilotSticks:
         return self._joystick_moved() or self._channels_moved()
 
     def _joystick_moved(self) -> bool:
-        found = self._link.latest("MANUAL_CONTROL")
-        if found is None or found.age_s > FRESH_S:
-            return False
-        if (found.system, found.component) == self._own:
+        # One who holds his sticks still must not hide another who moves his.
+        return any(self._moves(found) for found in self._link.every("MANUAL_CONTROL"))
+
+    def _moves(self, found: Received) -> bool:
+        if found.age_s > FRESH_S or (found.system, found.component) == self._own:
             return False
         sticks = found.message
         swings = (sticks.x, sticks.y, sticks.r, _swing_of_z(sticks.z))

@@ -3,21 +3,24 @@
 import contextlib
 import importlib
 import selectors
-import struct
 import threading
 import time
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from aqualvs.errors import OptionError
 from aqualvs.live.health import PartHealth, State
-from aqualvs.live.outputs.mavlink_address import SerialAddress, parse_address
+from aqualvs.live.mavlink_peers import MOVES_AFTER_S, Peer, PeerTable
+from aqualvs.live.mavlink_signing import Signer
+from aqualvs.live.outputs.mavlink_address import AllowedPeers, SerialAddress, parse_address
 from aqualvs.live.outputs.mavlink_ports import Port, check_address, open_port, why
 
 MAV_COMP_ID_ONBOARD_COMPUTER = 191
 HEARTBEAT_EVERY_S = 1.0
-SILENT_AFTER_S = 5.0
-"""A peer without a heartbeat for so long counts as gone."""
+SILENT_AFTER_S = MOVES_AFTER_S
+"""A vehicle without a heartbeat for so long counts as gone."""
 
 _LOOK_EVERY_S = 0.1
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
@@ -26,10 +29,16 @@ _LASTING_S = 2.0
 # A peer that was heard and falls silent may have moved to another address.
 _REOPEN_AFTER_S = 10.0
 _REFUSED_FOR_S = 3.0
-_MAX_KINDS = 1024
+# Of each kind of message the latest of so many senders is kept, besides the vehicle's.
+_MAX_SENDERS = 64
+# Datagrams taken in before the next look at what is to be sent.
+_READ_AT_ONCE = 64
 # What a serial driver already holds delays a message by so much at most; beyond, it is dropped.
 _PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
 _ARDUPILOT, _NO_AUTOPILOT = 3, 8
+_AUTOPILOT_COMPONENT = 1
+# ArduPilot queues 20 requests at most (GCS_Param.cpp), and a lost datagram loses some.
+_ASKED_AT_ONCE, _ASK_AGAIN_S, _ANSWER_POLL_S = 10, 0.3, 0.01
 _ARDUPILOT_NAMES = {1: "ArduPlane", 2: "ArduCopter", 10: "ArduRover", 11: "ArduBoat", 12: "ArduSub"}
 _AUTOPILOT_NAMES = {_ARDUPILOT: "ArduPilot", 12: "PX4"}
 
@@ -59,6 +68,42 @@ class Received:
         return 1e-9 * (time.monotonic_ns() - self.received_ns)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkOptions:
+    """Who we are on a connection, and who may speak to us.
+
+    Attributes
+    ----------
+    system : int
+        Own system id; that of the vehicle, whose part this computer is.
+    component : int
+        Own component id.
+    peers : tuple of str
+        Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
+        everybody if empty. Other connections hear one peer only.
+    key : bytes or None
+        Of MAVLink 2 signing, see `load_key`: what is sent is signed, and what is not signed with
+        it is not heard. None: nothing is signed, and nothing checked.
+    """
+
+    system: int = 1
+    component: int = MAV_COMP_ID_ONBOARD_COMPUTER
+    peers: tuple[str, ...] = ()
+    key: bytes | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        _check_id("system", self.system)
+        _check_id("component", self.component)
+        AllowedPeers(self.peers)
+
+
 class MavlinkLink:
     """Sends and receives MAVLink 2 as an onboard computer.
 
@@ -66,17 +111,20 @@ class MavlinkLink:
     takes in what comes, and opens the connection again whenever it breaks, a little later each time
     up to four seconds. `send` never waits and never raises for the state of the connection.
 
+    A system id belongs to the address where it was heard first, until it has been silent there for
+    five seconds; what others send in its name is left out (see `PeerTable`).
+
     Parameters
     ----------
     url : str
         See `parse_address`.
-    system : int
-        Own system id; that of the vehicle, whose part this computer is.
-    component : int
-        Own component id.
+    options : LinkOptions, optional
+        Defaults if left out.
 
     Attributes
     ----------
+    system : int
+        System id of the vehicle, and our own.
     dialect : module
         pymavlink's messages and constants (ardupilotmega, which holds all common ones).
 
@@ -86,17 +134,16 @@ class MavlinkLink:
         If the address makes no sense, or pymavlink is not installed.
     """
 
-    def __init__(
-        self, url: str, *, system: int = 1, component: int = MAV_COMP_ID_ONBOARD_COMPUTER
-    ) -> None:
-        _check_id("system", system)
-        _check_id("component", component)
+    def __init__(self, url: str, options: LinkOptions | None = None) -> None:
+        options = options or LinkOptions()
         self.url = url
-        self.system = system
+        self.system = system = options.system
+        self._autopilot_ids = (system, _AUTOPILOT_COMPONENT)
         self.dialect: Any = _dialect()
         self._address = parse_address(url)
         check_address(self._address)
-        self._packer = self.dialect.MAVLink(None, system, component)
+        self._signer = None if options.key is None else Signer(self.dialect, options.key)
+        self._packer = self.make_packer(system, options.component)
         self._heartbeat = self.dialect.MAVLink_heartbeat_message(
             self.dialect.MAV_TYPE_ONBOARD_CONTROLLER,
             self.dialect.MAV_AUTOPILOT_INVALID,
@@ -112,12 +159,23 @@ class MavlinkLink:
         self._fault = "not open yet"
         self._n_unsent = 0
         self._receiving = threading.Lock()
-        self._inbox: dict[tuple[str, int, int], Received] = {}
+        self._inbox: dict[str, dict[tuple[int, int, Peer], Received]] = {}
+        self._parameters: dict[str, float] = {}
+        self._n_received: Counter[str] = Counter()
         self._closing = threading.Event()
+        self._allowed, self._n_foreign, self._foreign = AllowedPeers(options.peers), 0, ""
+        self._peers = PeerTable(self._make_parser, (self.dialect.MAVError,), system)
         self._thread = threading.Thread(target=self._run, name=f"mavlink {url}", daemon=True)
         self._thread.start()
 
-    def send(self, *messages: Any, urgent: bool = False) -> bool:
+    def make_packer(self, system: int, component: int) -> Any:
+        """Return a packer of pymavlink for another sender's name on this connection."""
+        packer = self.dialect.MAVLink(None, system, component)
+        if self._signer is not None:
+            self._signer.sign(packer)
+        return packer
+
+    def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
         """Send messages together, in one datagram where there are datagrams; never waits.
 
         Parameters
@@ -126,6 +184,8 @@ class MavlinkLink:
             pymavlink's message objects, made from `dialect`; may be changed and sent again.
         urgent : bool
             On a serial line, may be delayed a little where others are dropped.
+        to_vehicle : bool
+            To the vehicle alone, also where others are heard.
 
         Returns
         -------
@@ -139,7 +199,7 @@ class MavlinkLink:
         """
         patience_s = _URGENT_PATIENCE_S if urgent else _PATIENCE_S
         with self._sending:
-            sent = self._send(messages, patience_s)
+            sent = self._send(messages, patience_s, to_vehicle=to_vehicle)
             self._n_unsent += not sent
         return sent
 
@@ -160,15 +220,73 @@ class MavlinkLink:
         system, component : int or None
             Only from these; from any if None.
         """
-        with self._receiving:
-            found = [
-                entry
-                for (name, of_system, of_component), entry in self._inbox.items()
-                if name == kind
-                and system in (None, of_system)
-                and component in (None, of_component)
-            ]
+        found = [
+            entry
+            for entry in self.every(kind)
+            if system in (None, entry.system) and component in (None, entry.component)
+        ]
         return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def every(self, kind: str) -> list[Received]:
+        """Return the last message of a kind of each sender."""
+        with self._receiving:
+            return list(self._inbox.get(kind, {}).values())
+
+    @property
+    def conflict(self) -> str:
+        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        return self._peers.conflict
+
+    def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
+        """Ask the autopilot for parameters and wait for the answers.
+
+        Parameters
+        ----------
+        names : iterable of str
+            As ArduPilot calls them, such as `RC4_DZ`.
+        patience_s : float
+            How long to ask and wait, in seconds.
+
+        Returns
+        -------
+        parameters : dict of str to float
+            In the autopilot's units. A parameter that the autopilot does not have, or did not
+            answer in time, is left out.
+        """
+        wanted = list(dict.fromkeys(names))
+        with self._receiving:
+            for name in wanted:
+                self._parameters.pop(name, None)
+        end_s = time.monotonic() + patience_s
+        missing = wanted
+        while missing and time.monotonic() < end_s and not self._closing.is_set():
+            asked = missing[:_ASKED_AT_ONCE]
+            self.ask_parameters(asked)
+            again_s = min(time.monotonic() + _ASK_AGAIN_S, end_s)
+            while time.monotonic() < again_s and not all(map(self._parameters.__contains__, asked)):
+                time.sleep(_ANSWER_POLL_S)
+            # Those that stay silent go to the end, so that the others are asked for.
+            rotated = [*missing[_ASKED_AT_ONCE:], *asked]
+            missing = [name for name in rotated if name not in self._parameters]
+        known = self.parameters()
+        return {name: known[name] for name in wanted if name in known}
+
+    def ask_parameters(self, names: Iterable[str]) -> None:
+        """Ask the autopilot for parameters, ten at once at most; returns at once."""
+        request = self.dialect.MAVLink_param_request_read_message
+        for name in names:
+            asked = request(self.system, _AUTOPILOT_COMPONENT, name.encode("ascii"), -1)
+            self.send(asked, to_vehicle=True)
+
+    def parameters(self) -> dict[str, float]:
+        """Return the parameters that the autopilot has told, whoever asked for them."""
+        with self._receiving:
+            return dict(self._parameters)
+
+    def n_received(self, kind: str) -> int:
+        """Return how many messages of a kind have come from the vehicle's autopilot."""
+        with self._receiving:
+            return self._n_received[kind]
 
     def autopilot(self) -> Received | None:
         """Return the last heartbeat of the own vehicle's autopilot, None if none has come."""
@@ -201,27 +319,42 @@ class MavlinkLink:
             return State.WARN, self._waiting_for()
         if age_s > SILENT_AFTER_S:
             return State.WARN, f"no heartbeat for {age_s:.0f} s"
+        doubt = self._peers.conflict or self._peers.rival
+        if doubt:
+            return State.WARN, doubt
         return State.OK, f"autopilot {_name(beat)} seen {age_s:.1f} s ago"
 
     def _waiting_for(self) -> str:
         others = [beat for beat in self._autopilots() if beat.age_s < SILENT_AFTER_S]
         if others:
             return f"no heartbeat of sysid {self.system}, but of {_name(others[-1])}"
-        return f"no heartbeat of sysid {self.system} yet"
+        told = f"no heartbeat of sysid {self.system} yet"
+        if self._signer is not None and self._signer.n_refused:
+            told += f"; {self._signer.n_refused} messages are not signed with our key, or are old"
+        if self._n_foreign:
+            told += f"; {self._foreign} is none of the peers that may speak"
+        return told
 
     def _autopilots(self) -> list[Received]:
-        with self._receiving:
-            beats = [entry for (name, _, _), entry in self._inbox.items() if name == "HEARTBEAT"]
+        beats = self.every("HEARTBEAT")
         return [beat for beat in beats if beat.message.autopilot != _NO_AUTOPILOT]
 
-    def _send(self, messages: tuple[Any, ...], patience_s: float) -> bool:
+    def _send(
+        self, messages: tuple[Any, ...], patience_s: float, *, to_vehicle: bool = False
+    ) -> bool:
         port = self._port
         if port is None or self._broken is not None:
             return False
         try:
-            if port.lag_s > patience_s:
+            vehicle = self._peers.vehicle if port.many else ()
+            if port.lag_s > patience_s or (to_vehicle and vehicle is None):
                 return False
-            return port.write(b"".join([self._packed(message) for message in messages]))
+            if self._signer is not None:
+                self._signer.advance()
+            frames = b"".join([self._packed(message) for message in messages])
+            if to_vehicle and vehicle is not None:
+                return port.write(frames, vehicle)
+            return port.write_all(frames, self._peers.receivers())
         except OSError as fault:
             self._broken = fault
             return False
@@ -250,6 +383,7 @@ class MavlinkLink:
         """Use an open port until it breaks or `close` is called."""
         with contextlib.closing(port), selectors.DefaultSelector() as selector:
             selector.register(port, selectors.EVENT_READ)
+            self._peers.restart()
             with self._sending:
                 self._port, self._broken = port, None
             try:
@@ -259,8 +393,6 @@ class MavlinkLink:
                     self._port = None
 
     def _pump(self, port: Port, selector: selectors.BaseSelector) -> None:
-        parser = self.dialect.MAVLink(None)
-        parser.robust_parsing = True
         opened_s = beat_s = time.monotonic()
         while not self._closing.is_set():
             now_s = time.monotonic()
@@ -272,7 +404,7 @@ class MavlinkLink:
             selector.modify(port, events)
             for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):
                 if ready & selectors.EVENT_READ:
-                    self._take_in(parser, port.read())
+                    self._read(port)
             self._flush(port)
             self._check_silence(opened_s)
 
@@ -292,24 +424,41 @@ class MavlinkLink:
         if min(beat.age_s, time.monotonic() - opened_s) > _REOPEN_AFTER_S:
             raise TimeoutError(0, f"no heartbeat for {beat.age_s:.0f} s")
 
-    def _take_in(self, parser: Any, data: bytes) -> None:
-        """Decode what came; whatever cannot be decoded is left out."""
-        try:
-            messages = parser.parse_buffer(data) if data else None
-        except (self.dialect.MAVError, struct.error, IndexError, ValueError):
-            parser.buf, parser.buf_index = bytearray(), 0
-            return
-        received_ns = time.monotonic_ns()
-        for message in messages or ():
-            kind = message.get_type()
-            if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
+    def _make_parser(self) -> Any:
+        parser = self.dialect.MAVLink(None)
+        parser.robust_parsing = True
+        if self._signer is not None:
+            self._signer.check(parser)
+        return parser
+
+    def _read(self, port: Port) -> None:
+        """Take in what has come, but not so much that sending has to wait."""
+        for _ in range(_READ_AT_ONCE):
+            data, peer = port.read()
+            if not data:
+                return
+            if peer not in self._allowed:
+                self._n_foreign, self._foreign = self._n_foreign + 1, str(peer[0])
                 continue
-            system, component = message.get_srcSystem(), message.get_srcComponent()
-            entry = Received(message, received_ns, system, component)
-            with self._receiving:
-                self._inbox[kind, system, component] = entry
-                if len(self._inbox) > _MAX_KINDS:
-                    del self._inbox[next(iter(self._inbox))]
+            for message in self._peers.decode(peer, data, whole=port.whole):
+                if self._peers.admit(peer, message):
+                    self._keep(peer, message)
+
+    def _keep(self, peer: Peer, message: Any) -> None:
+        """Keep a message as the latest of its kind and sender."""
+        kind, received_ns = message.get_type(), time.monotonic_ns()
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        with self._receiving:
+            latest = self._inbox.setdefault(kind, {})
+            latest.pop((*sender, peer), None)
+            latest[*sender, peer] = Received(message, received_ns, *sender)
+            if len(latest) > _MAX_SENDERS:
+                others = [key for key in latest if key[0] != self.system]
+                del latest[(others or list(latest))[0]]
+            self._n_received[kind] += sender == self._autopilot_ids
+            if kind == "PARAM_VALUE" and sender == self._autopilot_ids:
+                # ArduPilot casts integers to float; it does not copy their bits.
+                self._parameters[message.param_id] = float(message.param_value)
 
 
 def _check_id(name: str, value: int) -> None:

@@ -12,7 +12,7 @@ from aqualvs.control.setpoint import SetpointHolder
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleLink, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.health import PartHealth, State
-from aqualvs.live.pilot_report import PilotReport
+from aqualvs.live.pilot_report import PilotReport, words_of
 from aqualvs.live.pilot_watchdog import Watchdog
 from aqualvs.live.sample import LiveSample
 from aqualvs.live.time_filter import FilteredPosture
@@ -60,7 +60,7 @@ class Pilot:
         self._fault = ""
         self._unsent = ""
         self._n_unsent = 0
-        self._told: tuple[bool, Reason | None] = (False, Reason.NOT_ENGAGED)
+        self._told: tuple[bool, Reason | None, str] = (False, Reason.NOT_ENGAGED, "")
 
     @property
     def engaged(self) -> bool:
@@ -83,11 +83,11 @@ class Pilot:
         with self._stepping:
             if self._takes_setpoint() and not self._setpoint_known():
                 raise OptionError(f"pilot: {Reason.NO_SETPOINT.words}; choose one first")
-            refused = self._begin()
+            refused, state = self._begin()
             if refused is not None:
-                raise OptionError(f"pilot: not engaged: {refused.words}")
+                raise OptionError(f"pilot: not engaged: {words_of(refused, state)}")
             self._fault, self._goodbyes = "", 0
-            self._told = (True, None)
+            self._told = (True, None, "")
         _log.info("pilot: engaged")
 
     def disengage(self) -> None:
@@ -96,7 +96,7 @@ class Pilot:
             if not self._steering.engaged:
                 return
             self._steering.disengage()
-            self._told = (False, Reason.NOT_ENGAGED)
+            self._told = (False, Reason.NOT_ENGAGED, "")
             self._goodbyes = _GOODBYES
             self._send(NEUTRAL)
         _log.info("pilot: disengaged")
@@ -142,10 +142,11 @@ class Pilot:
         self._watchdog.close()
         self._vehicle.close()
 
-    def _begin(self) -> Reason | None:
-        """Let control begin; return why not."""
+    def _begin(self) -> tuple[Reason | None, VehicleState]:
+        """Let control begin; return why not, and what the vehicle told."""
         try:
-            return self._steering.engage(time.monotonic(), self._vehicle.state())
+            state = self._vehicle.state()
+            return self._steering.engage(time.monotonic(), state), state
         except BaseException:
             self._steering.disengage()
             raise
@@ -203,7 +204,7 @@ class Pilot:
             _log.exception("pilot: %s", words)
         self._fault = words
         self._steering.disengage()
-        self._told = (False, Reason.NOT_ENGAGED)
+        self._told = (False, Reason.NOT_ENGAGED, "")
         if self._latest is not None:
             self._latest = replace(
                 self._latest, engaged=False, effort=NEUTRAL, reason=Reason.NOT_ENGAGED
@@ -222,11 +223,11 @@ class Pilot:
 
     def _tell(self, report: PilotReport) -> None:
         """Log what has changed."""
-        told = (report.engaged, report.reason)
+        told = (report.engaged, report.reason, report.state.doubt)
         if told == self._told:
             return
         self._told = told
-        level = logging.INFO if report.reason is None else logging.WARNING
+        level = logging.INFO if report.colour is State.OK else logging.WARNING
         _log.log(level, "pilot, frame %d: %s", report.frame, report.words)
 
 

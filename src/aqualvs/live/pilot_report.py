@@ -8,6 +8,14 @@ from aqualvs.control.safety import Reason
 from aqualvs.control.vehicle import Effort, VehicleState
 from aqualvs.live.health import State
 
+_TELL_MODE = (
+    Reason.PILOT_MODE,
+    Reason.NO_STATION,
+    Reason.IGNORED,
+    Reason.CONFLICT,
+    Reason.UNKNOWN_MODE,
+)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PilotReport:
@@ -42,17 +50,21 @@ class PilotReport:
     @property
     def words(self) -> str:
         """What it does, or why it does not, in one line."""
-        told = self.reason.words if self.reason else _aim(self.guidance)
-        if self.reason is Reason.PILOT_MODE and self.state.mode_name:
-            told = f"{told} ({self.state.mode_name})"
-        return told
+        told = words_of(self.reason, self.state) if self.reason else _aim(self.guidance)
+        return f"{told}; {self.state.doubt}" if self.engaged and self.state.doubt else told
 
     @property
     def colour(self) -> State:
         """How it is, for the health list."""
         if not self.engaged:
             return State.OFF
-        return State.WARN if self.reason else State.OK
+        return State.WARN if self.reason or self.state.doubt else State.OK
+
+
+def words_of(reason: Reason, state: VehicleState) -> str:
+    """Return why efforts do not pass, with what the vehicle says of it."""
+    told = f" ({state.mode_name})" if reason in _TELL_MODE and state.mode_name else ""
+    return f"{reason.words}{told}"
 
 
 def _aim(guidance: Guidance) -> str:

@@ -19,12 +19,15 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_r
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
+from aqualvs.optics.rig_copies import keep_dated
 from aqualvs.optics.rigschema import VERSION, LaserPart, RigFile, WaterPart, parse_rig
-from aqualvs.optics.rigtext import read_yaml, rig_text
+from aqualvs.optics.rigtext import rig_text
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
+from aqualvs.yamlcomments import carry_comments
+from aqualvs.yamlfile import parse_yaml, read_text, read_yaml
 
-__all__ = ["load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
+__all__ = ["check_rig_place", "load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
 
 _MM = 1e3
 _ROTATION_DECIMALS = 12
@@ -52,21 +55,45 @@ def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
     RigError
         One line that names the file, the place in it, the value and the remedy.
     """
-    return rig_from_mapping(read_yaml(Path(path)), source_name=str(path), need_lasers=need_lasers)
+    content = read_yaml(Path(path), "a rig file", RigError)
+    return rig_from_mapping(content, source_name=str(path), need_lasers=need_lasers)
 
 
-def save_rig(rig: Rig, path: str | Path) -> None:
+def save_rig(rig: Rig, path: str | Path, *, comments_of: str | Path | None = None) -> Path | None:
     """Write a rig file that `load_rig` turns into the same rig; an old file is replaced at once.
+
+    A rig file that is there is kept under a dated name, such as `rig.2026-11-23T141503.yaml` (UTC),
+    unless it holds the same already. Its comments go over to the new one.
+
+    Parameters
+    ----------
+    rig : Rig
+    path : path
+    comments_of : path, optional
+        Rig file whose comments to take over where `path` does not exist yet.
+
+    Returns
+    -------
+    copy : Path or None
+        Under which the old file is kept.
 
     Raises
     ------
     OutputError
-        If the file cannot be written.
+        If the file cannot be written, or `path` is a file but no rig.
     RigError
         If `solved_from` holds what YAML cannot.
     """
-    target = Path(path)
+    target, copy = Path(path), None
     text = rig_text(rig_to_mapping(rig))
+    if os.path.lexists(target):
+        old = _old_rig(target)
+        text = carry_comments(old, text)
+        if text == old:
+            return None
+        copy = keep_dated(target)
+    elif comments_of is not None:
+        text = carry_comments(read_text(Path(comments_of), "a rig file", RigError), text)
     draft = target.with_name(target.name + ".part")
     try:
         draft.write_text(text, encoding="utf-8")
@@ -77,6 +104,37 @@ def save_rig(rig: Rig, path: str | Path) -> None:
         ) from error
     finally:
         draft.unlink(missing_ok=True)
+    return copy
+
+
+def check_rig_place(path: Path) -> None:
+    """Make sure that `save_rig` may write there, before anything is computed.
+
+    Raises
+    ------
+    OutputError
+        If the path is a file but no rig.
+    """
+    if os.path.lexists(path):
+        _old_rig(path)
+
+
+def _old_rig(path: Path) -> str:
+    """Return the text of a rig file that is about to be replaced.
+
+    Raises
+    ------
+    OutputError
+        If it is none: whoever wrote it did not mean it to become a rig.
+    """
+    try:
+        text = read_text(path, "a rig file", OutputError)
+        content = parse_yaml(text, str(path), OutputError)
+    except OutputError:
+        content = None
+    if not isinstance(content, Mapping) or "aqualvs_rig" not in content:
+        raise OutputError(f"{path}: exists and is no rig file; choose another place for the rig")
+    return text
 
 
 def rig_to_mapping(rig: Rig) -> dict[str, Any]:

@@ -1,11 +1,10 @@
 """Detection in a whole frame: one search for each direction that the lasers need."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
@@ -19,10 +18,11 @@ from aqualvs.scanning.laser_colour import (
 )
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
-from aqualvs.scanning.search_image import SearchLines
+from aqualvs.scanning.search_image import SearchLines, is_plain
 from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
     HEIGHT,
+    N_MEASURES,
     POSITION,
     PeakFinder,
     Returns,
@@ -39,12 +39,9 @@ DetectorOptions = StripeOptions | ThresholdOptions
 _SAMPLE_EVERY, _MOST_PEAKS = 48, 3.0
 # What the frame's bright returns are as high as.
 _BRIGHT_QUANTILE = 0.9
+_CACHE_LINE = 8  # numbers of 64 bits
 # An overexposed line is no wider than this share of the picture.
 _WIDEST_WHITE = 0.02
-_NO_CHROMA = np.empty((2, 0, 0), np.uint8)
-
-Peaks: TypeAlias = dict[SearchAxis, tuple[IntArray, FloatArray]]
-"""Search line and measures of the peaks of each search direction."""
 
 
 class FrameDetector:
@@ -88,6 +85,11 @@ class FrameDetector:
             if isinstance(options, StripeOptions)
             else {}
         )
+        self._room = options.max_returns
+        # Peaks of all directions, one after the other. Rows of a length that is a power of two would
+        # all fall on the same few places of the processor's cache.
+        self._line = np.empty(len(self._finders) * self._room, np.int64)
+        self._table = np.empty((N_MEASURES, len(self._line) + _CACHE_LINE))
         self._threshold = (
             {
                 axis: ThresholdDetector(axis, size_px, *band, options)
@@ -99,7 +101,6 @@ class FrameDetector:
         width, height = size_px
         self._lines = {axis: SearchLines(size_px, axis, self._line_px) for axis in self._bands}
         self._luma = np.empty((height, width), np.uint8)
-        self._chroma = np.empty((2, -(-height // 2), -(-width // 2)), np.uint8)
 
     def _finder(self, axis: SearchAxis, options: StripeOptions) -> PeakFinder:
         width, height = self._size_px
@@ -107,7 +108,6 @@ class FrameDetector:
             width if axis is SearchAxis.ALONG_X else height,
             *self._bands[axis],
             max(8, round(options.reach_share * width)),
-            options.max_returns,
             np.array([colour.value for colour in self._colours]),
         )
 
@@ -146,52 +146,62 @@ class FrameDetector:
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, Returns]:
         luma = self._brightest(frame)
-        u, v = self._chroma if frame.chroma is not None else _NO_CHROMA
-        if frame.chroma is not None:
-            np.copyto(u, frame.chroma[0])
-            np.copyto(v, frame.chroma[1])
         images = {
-            axis: SearchImage(
-                self._lines[axis].of(luma),
-                u,
-                v,
-                axis is SearchAxis.ALONG_X,
-                self._line_px,
-            )
-            for axis in self._finders
+            axis: SearchImage(lines.of(luma), *lines.chroma_of(frame.chroma), self._line_px)
+            for axis, lines in self._lines.items()
         }
         # A sample of the search lines tells from which height on it pays to look.
-        _, sample = _joined(self._find(images, options.min_contrast, _SAMPLE_EVERY))
+        _, sample, _ = self._find(images, options.min_contrast, _SAMPLE_EVERY)
         contrast, colours = self._survey(sample, frame.chroma is not None)
-        found = self._find(images, max(contrast, options.min_contrast))
-        line, table = _joined(found)
+        line, table, ends = self._find(images, max(contrast, options.min_contrast))
         likelihood = np.ones(len(line))
         if frame.chroma is not None:
             likelihood = self._likelihood(table, colours)
-        sizes = np.cumsum([0, *(len(mine) for mine, _ in found.values())])
-        keep = select_returns(
-            line, table, likelihood, sizes, options.min_likelihood, options.min_share
+        rows = select_returns(
+            line, table, likelihood, ends, options.min_likelihood, options.min_share
         )
+        line, likelihood = line[rows], likelihood[rows]
+        position, height, width = table[:3].take(rows, axis=1)
+        bounds = np.searchsorted(rows, ends)
         return {
             axis: Returns(
-                *(column[start:end][keep[start:end]] for column in (line, *table[:3], likelihood))
+                line[start:end],
+                position[start:end],
+                height[start:end],
+                width[start:end],
+                likelihood[start:end],
             )
-            for axis, start, end in zip(found, sizes[:-1], sizes[1:], strict=True)
+            for axis, start, end in zip(images, bounds[:-1], bounds[1:], strict=True)
         }
 
     def _brightest(self, frame: Frame) -> U8Array:
-        """Return the picture in which the lasers stand out best; the next call overwrites it."""
-        np.copyto(self._luma, channel_image(frame, self._colours[0]))
-        for colour in self._colours[1:]:
-            np.maximum(self._luma, channel_image(frame, colour), out=self._luma)
+        """Return the picture in which the lasers stand out best.
+
+        Overwritten by the next call; the frame's luma itself where that is the same.
+        """
+        first, *others = (channel_image(frame, colour) for colour in self._colours)
+        if not others and is_plain(first):
+            return first
+        np.copyto(self._luma, first)
+        for image in others:
+            np.maximum(self._luma, image, out=self._luma)
         return self._luma
 
     def _find(
         self, images: Mapping[SearchAxis, SearchImage], contrast: int, every: int = 1
-    ) -> Peaks:
-        return {
-            axis: self._finders[axis].find(one, contrast, every) for axis, one in images.items()
-        }
+    ) -> tuple[IntArray, FloatArray, IntArray]:
+        """Return search line and measures of the peaks, and where those of each direction end.
+
+        Views: the next call overwrites them.
+        """
+        ends = [0]
+        for axis, image in images.items():
+            room = slice(ends[-1], ends[-1] + self._room)
+            n = self._finders[axis].find(
+                image, contrast, every, self._line[room], self._table[:, room]
+            )
+            ends.append(ends[-1] + n)
+        return self._line[: ends[-1]], self._table[:, : ends[-1]], np.array(ends)
 
     def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, list[LineColour | None]]:
         """Return the height from which on it pays to look, and what the lines' colours are.
@@ -228,22 +238,16 @@ class FrameDetector:
         return np.asarray(np.max(found, axis=0), np.float64) if len(found) > 1 else found[0]
 
 
-def _joined(peaks: Peaks) -> tuple[IntArray, FloatArray]:
-    """Return the search line and the measures of the peaks of all directions, copied."""
-    line = np.concatenate([line for line, _ in peaks.values()])
-    return line, np.concatenate([table for _, table in peaks.values()], axis=1)
-
-
 @kernel
 def select_returns(
     line: IntArray,
     table: FloatArray,
     likelihood: FloatArray,
-    sizes: IntArray,
+    ends: IntArray,
     min_likelihood: float,
     min_share: float,
-) -> BoolArray:
-    """Mark the peaks that are likely a laser's, and bright or one of many in a row.
+) -> IntArray:
+    """Return the peaks that are likely a laser's, and bright or one of many in a row.
 
     Parameters
     ----------
@@ -253,19 +257,19 @@ def select_returns(
         Measures of the peaks.
     likelihood : array, shape (N,)
         Of each peak.
-    sizes : int array, shape (n_directions + 1,)
-        Where the peaks of each direction begin, and N.
+    ends : int array, shape (n_directions + 1,)
+        0, and where the peaks of each direction end.
     min_likelihood, min_share : float
         As in `StripeOptions`.
     """
     keep = likelihood >= min_likelihood
     bright = min_share * element_at(table[HEIGHT][keep], _BRIGHT_QUANTILE)
-    for k in range(sizes.shape[0] - 1):
-        rows = sizes[k] + np.flatnonzero(keep[sizes[k] : sizes[k + 1]])
+    for k in range(ends.shape[0] - 1):
+        rows = ends[k] + np.flatnonzero(keep[ends[k] : ends[k + 1]])
         long = in_a_row(line[rows], table[POSITION][rows])
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
-    return keep
+    return np.flatnonzero(keep)
 
 
 def _band(searches: Sequence[StripeSearch]) -> tuple[IntArray, IntArray]:

@@ -57,6 +57,8 @@ _LEARNED_QUANTILE = 0.35
 _LEAST_SIGMA = 0.7
 # Heights that are counted as one kind, and how often the shares of lines among them are refined.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
+_KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
+_KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
 # Heights of which so few, or no more than this share, of a sample's peaks are clearly lines are not
 # looked at.
 _FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
@@ -245,7 +247,7 @@ def element_at(values: FloatArray, share: float) -> float:
 
 @inline_kernel
 def _kind_of(height: float) -> int:
-    return min(int(_KINDS_PER_OCTAVE * math.log2(max(height, 1.0))), _N_KINDS - 1)
+    return int(_KIND_OF_HEIGHT[min(int(height), 255)])
 
 
 @kernel
@@ -268,7 +270,7 @@ def _beyond_paint(
     """
     u, v, height = left * table[STEP_U, i], left * table[STEP_V, i], table[HEIGHT, i]
     tint_u, tint_v = height * table[TINT_U, i], height * table[TINT_V, i]
-    size = math.hypot(tint_u, tint_v)
+    size = math.sqrt(tint_u**2 + tint_v**2)
     if size < 1e-9:
         return u, v
     share = (u * tint_u + v * tint_v) / (size * size)
@@ -387,7 +389,7 @@ def _weigh(
         height = table[HEIGHT, i]
         line = ratio * height
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
-        size = math.hypot(step_u, step_v)
+        size = math.sqrt(step_u**2 + step_v**2)
         # A step is the largest of three, so that noise alone has one.
         left = (
             max(1.0 - _LARGEST_OF_THREE * max(sigma - _QUIET, 0.0) / size, 0.0)
@@ -401,9 +403,9 @@ def _weigh(
         var_along = sigma**2 + (along_spread * line) ** 2
         var_across = sigma**2 + (across_spread * line) ** 2
         if spread_u > 0.0:
-            off_u = (step_u - paint_u * height) / math.hypot(sigma, spread_u * height)
-            off_v = (step_v - paint_v * height) / math.hypot(sigma, spread_v * height)
-            off_paint = off_u**2 + off_v**2
+            off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
+            off_paint = off_u**2 / (sigma**2 + (spread_u * height) ** 2)
+            off_paint += off_v**2 / (sigma**2 + (spread_v * height) ** 2)
         else:
             beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
             off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)

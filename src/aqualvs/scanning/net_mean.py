@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.plane_fit import PlaneFit
+from aqualvs.geometry.symmetric import invert_symmetric, solve_symmetric
+from aqualvs.scanning.plane_fit import PlaneFit, normal_equations
 from aqualvs.scanning.posture import Posture
 
 _TUKEY = 4.685  # 95 % efficiency for normal errors
 _ITERATIONS = 5
 _EXACT = 1e-9
-_SINGULAR = 1e12
 
 
 def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
@@ -34,26 +35,42 @@ def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
     """
     if len(points) <= 3:
         return None
-    m = start.normal / start.offset
+    m, weights, covariance = start.normal / start.offset, np.empty(len(points)), np.empty((3, 3))
+    rms = _fit_mean(points, m, weights, covariance)
+    return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
+
+
+@kernel
+def _fit_mean(
+    points: FloatArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
+) -> float:
+    """Refine m in place, write weights and covariance; the rms, NaN where no plane is fixed."""
+    n, one = points.shape[0], np.ones(points.shape[0])
+    off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(_ITERATIONS):
-        off = points @ m - 1.0
-        z = off / (_TUKEY * 1.4826 * max(float(np.median(np.abs(off))), _EXACT))
-        weights = np.maximum(1.0 - z**2, 0.0) ** 2
-        normal = (weights[:, None] * points).T @ points
-        try:
-            m = np.asarray(np.linalg.solve(normal, weights @ points), np.float64)
-        except np.linalg.LinAlgError:
-            return None
-    if np.linalg.cond(normal) > _SINGULAR:
-        return None
-    square = float(weights @ (points @ m - 1.0) ** 2)
-    rms = float(np.sqrt(square / weights.sum()) / np.linalg.norm(m))
-    covariance = (
-        np.asarray(np.linalg.inv(normal), np.float64)
-        * square
-        / (weights.sum() * (1.0 - 3.0 / len(points)))
-    )
-    return PlaneFit(m, covariance, weights, rms)
+        _distances(points, m, off)
+        cut = _TUKEY * 1.4826 * max(np.median(np.abs(off)), _EXACT)
+        for i in range(n):
+            weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
+        normal_equations(points, one, weights, normal, right)
+        if not solve_symmetric(normal, right, inverse, m):
+            return np.nan
+    if not invert_symmetric(normal, covariance):
+        return np.nan
+    _distances(points, m, off)
+    square, weight = 0.0, 0.0
+    for i in range(n):
+        square += weights[i] * off[i] * off[i]
+        weight += weights[i]
+    covariance *= square / (weight * (1.0 - 3.0 / n))
+    return float(np.sqrt(square / weight / (m[0] * m[0] + m[1] * m[1] + m[2] * m[2])))
+
+
+@kernel
+def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
+    """Write m·X - 1 of each point."""
+    for i in range(points.shape[0]):
+        off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
 
 
 def doubted(posture: Posture, other: Posture, share: float) -> Posture:

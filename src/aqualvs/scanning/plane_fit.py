@@ -132,7 +132,7 @@ def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
     """Write the m of m·X = 1 that fits points (N, 3) best, all alike; False if they fix none."""
     normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     one = np.ones(points.shape[0])
-    _normal_equations(points, one, one, normal, right)
+    normal_equations(points, one, one, normal, right)
     return solve_symmetric(normal, right, inverse, m)
 
 
@@ -154,7 +154,7 @@ def _normalised_residuals(
 
 
 @kernel
-def _normal_equations(
+def normal_equations(
     points: FloatArray,
     sigma: FloatArray,
     weights: FloatArray,
@@ -198,13 +198,13 @@ def _fit(
             ratio = z[i] / (_TUKEY * scale)
             kept = max(1.0 - ratio * ratio, 0.0)
             weights[i] = kept * kept
-        _normal_equations(points, sigma, weights, normal, right)
+        normal_equations(points, sigma, weights, normal, right)
         if not solve_symmetric(normal, right, inverse, m):
             return np.nan
     _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
     # A scatter below the stated errors is luck where observations are few.
     factor = max(_huber_factor(z, _TUKEY * scale), 1.0)
-    _normal_equations(points, sigma, np.ones(n), normal, right)
+    normal_equations(points, sigma, np.ones(n), normal, right)
     if not invert_symmetric(normal, covariance):
         return np.nan
     covariance *= factor

@@ -23,12 +23,14 @@ U8Array: TypeAlias = NDArray[np.uint8]
 _MAX_CONTRAST = 120
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
-# Pixels are skipped eight at a time where none stands out.
-_WORD, _WORD_BITS, _IN_WORD = 8, 3, 7
-_NOTHING = np.uint64(0)
+# Marks of pixels, bytes of 0 or 1, are looked at eight at a time.
+_WORD = 8
+_NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
+_EACH_BYTE, _BYTE_NUMBERS = np.uint64(0x0101010101010101), np.uint64(0x0001020304050607)
 _BRIGHT = np.uint8(255)
 # Luma of flanks that are dark; black is 16.
 _DARK = 36.0
+_THIRD = 1.0 / 3.0
 # Flanks that differ by more than this share of a peak's height are not both background.
 _OTHER_STRIPE = 0.25
 POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V = range(9)
@@ -114,10 +116,8 @@ class SearchImage(NamedTuple):
     ----------
     lines : uint8 array, shape (n_lines, length)
         Search lines as rows.
-    u, v : uint8 array, shape (ceil(height / 2), ceil(width / 2))
-        Chroma as decoded; of shape (0, 0) for a grey source.
-    along_x : bool
-        Whether search lines are rows of the picture.
+    u, v : uint8 array, shape (ceil(n_lines * line_px / 2), ceil(length / 2))
+        Chroma, turned as the lines are; of shape (0, 0) for a grey source.
     line_px : int
         Pixels across one search line.
     """
@@ -125,12 +125,14 @@ class SearchImage(NamedTuple):
     lines: U8Array
     u: U8Array
     v: U8Array
-    along_x: bool
     line_px: int
 
 
 class _Scratch(NamedTuple):
-    """Buffers of one search line: its pixels with margins, sliding minima, what stands out."""
+    """Buffers of one search line.
+
+    Its pixels with margins, sliding minima, what stands out, and its chroma in thirds of a level.
+    """
 
     padded: U8Array
     minima: U8Array
@@ -138,6 +140,8 @@ class _Scratch(NamedTuple):
     background: U8Array
     above: U8Array
     words: NDArray[np.uint64]
+    u: NDArray[np.uint16]
+    v: NDArray[np.uint16]
 
 
 class PeakFinder:
@@ -151,8 +155,6 @@ class PeakFinder:
         First and last position of interest on each line (an empty interval skips the line).
     reach_px : int
         How far the background is looked for on each side; wider stripes are left out.
-    capacity : int
-        Peaks kept; where there are more, the contrast threshold is doubled.
     directions : array, shape (n_colours, 2)
         The lasers' colours in the (U, V) plane.
     """
@@ -163,7 +165,6 @@ class PeakFinder:
         lowest: IntArray,
         highest: IntArray,
         reach_px: int,
-        capacity: int,
         directions: FloatArray,
     ) -> None:
         self._lowest, self._highest = lowest, highest
@@ -172,31 +173,32 @@ class PeakFinder:
         # With room for a gap and a mark after the last pixel.
         background, above = np.zeros((2, (length // _WORD + 3) * _WORD), np.uint8)
         words = above.view(np.uint64)
-        self._scratch = _Scratch(padded, minima, spare, background, above, words)
-        self._line = np.empty(capacity, np.int64)
-        self._table = np.empty((N_MEASURES, capacity))
+        u, v = np.empty((2, -(-length // 2)), np.uint16)
+        self._scratch = _Scratch(padded, minima, spare, background, above, words, u, v)
 
     def find(
-        self, image: SearchImage, min_contrast: int, every: int = 1
-    ) -> tuple[IntArray, FloatArray]:
-        """Find the peaks of one frame.
+        self,
+        image: SearchImage,
+        min_contrast: int,
+        every: int,
+        line: IntArray,
+        table: FloatArray,
+    ) -> int:
+        """Find the peaks of one frame, and return how many they are.
 
         Parameters
         ----------
         image : SearchImage
             Of the shape that this was made for.
         min_contrast : int
-            Least height above the background, in grey levels; doubled where noise makes more peaks
-            than there is room for.
+            Least height above the background, in grey levels; doubled where noise makes N peaks
+            or more.
         every : int
             Look at one search line of so many.
-
-        Returns
-        -------
         line : int array, shape (N,)
-            Search line of each peak; ascending. A view: overwritten by the next call.
+            Gets the search line of each peak; ascending.
         table : array, shape (9, N)
-            Measures of each peak, rows as named above; likewise.
+            Gets the measures of each peak, rows as named above.
         """
         while True:
             n = _find_peaks(
@@ -208,11 +210,11 @@ class PeakFinder:
                 self._reach_px,
                 self._directions,
                 self._scratch,
-                self._line,
-                self._table,
+                line,
+                table,
             )
-            if n < len(self._line) or min_contrast > _MAX_CONTRAST:
-                return self._line[:n], self._table[:, :n]
+            if n < len(line) or min_contrast > _MAX_CONTRAST:
+                return n
             min_contrast *= 2
 
 
@@ -230,7 +232,7 @@ def _find_peaks(
     table: FloatArray,
 ) -> int:
     """Write the search line and the measures of each peak; return how many."""
-    n = 0
+    n, chroma_line = 0, -1
     for x in range(0, lowest.shape[0], every):
         if lowest[x] > highest[x]:
             continue
@@ -239,20 +241,21 @@ def _find_peaks(
         first = max(lowest[x] - reach_px, 0)
         end = min(highest[x] + reach_px + 1, row.shape[0])
         _mark_above(row, first, end, min_contrast, reach_px, scratch)
-        background = scratch.background
-        start = _next_set(scratch, 0)
+        start = _next_with(_MARKED, scratch.words, 0)
+        if start < end - first and chroma_line != (x * image.line_px) >> 1:
+            chroma_line = (x * image.line_px) >> 1
+            _sum_neighbours(image.u, chroma_line, scratch.u)
+            _sum_neighbours(image.v, chroma_line, scratch.v)
         while start < end - first:
-            stop = start
-            while scratch.above[stop]:
-                stop += 1
+            stop = _next_with(_UNMARKED, scratch.words, start)
             if first + start <= highest[x] and first + stop > lowest[x]:
                 run = (start, stop)
                 n = _measure_run(
-                    image, x, first, run, background, reach_px, directions, line, table, n
+                    image, x, first, run, scratch, reach_px, directions, line, table, n
                 )
                 if n == line.shape[0]:
                     return n
-            start = _next_set(scratch, stop)
+            start = _next_with(_MARKED, scratch.words, stop)
     return n
 
 
@@ -299,20 +302,18 @@ def _copy(source: U8Array, out: U8Array) -> None:
 
 
 @inline_borrowing_kernel
-def _next_set(scratch: _Scratch, at: int) -> int:
-    """Return the first marked pixel from `at` on; there is one beyond the last pixel."""
-    above, words = scratch.above, scratch.words
-    while at & _IN_WORD:
-        if above[at]:
-            return at
-        at += 1
-    word = at >> _WORD_BITS
-    while words[word] == _NOTHING:
-        word += 1
-    at = word << _WORD_BITS
-    while not above[at]:
-        at += 1
-    return at
+def _next_with(mark: np.uint64, words: NDArray[np.uint64], at: int) -> int:
+    """Return the first pixel from `at` on that is marked, for 1, or not, for 0; there is one."""
+    # Bytes of the word that have the mark become 1, others 0; those before `at` as well.
+    other = _EACH_BYTE * (np.uint64(1) - mark)
+    index = at >> 3
+    found = (words[index] ^ other) & (_EACH_BYTE << np.uint64(8 * (at & 7)))
+    while found == _NOTHING:
+        index += 1
+        found = words[index] ^ other
+    # The lowest of these bits alone shifts the number of its byte to the top.
+    lowest = found & (~found + np.uint64(1))
+    return (index << 3) + np.int64((lowest * _BYTE_NUMBERS) >> np.uint64(56))
 
 
 @inline_borrowing_kernel
@@ -321,7 +322,7 @@ def _measure_run(
     x: int,
     first: int,
     run: tuple[int, int],
-    background: U8Array,
+    scratch: _Scratch,
     reach_px: int,
     directions: FloatArray,
     line: IntArray,
@@ -332,7 +333,7 @@ def _measure_run(
 
     The run [start, end) and the background count from position `first` on.
     """
-    row = image.lines[x]
+    row, background = image.lines[x], scratch.background
     start, end = first + run[0], first + run[1]
     base = np.int64(background[run[0]])
     low = max(start - reach_px, 0)
@@ -355,7 +356,7 @@ def _measure_run(
         table[HEIGHT, n] = 2 * np.int64(row[peak]) - level
         table[WIDTH, n], table[TOP, n] = width, row[peak]
         if image.u.shape[0] > 0:
-            _measure_chroma(image, x, peak, width, directions, table[:, n])
+            _measure_chroma(row, scratch, peak, width, directions, table[:, n])
         n += 1
     return n
 
@@ -427,8 +428,8 @@ def _centroid(row: U8Array, a: int, b: int, level: np.int64) -> float:
 
 @inline_borrowing_kernel
 def _measure_chroma(
-    image: SearchImage,
-    x: int,
+    row: U8Array,
+    scratch: _Scratch,
     peak: int,
     width: float,
     directions: FloatArray,
@@ -439,11 +440,10 @@ def _measure_chroma(
     The peak's is that of its middle or of an edge, whichever is more of the laser's colour: a
     saturated core is white.
     """
-    row = image.lines[x]
     edge, flank = int(0.5 * width) + 1, int(width) + 4
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
-    u_before, v_before = _chroma(image, x, before)
-    u_after, v_after = _chroma(image, x, after)
+    u_before, v_before = _chroma(scratch, before)
+    u_after, v_after = _chroma(scratch, after)
     # Where one flank is much brighter, another stripe lies there.
     difference = np.int64(row[before]) - np.int64(row[after])
     weight = 0.5
@@ -456,7 +456,7 @@ def _measure_chroma(
     for k in range(directions.shape[0]):
         along_u, along_v = directions[k, 0], directions[k, 1]
         for offset in (0, -edge, edge):
-            u, v = _chroma(image, x, peak + offset)
+            u, v = _chroma(scratch, peak + offset)
             u, v = u - u_flank, v - v_flank
             along = along_u * u + along_v * v
             if along > best:
@@ -474,16 +474,18 @@ def _measure_chroma(
 
 
 @inline_borrowing_kernel
-def _chroma(image: SearchImage, x: int, position: int) -> tuple[float, float]:
+def _chroma(scratch: _Scratch, position: int) -> tuple[float, float]:
     """Return U and V at a position of a search line, the mean over neighbours along the stripe."""
-    p, q = max(position, 0) >> 1, (x * image.line_px) >> 1
-    u, v = np.int64(0), np.int64(0)
-    if image.along_x:
-        p = min(p, image.u.shape[1] - 1)
-        for i in (max(q - 1, 0), min(q, image.u.shape[0] - 1), min(q + 1, image.u.shape[0] - 1)):
-            u, v = u + image.u[i, p], v + image.v[i, p]
-    else:
-        p = min(p, image.u.shape[0] - 1)
-        for j in (max(q - 1, 0), min(q, image.u.shape[1] - 1), min(q + 1, image.u.shape[1] - 1)):
-            u, v = u + image.u[p, j], v + image.v[p, j]
-    return u / 3.0, v / 3.0
+    p = min(max(position, 0) >> 1, scratch.u.shape[0] - 1)
+    return scratch.u[p] * _THIRD, scratch.v[p] * _THIRD
+
+
+@inline_borrowing_kernel
+def _sum_neighbours(plane: U8Array, line: int, total: NDArray[np.uint16]) -> None:
+    """Write the sum of a line of chroma and its two neighbours; nothing of a grey source."""
+    last = plane.shape[0] - 1
+    if last < 0:
+        return
+    one, two, three = plane[max(line - 1, 0)], plane[min(line, last)], plane[min(line + 1, last)]
+    for p in range(two.shape[0]):
+        total[p] = np.uint16(one[p]) + np.uint16(two[p]) + np.uint16(three[p])

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aqualvs.errors import OptionError
@@ -14,6 +13,7 @@ from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scene import Box, Fold, Mesh, Net, Sensor, Target, Wall, WaterOptics
 from aqualvs.simulation.trajectory import Course, Trajectory
 from aqualvs.simulation.vectors import Vec
+from aqualvs.yamlfile import read_yaml
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -167,16 +167,7 @@ def read_scenario(path: Path) -> Scenario:
         If the file cannot be read, is not YAML, or holds a key or value that makes no sense; the
         message names the file, the key and the remedy.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise OptionError(
-            f"scenario {path}: {error.strerror}; give a name from the list of built-in scenarios "
-            "or the path of a YAML file"
-        ) from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        line = " ".join(str(error).split())
-        raise OptionError(f"scenario {path}: not YAML ({line}); correct the file") from None
+    content = read_yaml(path, "a scenario file, or the name of a built-in scenario", OptionError)
     return parse_scenario(content, path.stem, str(path))
 
 

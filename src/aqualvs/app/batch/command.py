@@ -18,11 +18,12 @@ from aqualvs.app.batch.names import name_dives
 from aqualvs.app.batch.net_state import known_net
 from aqualvs.app.batch.records import DiveRecord, DiveState
 from aqualvs.app.batch.season import Season
-from aqualvs.app.batch.summary_page import write_summary
+from aqualvs.app.batch.summary_page import SUMMARY_HTML, write_summary
 from aqualvs.app.batch.survey import size_of
 from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
 from aqualvs.app.disk import writing
 from aqualvs.app.net_request import NetRequest
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.run import RunRequest
 from aqualvs.app.run_inputs import Water
 from aqualvs.app.stopping import StopSignals
@@ -105,6 +106,10 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
     """
     _check(request)
     dives = find_dives(request.dives, rig=request.rig, water=request.water, out=request.out)
+    # What an earlier batch of this folder has finished is gone on with, not replaced.
+    files = [request.out / name for name in (SUMMARY_HTML, DIVES, DATASET)]
+    known = files if (request.out / HOME).is_dir() else []
+    claim = Claim("batch", files, overwrite=True, known=known)
     with writing(request.out):
         (request.out / HOME).mkdir(parents=True, exist_ok=True)
     lock = request.out / HOME / _LOCK
@@ -134,6 +139,7 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
         ):
             tell(line)
         tell(f"summary: {write_summary(request.out, records)}")
+    claim.settle()
     if stop.caught:
         return stop.exit_code
     unfinished = [r for r in found.values() if r.state is not DiveState.FINISHED]

@@ -15,10 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aqualvs.app.run_inputs import Water
 from aqualvs.errors import OptionError
+from aqualvs.yamlfile import parse_yaml, read_text
 
 LIST_SUFFIXES = frozenset({".csv", ".yaml", ".yml"})
 
@@ -61,24 +60,23 @@ def read_list(path: Path) -> list[ListedDive]:
     OptionError
         If it cannot be read, a row has no dive, or what it says is not understood.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = list(_csv_rows(text) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, csv.Error) as fault:
-        words = str(fault).splitlines()[0]
-        raise OptionError(f"{path}: cannot be read as a list of dives ({words})") from fault
+    text = read_text(path, "a list of dives", OptionError)
+    rows = list(_csv_rows(text, path) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
     if not rows:
         raise OptionError(f"{path}: lists no dive; give at least one row")
     return [_listed(row, path, number) for number, row in enumerate(rows, 1)]
 
 
-def _csv_rows(text: str) -> Iterator[Mapping[str, Any]]:
-    for row in csv.DictReader(text.splitlines(), skipinitialspace=True):
-        yield {str(key).strip(): value for key, value in row.items() if value not in ("", None)}
+def _csv_rows(text: str, path: Path) -> Iterator[Mapping[str, Any]]:
+    try:
+        for row in csv.DictReader(text.splitlines(), skipinitialspace=True):
+            yield {str(key).strip(): value for key, value in row.items() if value not in ("", None)}
+    except csv.Error as fault:
+        raise OptionError(f"{path}: cannot be read as a list of dives ({fault})") from fault
 
 
 def _yaml_rows(text: str, path: Path) -> Iterable[Mapping[str, Any]]:
-    content = yaml.safe_load(text)
+    content = parse_yaml(text, str(path), OptionError)
     if isinstance(content, dict) and set(content) == {"dives"}:
         content = content["dives"]
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):

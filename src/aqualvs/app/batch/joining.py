@@ -17,6 +17,7 @@ from aqualvs.app.batch.work import DiveWork, open_dive
 from aqualvs.app.disk import writing
 from aqualvs.app.journal import read_journal
 from aqualvs.app.outputs import (
+    DIVE_MCAP,
     JOURNAL,
     POINTS_PARQUET,
     POINTS_PLY,
@@ -160,7 +161,8 @@ def _join_rows(parts: Sequence[Path], path: Path) -> None:
 def _replace_run(draft: Path, out: Path) -> list[str]:
     """Put the files of a run in the place of an older one's; returns the names to be verified."""
     out.mkdir(parents=True, exist_ok=True)
-    for name in RUN_FILES:
+    # A batch makes no recordings; one that is there is somebody's.
+    for name in set(RUN_FILES) - {DIVE_MCAP}:
         if (draft / name).exists():
             os.replace(draft / name, out / name)
         else:

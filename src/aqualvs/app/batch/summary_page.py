@@ -11,6 +11,7 @@ from aqualvs import __version__
 from aqualvs.app import report_html as html
 from aqualvs.app.batch.records import DiveRecord, DiveState
 from aqualvs.app.batch.thumbnail import range_svg
+from aqualvs.app.disk import replace_text
 from aqualvs.app.outputs import NET_MAP_PNG, REPORT_HTML
 from aqualvs.app.report_findings import Card
 from aqualvs.app.report_words import clock
@@ -55,7 +56,7 @@ def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
     template = files("aqualvs.app.batch").joinpath("assets", SUMMARY_HTML)
     text = Template(template.read_text(encoding="utf-8")).substitute(_parts(folder, records))
     try:
-        path.write_text(text, encoding="utf-8")
+        replace_text(path, text)
     except OSError as fault:
         raise OutputError(
             f"{path}: cannot be written ({fault.strerror}); free the disk or choose another folder"

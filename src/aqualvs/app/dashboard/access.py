@@ -1,11 +1,16 @@
 """Who may see the pilot's page, and who may command from it."""
 
 import ipaddress
+import re
 import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 _LEAST_TOKEN = 8
+_HOST = re.compile(r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::([0-9]{1,5}))?", re.ASCII)
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*://", re.ASCII)
+_MAX_PORT = 65535
 _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
@@ -56,6 +61,37 @@ class Access:
         if self.is_local and urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
             return False
         return origin is None or urlsplit(origin).netloc == host
+
+
+def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
+    """Return whether the headers `Host` and `Origin` of a request are written as addresses are.
+
+    Parameters
+    ----------
+    hosts, origins : sequence of str
+        All values of these headers; a program may send none, nobody may send two.
+    """
+    if len(hosts) > 1 or len(origins) > 1:
+        return False
+    return all(map(_is_host, hosts)) and all(map(_is_origin, origins))
+
+
+def _is_host(text: str) -> bool:
+    """Return whether a text is a name or an IP address, with or without a port (RFC 9110, 7.2)."""
+    found = _HOST.fullmatch(text)
+    if found is None or int(found[1] or 0) > _MAX_PORT:
+        return False
+    try:
+        # The brackets of what is no IPv6 address raise here.
+        return urlsplit(f"//{text}").hostname is not None
+    except ValueError:
+        return False
+
+
+def _is_origin(text: str) -> bool:
+    """Return whether a text is an origin, as browsers write it (RFC 6454, 6.2)."""
+    scheme = _SCHEME.match(text)
+    return text == "null" or (scheme is not None and _is_host(text[scheme.end() :]))
 
 
 def make_access(host: str, token: str | None) -> Access:

@@ -16,10 +16,13 @@ class Watcher:
     may_command : bool
     unshown : int
         Pictures that were sent and not yet shown.
+    gone : Event
+        Set when another page takes this one's place.
     """
 
     may_command: bool
     unshown: int = 0
+    gone: asyncio.Event = field(default_factory=asyncio.Event)
     _state: str | None = None
     _picture: bytes | None = None
     _news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -55,7 +58,8 @@ class Hub:
     MAX_WATCHERS = 8
 
     def __init__(self) -> None:
-        self._watchers: set[Watcher] = set()
+        # In the order in which they came.
+        self._watchers: dict[Watcher, None] = {}
 
     @property
     def n_watchers(self) -> int:
@@ -63,15 +67,22 @@ class Hub:
         return len(self._watchers)
 
     def join(self, watcher: Watcher) -> bool:
-        """Add a page; False if there are too many."""
+        """Add a page; False if there are too many.
+
+        A page that may command takes the place of the oldest one that may not.
+        """
         if len(self._watchers) >= self.MAX_WATCHERS:
-            return False
-        self._watchers.add(watcher)
+            oldest = next((one for one in self._watchers if not one.may_command), None)
+            if oldest is None or not watcher.may_command:
+                return False
+            self.leave(oldest)
+            oldest.gone.set()
+        self._watchers[watcher] = None
         return True
 
     def leave(self, watcher: Watcher) -> None:
         """Remove a page."""
-        self._watchers.discard(watcher)
+        self._watchers.pop(watcher, None)
 
     def publish(self, state: str, picture: bytes | None) -> None:
         """Hand out the latest state, and picture if there is a new one."""

@@ -10,13 +10,15 @@ import time
 import uvicorn
 from pydantic import ValidationError
 from starlette.applications import Starlette
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from aqualvs import __version__
-from aqualvs.app.dashboard.access import Access
+from aqualvs.app.dashboard.access import Access, are_addresses
 from aqualvs.app.dashboard.commands import (
     MAX_MESSAGE_BYTES,
     Controls,
@@ -25,6 +27,7 @@ from aqualvs.app.dashboard.commands import (
     parse_message,
 )
 from aqualvs.app.dashboard.hub import Hub, Watcher
+from aqualvs.app.dashboard.limits import ConnectionLimits, Peer, TokenGate
 from aqualvs.app.dashboard.state import rig_state
 from aqualvs.errors import AqualvsError, OptionError
 from aqualvs.optics.rig import Rig
@@ -44,8 +47,10 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
 }
-# Whoever guesses tokens has to wait; whoever says nothing is shown the door.
-_WRONG_TOKEN_S, _HELLO_S, _START_S, _STOP_S = 1.0, 5.0, 10.0, 3.0
+# A page that has connected greets within the first of these times.
+_HELLO_S, _START_S, _STOP_S = 5.0, 10.0, 3.0
+# How often it is checked that whoever waits for the check of a token is still there.
+_ALIVE_S = 0.5
 _REFUSED = 1008
 _log = logging.getLogger(__name__)
 
@@ -76,18 +81,19 @@ class DashboardServer:
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
         self.hub = Hub()
         self._access, self._rig, self._controls = access, rig, controls
+        self._limits, self._gate = ConnectionLimits(), TokenGate(access)
         self._socket = _listening(host, port)
         self.port: int = self._socket.getsockname()[1]
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server = uvicorn.Server(
             uvicorn.Config(
-                self._app(),
+                _refusing_malformed(self._app()),
+                http=self._limits.protocol(),
                 log_level="warning",
                 access_log=False,
                 ws_max_size=MAX_MESSAGE_BYTES,
                 ws_ping_interval=5.0,
                 ws_ping_timeout=10.0,
-                limit_concurrency=32,
                 timeout_graceful_shutdown=1,
             )
         )
@@ -132,7 +138,7 @@ class DashboardServer:
         )
 
     async def _talk(self, socket: WebSocket) -> None:
-        peer = f"{socket.client.host if socket.client else 'unknown'}"
+        peer = socket.client.host if socket.client else "unknown"
         headers = socket.headers
         if not self._access.is_own_page(headers.get("origin"), headers.get("host", "")):
             _log.warning("dashboard: %s refused: foreign page %s", peer, headers.get("origin"))
@@ -155,16 +161,26 @@ class DashboardServer:
             await _refuse(socket, peer, f"no greeting: {type(fault).__name__}")
             return None
         token = hello.token if isinstance(hello, Hello) else ""
-        known = self._access.may_command(token)
-        if token and not known:
-            await asyncio.sleep(_WRONG_TOKEN_S)
+        known = bool(token) and await self._is_right(socket, token)
         watcher = Watcher(may_command=known)
         why = self._why_not(token, watcher)
         if why:
             await _refuse(socket, peer, why)
             return None
+        self._limits.welcome(_end(socket))
         await socket.send_text(rig_state(self._rig, may_command=known))
         return watcher
+
+    async def _is_right(self, socket: WebSocket, token: str) -> bool:
+        """Return whether a token is right, when its turn has come; a page that goes loses it."""
+        end = _end(socket)
+        asking = asyncio.create_task(self._gate.check(end[0], token))
+        while self._limits.holds(end):
+            done, _ = await asyncio.wait({asking}, timeout=_ALIVE_S)
+            if done:
+                return asking.result()
+        asking.cancel()
+        raise WebSocketDisconnect
 
     def _why_not(self, token: str, watcher: Watcher) -> str:
         """Let a page in, or return why not."""
@@ -176,7 +192,10 @@ class DashboardServer:
 
     async def _attend(self, socket: WebSocket, watcher: Watcher, peer: str) -> None:
         """Send what is new and listen, until the page goes."""
-        sending = asyncio.create_task(_send_news(socket, watcher))
+        beside = [
+            asyncio.create_task(_send_news(socket, watcher)),
+            asyncio.create_task(_make_room(socket, watcher, peer)),
+        ]
         try:
             while True:
                 await self._hear(socket, watcher, peer, await socket.receive_text())
@@ -184,7 +203,8 @@ class DashboardServer:
             await _refuse(socket, peer, "message not understood")
         finally:
             self.hub.leave(watcher)
-            sending.cancel()
+            for task in beside:
+                task.cancel()
 
     async def _hear(self, socket: WebSocket, watcher: Watcher, peer: str, text: str) -> None:
         message = parse_message(text)
@@ -212,9 +232,37 @@ async def _send_news(socket: WebSocket, watcher: Watcher) -> None:
             await socket.send_bytes(picture)
 
 
+async def _make_room(socket: WebSocket, watcher: Watcher, peer: str) -> None:
+    await watcher.gone.wait()
+    await _refuse(socket, peer, "a page with the token took this place")
+
+
 async def _refuse(socket: WebSocket, peer: str, why: str) -> None:
     _log.warning("dashboard: %s refused: %s", peer, why)
     await socket.close(_REFUSED, why)
+
+
+def _end(socket: WebSocket) -> Peer:
+    """Return address and port of a page."""
+    return (socket.client.host, socket.client.port) if socket.client else ("unknown", 0)
+
+
+def _refusing_malformed(app: ASGIApp) -> ASGIApp:
+    """Return an application that answers 400 where a request's addresses are malformed."""
+
+    async def checked(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] in ("http", "websocket"):
+            headers = Headers(scope=scope)
+            if not are_addresses(headers.getlist("host"), headers.getlist("origin")):
+                answer = PlainTextResponse("malformed Host or Origin\n", 400, headers=_HEADERS)
+                if scope["type"] == "websocket":
+                    await WebSocket(scope, receive, send).send_denial_response(answer)
+                else:
+                    await answer(scope, receive, send)
+                return
+        await app(scope, receive, send)
+
+    return checked
 
 
 async def _blueos(_request: Request) -> Response:

@@ -7,18 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 
 from aqualvs.app.design.best import best_angles
 from aqualvs.app.design.calibrated import camera_errors
 from aqualvs.app.design.changes import changes
-from aqualvs.app.design.figures import draw_figures
+from aqualvs.app.design.figures import ERRORS_PNG, PICTURE_PNG, draw_figures
 from aqualvs.app.design.file import (
-    EXAMPLE,
     FAN_DEG,
     design_from,
     design_of_rig,
+    example_content,
     load_design,
     merged_content,
 )
@@ -38,6 +37,7 @@ from aqualvs.app.design.words import (
     summary,
 )
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
@@ -68,6 +68,8 @@ class DesignRequest:
         Whether to look for the best angles.
     try_changes : bool
         Whether to say which changes would help.
+    overwrite : bool
+        Whether to replace what this command wrote to `out` before.
     """
 
     design: Path | None = None
@@ -78,6 +80,7 @@ class DesignRequest:
     turn: bool = False
     tilt: bool = True
     try_changes: bool = True
+    overwrite: bool = False
 
 
 def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
@@ -90,6 +93,9 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
     """
     console = console or Console()
     design = _asked_for(request)
+    names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG)
+    files = [(request.out or Path()) / name for name in names]
+    claim = Claim("design", files, overwrite=request.overwrite)
     if request.turn:
         turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
         design = design.with_mounts(turned)
@@ -112,6 +118,7 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
         console.print()
     if request.out is not None:
         _write(best, request.out, console)
+        claim.settle()
 
 
 def _tell_errors(console: Console, design: Design, title: str) -> None:
@@ -141,13 +148,12 @@ def _asked_for(request: DesignRequest) -> Design:
         return design_of_rig(load_rig(request.rig), request.fan_deg or FAN_DEG)
     if request.design is not None:
         return load_design(request.design, request.given)
-    content = merged_content(yaml.safe_load(EXAMPLE), request.given)
+    content = merged_content(example_content(), request.given)
     return design_from(content, name="design", folder=Path())
 
 
 def _write(design: Design, out: Path, console: Console) -> None:
     with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
         save_rig(designed_rig(design), out / RIG_YAML)
         pictures = draw_figures(design, out)
     for path in (out / RIG_YAML, *pictures):

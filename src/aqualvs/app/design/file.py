@@ -18,9 +18,9 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.optics.rigtext import read_yaml
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.plane_fit import SharedError
+from aqualvs.yamlfile import parse_yaml, read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
 FAN_DEG = 68.0
@@ -178,11 +178,17 @@ def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
     OptionError, RigError
         One line: file, place, value, remedy.
     """
-    content = read_yaml(path)
+    content = read_yaml(path, "a design file", OptionError)
     if not isinstance(content, Mapping):
         raise OptionError(f"{path}: is no design; such a file begins with '{KEY}: {VERSION}'")
     merged = merged_content(content, given or {})
     return design_from(merged, name=str(path), folder=path.parent)
+
+
+def example_content() -> dict[str, Any]:
+    """Return the content of `EXAMPLE`."""
+    content: dict[str, Any] = parse_yaml(EXAMPLE, "the example", OptionError)
+    return content
 
 
 def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

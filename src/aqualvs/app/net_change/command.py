@@ -14,7 +14,8 @@ from aqualvs.app.net_change.page import write_page
 from aqualvs.app.net_change.picture import draw_change
 from aqualvs.app.net_change.surveys import Survey, check_surveys, find_runs, left_out, read_survey
 from aqualvs.app.net_change.words import summary_lines
-from aqualvs.errors import OptionError, OutputError
+from aqualvs.app.overwriting import Claim
+from aqualvs.errors import OptionError
 
 NET_CHANGE_CSV, HOLES_CHANGE_CSV = "net_change.csv", "holes_change.csv"
 NET_CHANGE_PNG, NET_CHANGE_HTML = "net_change.png", "net_change.html"
@@ -63,7 +64,8 @@ def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comp
     """
     surveys, origins = _surveys(request)
     check_surveys(surveys)
-    _prepare(request.out, overwrite=request.overwrite)
+    files = [request.out / name for name in NET_CHANGE_FILES]
+    claim = Claim("net-change", files, overwrite=request.overwrite)
     for folder in request.runs:
         for line in left_out(folder):
             tell(line)
@@ -74,6 +76,7 @@ def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comp
         write_tables(request.out, result, (NET_CHANGE_CSV, HOLES_CHANGE_CSV))
         draw_change(result, request.out / NET_CHANGE_PNG)
         write_page(request.out / NET_CHANGE_HTML, request.out / NET_CHANGE_PNG, result, origins)
+    claim.settle()
     for line in summary_lines(result):
         tell(line)
     tell(f"page: {request.out / NET_CHANGE_HTML}")
@@ -90,14 +93,3 @@ def _surveys(request: NetChangeRequest) -> tuple[list[Survey], dict[str, str]]:
             surveys.append(read_survey(run, found))
             origins[str(run)] = origin
     return surveys, origins
-
-
-def _prepare(folder: Path, *, overwrite: bool) -> None:
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        found = [folder / name for name in NET_CHANGE_FILES if (folder / name).exists()]
-        if found and not overwrite:
-            raise OutputError(
-                f"{folder}: already holds a comparison ({found[0].name}); choose another folder "
-                "or add --overwrite"
-            )

@@ -5,10 +5,8 @@ from collections.abc import Sequence
 from datetime import UTC, date, datetime
 from pathlib import Path
 
-import yaml
-
-from aqualvs.app.outputs import RUN_YAML
-from aqualvs.errors import OptionError
+from aqualvs.app.runfile import read_run_yaml
+from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.logs import dive_start_utc
 
 _NAMED = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)(?!\d)")
@@ -80,10 +78,9 @@ def _given(text: str) -> date | None:
 def _source(folder: Path) -> Path:
     """Return the video of a run, which may be gone; an empty path where it is not known."""
     try:
-        content = yaml.safe_load((folder / RUN_YAML).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        source = read_run_yaml(folder).get("source")
+    except SourceError:
         return Path()
-    source = content.get("source") if isinstance(content, dict) else None
     if not isinstance(source, dict):
         return Path()
     return Path(str(source.get("path") or source.get("name") or ""))

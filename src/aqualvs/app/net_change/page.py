@@ -12,6 +12,7 @@ import numpy as np
 
 from aqualvs import __version__
 from aqualvs.app import report_html as html
+from aqualvs.app.disk import replace_text
 from aqualvs.app.net_change.cells import Growth
 from aqualvs.app.net_change.comparison import Comparison, OnWall
 from aqualvs.app.net_change.hole_sites import HoleState, Site
@@ -67,7 +68,7 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
         "footer": escape(f"Written {now()} by aqualvs {__version__}."),
     }
     text = Template(template.read_text(encoding="utf-8")).substitute(parts)
-    path.write_text(text, encoding="utf-8")
+    replace_text(path, text)
 
 
 def _cards(result: Comparison) -> list[Card]:

@@ -9,13 +9,20 @@ from pathlib import Path
 from typing import TypeAlias
 
 from aqualvs.app.disk import writing
+from aqualvs.app.overwriting import Claim
 from aqualvs.app.reproduce import catalogue
 from aqualvs.app.reproduce.experiment import Experiment
 from aqualvs.app.reproduce.laboratory import Laboratory
 from aqualvs.app.reproduce.page import FRAME, PAGE, write_page
 from aqualvs.app.reproduce.progress_bar import experiment_bar
 from aqualvs.app.reproduce.records import (
+    FIGURES,
+    RESULTS,
+    SERIES,
+    TIMES,
+    WORK,
     Record,
+    is_reproduced,
     read_results,
     save_outcome,
     work_folder,
@@ -80,6 +87,11 @@ def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.expe
         If the folder cannot be written.
     """
     names = catalogue.ordered(request.names)
+    # Results of other experiments in the folder stay; those of the same are brought up to date.
+    written = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, _FAILURES)
+    files = [request.out / name for name in written]
+    known = files if is_reproduced(request.out) else []
+    claim = Claim("reproduce", files, overwrite=True, known=known)
     with experiment_bar(names) as bar:
         laboratory = Laboratory(work_folder(request.out), bar.tick)
         book = _Book(request.out)
@@ -89,6 +101,7 @@ def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.expe
             tell(f"[{number}/{len(names)}] {_line(book.records[name], book.seconds[name])}")
             bar.end()
             write_page(book.in_order(), book.seconds, request.out)
+    claim.settle()
     for line in _closing(book, names, request.out):
         tell(line)
     return _EXIT_FAILED if any(book.records[name].failure for name in names) else 0

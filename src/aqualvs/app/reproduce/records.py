@@ -141,6 +141,11 @@ def read_results(folder: Path) -> tuple[dict[str, Record], dict[str, float]]:
         return {}, {}
 
 
+def is_reproduced(folder: Path) -> bool:
+    """Return whether the experiments have been run in a folder before, by whichever version."""
+    return (folder / WORK / _MADE_BY).is_file()
+
+
 def work_folder(folder: Path) -> Path:
     """Return the folder for rendered dives, emptied of what another version left in it.
 

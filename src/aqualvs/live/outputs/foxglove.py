@@ -150,7 +150,11 @@ class FoxgloveOutput:
         if self._transforms.has_sinks():
             self._transforms.log(foxglove_scene.transforms(rig, at_ns), log_time=at_ns)
         self._log(schemas.HEALTH, at_ns, lambda: messages.health_message(health, at_ns))
-        self._log(schemas.RIG, at_ns, lambda: messages.rig_message(rig, options, at_ns))
+        self._log(
+            schemas.RIG,
+            at_ns,
+            lambda: messages.rig_message(messages.rig_texts(rig, options), at_ns),
+        )
 
     def _log(
         self, topic: Topic, at_ns: int, content: Callable[[], bytes], due: "_Rate | None" = None

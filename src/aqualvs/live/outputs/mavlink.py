@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from aqualvs.live.health import PartHealth
-from aqualvs.live.mavlink_link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink
+from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
 from aqualvs.live.sample import LiveSample
 from aqualvs.live.time_filter import FilteredPosture
 from aqualvs.scanning.posture import Posture, Refusal
@@ -48,8 +48,8 @@ class MavlinkOutput:
     ----------
     link : str or MavlinkLink
         Address as in `parse_address`, or a link that others use too; such a one is not closed here.
-    system, component : int
-        Own ids, where the link is made here.
+    options : LinkOptions, optional
+        Where the link is made here.
 
     Raises
     ------
@@ -60,22 +60,14 @@ class MavlinkOutput:
     inline = True
     keeps_all = False
 
-    def __init__(
-        self,
-        link: str | MavlinkLink,
-        *,
-        system: int = 1,
-        component: int = MAV_COMP_ID_ONBOARD_COMPUTER,
-    ) -> None:
+    def __init__(self, link: str | MavlinkLink, options: LinkOptions | None = None) -> None:
         self._owns_link = isinstance(link, str)
-        if isinstance(link, str):
-            link = MavlinkLink(link, system=system, component=component)
-        self.link = link
-        self.name = f"mavlink {link.url}"
+        self.link = MavlinkLink(link, options) if isinstance(link, str) else link
+        self.name = f"mavlink {self.link.url}"
         self._n_dropped = 0
-        self._distance = _distance_message(link.dialect)
-        self._values = _value_messages(link.dialect, NAMES)
-        self._filtered_values = _value_messages(link.dialect, FILTERED_NAMES)
+        self._distance = _distance_message(self.link.dialect)
+        self._values = _value_messages(self.link.dialect, NAMES)
+        self._filtered_values = _value_messages(self.link.dialect, FILTERED_NAMES)
         self._was_filtered = False
 
     def send(self, sample: LiveSample) -> None:

@@ -1,6 +1,8 @@
 """Where a MAVLink peer is, as pilots write it."""
 
+import ipaddress
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -92,6 +94,42 @@ def parse_address(url: str) -> Address:
     if url.startswith("/dev/") or re.match(r"COM\d+\b", url):
         return _serial_address(url, url)
     raise OptionError(f"MAVLink connection {url!r}: not understood; {_FORMS}")
+
+
+class AllowedPeers:
+    """Addresses that are listened to.
+
+    Parameters
+    ----------
+    rules : sequence of str
+        Each `ADDRESS`, `ADDRESS:PORT` or `NETWORK/BITS`, in numbers; everybody if there is none.
+
+    Raises
+    ------
+    OptionError
+        If one is none of these.
+    """
+
+    def __init__(self, rules: Sequence[str] = ()) -> None:
+        self._rules = [_peer_rule(text) for text in rules]
+
+    def __contains__(self, peer: Sequence[object]) -> bool:
+        """Return whether an address, as the system writes it, may speak."""
+        if not self._rules or not peer:
+            return True
+        address = ipaddress.ip_address(str(peer[0]).partition("%")[0])
+        return any(address in network and port in (None, peer[1]) for network, port in self._rules)
+
+
+def _peer_rule(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, int | None]:
+    host, port = parse_host_port(text) or (text, None)
+    try:
+        return ipaddress.ip_network(host, strict=False), port
+    except ValueError:
+        raise OptionError(
+            f"MAVLink peer {text!r}: not understood; write numbers, such as 192.168.2.2, "
+            "192.168.2.2:14550 or 192.168.2.0/24"
+        ) from None
 
 
 def parse_host_port(text: str) -> tuple[str, int] | None:

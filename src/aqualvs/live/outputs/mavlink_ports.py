@@ -3,9 +3,11 @@
 import errno
 import socket
 import time
+from collections.abc import Sequence
 from typing import Protocol
 
 from aqualvs.errors import OptionError
+from aqualvs.live.mavlink_peers import Peer
 from aqualvs.live.outputs.mavlink_address import Address, NetAddress, SerialAddress
 
 _DATAGRAM = 65_535
@@ -14,14 +16,19 @@ _CONNECT_S = 1.0
 # A stream that takes nothing for so long leads nowhere.
 _STALLED_S = 5.0
 _SEND_BUFFER = 16_384
-# Peers of a listening port are forgotten after so long, and are so many at most.
-_PEER_S = 10.0
-_MAX_PEERS = 8
 _NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
 
 
 class Port(Protocol):
     """An open way to a peer. Whatever shows that it is broken is raised as OSError."""
+
+    @property
+    def many(self) -> bool:
+        """Whether anybody may send to it, and addresses keep senders apart."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether what is read is a datagram."""
 
     @property
     def refused_s(self) -> float | None:
@@ -38,11 +45,17 @@ class Port(Protocol):
     def fileno(self) -> int:
         """Return the number to wait on."""
 
-    def read(self) -> bytes:
-        """Return what has come, empty if nothing."""
+    def read(self) -> tuple[bytes, Peer]:
+        """Return what has come, empty if nothing, and from where."""
 
-    def write(self, frames: bytes) -> bool:
-        """Send all of it, or nothing if there is no room; return whether it went."""
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
+        """Send all of it, or nothing if there is no room; return whether it went.
+
+        Where there is only one peer, its address is left empty.
+        """
+
+    def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
+        """Send to everybody: to those heard, where the port has no address of its own."""
 
     def flush(self) -> None:
         """Send what waits, as far as there is room."""
@@ -65,6 +78,8 @@ def open_port(address: Address) -> Port:
         return SerialPort(address)
     if address.kind == "tcp":
         return _TcpPort(address)
+    if address.kind == "udpbcast":
+        return _UdpBroadcaster(address)
     return _UdpListener(address) if address.kind == "udpin" else _UdpSender(address)
 
 
@@ -104,6 +119,7 @@ class _UdpPort:
 
     unsent = False
     lag_s = 0.0
+    whole = True
 
     def __init__(self, made: socket.socket) -> None:
         self._socket = made
@@ -118,15 +134,15 @@ class _UdpPort:
     def close(self) -> None:
         self._socket.close()
 
-    def _sent(self, frames: bytes, where: tuple[object, ...] | None) -> bool:
-        """Send a datagram to an address, or to the connected peer."""
+    def _sent(self, frames: bytes, where: Peer) -> bool:
+        """Send a datagram to an address, or to the connected peer if that is empty."""
         # A refusal belongs to an earlier datagram; this one has not been tried yet.
         for _ in range(2):
             try:
-                if where is None:
-                    self._socket.send(frames)
-                else:
+                if where:
                     self._socket.sendto(frames, where)
+                else:
+                    self._socket.send(frames)
             except (ConnectionRefusedError, ConnectionResetError):
                 self.refused_s = time.monotonic()
             except OSError as fault:
@@ -137,7 +153,7 @@ class _UdpPort:
                 return True
         return False
 
-    def _received(self) -> tuple[bytes, tuple[object, ...] | None]:
+    def _received(self) -> tuple[bytes, Peer]:
         try:
             return self._socket.recvfrom(_DATAGRAM)
         except (ConnectionRefusedError, ConnectionResetError):
@@ -145,37 +161,64 @@ class _UdpPort:
         except OSError as fault:
             if fault.errno not in _NOT_NOW:
                 raise
-        return b"", None
+        return b"", ()
 
 
 class _UdpSender(_UdpPort):
-    """Sends to one address; hears whoever answers."""
+    """Sends to one address, and hears that alone."""
+
+    many = False
 
     def __init__(self, address: NetAddress) -> None:
         made, where = _open_udp(address, passive=False)
         super().__init__(made)
         try:
-            if address.kind == "udpbcast":
-                made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-                # Bound, so that it can be read before the first datagram goes out.
-                made.bind(("", 0))
-            else:
-                # Connected, so that the system tells when nobody listens.
-                made.connect(where)
+            # Connected, so that the system tells when nobody listens, and lets nobody else in.
+            made.connect(where)
         except OSError:
             made.close()
             raise
-        self._where = where if address.kind == "udpbcast" else None
 
-    def read(self) -> bytes:
-        return self._received()[0]
+    def read(self) -> tuple[bytes, Peer]:
+        return self._received()[0], ()
 
-    def write(self, frames: bytes) -> bool:
+    def write(self, frames: bytes, _peer: Peer, /) -> bool:
+        return self._sent(frames, ())
+
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
+        return self._sent(frames, ())
+
+
+class _UdpBroadcaster(_UdpPort):
+    """Sends to a broadcast address; hears whoever answers."""
+
+    many = True
+
+    def __init__(self, address: NetAddress) -> None:
+        made, self._where = _open_udp(address, passive=False)
+        super().__init__(made)
+        try:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            # Bound, so that it can be read before the first datagram goes out.
+            made.bind(("", 0))
+        except OSError:
+            made.close()
+            raise
+
+    def read(self) -> tuple[bytes, Peer]:
+        return self._received()
+
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
+        return self._sent(frames, peer)
+
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
         return self._sent(frames, self._where)
 
 
 class _UdpListener(_UdpPort):
-    """Listens, and sends to those it has heard lately."""
+    """Listens, and sends to those it has heard."""
+
+    many = True
 
     def __init__(self, address: NetAddress) -> None:
         made, where = _open_udp(address, passive=True)
@@ -190,35 +233,27 @@ class _UdpListener(_UdpPort):
                     f"{address.host} is no address of this computer; to send there use udpout:",
                 ) from fault
             raise
-        self._heard_s: dict[tuple[object, ...], float] = {}
 
-    def read(self) -> bytes:
-        data, where = self._received()
-        if where is not None:
-            self._heard_s.pop(where, None)
-            self._heard_s[where] = time.monotonic()
-            if len(self._heard_s) > _MAX_PEERS:
-                self._heard_s.pop(next(iter(self._heard_s)))
-        return data
+    def read(self) -> tuple[bytes, Peer]:
+        return self._received()
 
-    def write(self, frames: bytes) -> bool:
-        now = time.monotonic()
-        peers = [where for where, heard in tuple(self._heard_s.items()) if now - heard < _PEER_S]
-        sent = [self._sent_to(frames, where) for where in peers]
-        return any(sent)
-
-    def _sent_to(self, frames: bytes, where: tuple[object, ...]) -> bool:
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
         """Send to one peer; one that cannot be reached must not keep it from the others."""
         try:
-            return self._sent(frames, where)
+            return self._sent(frames, peer)
         except OSError:
             return False
+
+    def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
+        sent = [self.write(frames, peer) for peer in heard]
+        return any(sent)
 
 
 class StreamPort:
     """What TCP and serial share: a message may go in parts, and the rest goes before the next."""
 
     refused_s: float | None = None
+    many = whole = False
 
     def __init__(self) -> None:
         self._rest = b""
@@ -234,17 +269,21 @@ class StreamPort:
         """How long the driver is going to send what it holds already."""
         return 0.0
 
-    def read(self) -> bytes:
-        """Return what has come, empty if nothing."""
+    def read(self) -> tuple[bytes, Peer]:
+        """Return what has come, empty if nothing, and from where: from the only peer."""
         try:
             data = self._take()
         except BlockingIOError:
-            return b""
+            return b"", ()
         if not data:
             raise ConnectionResetError(errno.ECONNRESET, "the peer has gone")
-        return data
+        return data, ()
 
-    def write(self, frames: bytes) -> bool:
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
+        """Send to everybody: to the only peer."""
+        return self.write(frames, ())
+
+    def write(self, frames: bytes, _peer: Peer, /) -> bool:
         """Send all of it, or nothing if there is no room; return whether it went."""
         self.flush()
         if self._rest:

@@ -140,11 +140,16 @@ def health_message(health: Health, stamp_ns: int) -> bytes:
     return to.finish()
 
 
-def rig_message(rig: Rig, options: ScannerOptions, stamp_ns: int) -> bytes:
-    """Return what the run measures with."""
+def rig_texts(rig: Rig, options: ScannerOptions) -> tuple[str, str, str]:
+    """Return the rig file, its exact numbers and the scanner's options as a message has them."""
+    return rig_yaml(rig), rig_exact(rig), options_text(options)
+
+
+def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
+    """Return what the run measures with, from `rig_texts`."""
     to = CdrWriter()
     to.header(stamp_ns, FRAME_ID)
-    for words in (rig_yaml(rig), rig_exact(rig), options_text(options)):
+    for words in texts:
         to.text(words)
     return to.finish()
 

@@ -1,5 +1,6 @@
 """Reading recordings back, torn ones too."""
 
+import contextlib
 import struct
 import zlib
 from collections.abc import Collection, Iterator
@@ -10,12 +11,21 @@ from typing import BinaryIO
 import pyarrow as pa
 
 from aqualvs.errors import SourceError
-from aqualvs.live.recorder.records import FOOTER_BYTES, HEAD_BYTES, MAGIC, Op
+from aqualvs.live.recorder.records import (
+    DATA_END_BYTES,
+    FOOTER_BYTES,
+    HEAD_BYTES,
+    MAGIC,
+    Op,
+)
 
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-# What a record may hold at most; more is garbage in a torn file.
-_LARGEST = 1 << 31
+MAX_RECORD_BYTES = 1 << 29
+"""Size of a record, also when decompressed; more is damage, or meant to fill the memory."""
+# The records of a summary are far smaller than chunks.
+_MAX_SUMMARY_BYTES = 1 << 24
+_KNOWN = frozenset(Op)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,19 +46,37 @@ class StoredMessage:
 
 
 @dataclass(slots=True)
-class _Index:
-    """What a file holds."""
+class _Listing:
+    """What one end of a file tells of it.
 
-    topics: dict[int, str] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    chunks: list[int] = field(default_factory=list)
+    Attributes
+    ----------
+    channels : list of (int, str)
+        Numbers and topics.
+    chunks : dict
+        From a chunk's place in the file to the length of its record; None where not known.
+    counts : dict or None
+        Messages by channel.
+    n_chunks : int or None
+        As the statistics have it.
+    whole : bool
+        Whether it was read to its end.
+    """
+
+    channels: list[tuple[int, str]] = field(default_factory=list)
+    chunks: dict[int, int | None] = field(default_factory=dict)
+    counts: dict[int, int] | None = None
+    n_chunks: int | None = None
+    whole: bool = False
 
 
 class McapFile:
     """An MCAP file whose chunks can be read one after the other.
 
-    A file without a sound summary, torn by a loss of power, is read from its beginning as far as it
-    goes.
+    What the summary at the end tells is checked against the chunks themselves. Where they differ,
+    or the end is missing, as after a loss of power or with a bit that flipped on the disk, the file
+    is read from its beginning as far as it goes, and what the summary tells beyond that is added:
+    damage in one place loses the chunk that it is in.
 
     Parameters
     ----------
@@ -57,7 +85,7 @@ class McapFile:
     Attributes
     ----------
     n_torn : int
-        Chunks left out so far because their checksum was wrong.
+        Chunks left out so far because they are damaged.
 
     Raises
     ------
@@ -67,21 +95,41 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.n_torn = 0
+        self._torn: set[int] = set()
         with self._opened() as file:
-            if file.read(len(MAGIC)) != MAGIC:
+            size = file.seek(0, 2)
+            file.seek(0)
+            begins = file.read(len(MAGIC)) == MAGIC
+            file.seek(max(0, size - len(MAGIC)))
+            if not begins and file.read() != MAGIC:
                 raise SourceError(f"{path}: no MCAP file; give a recording")
-            self._index = _from_summary(file) or _from_scan(file)
+            front, summary = _front(file, size, only_channels=True), _summary(file, size)
+            sound = _is_sound(file, summary)
+            if not sound:
+                front = _front(file, size, only_channels=False)
+        self._topics = _merged_topics(front, summary)
+        self._counts = summary.counts if sound else None
+        # What was read to its end needs no summary, which may itself be damaged.
+        listed = summary.chunks if sound else front.chunks
+        if not (sound or front.whole):
+            listed = front.chunks | summary.chunks
+        self._chunks = sorted(listed)
+
+    @property
+    def n_torn(self) -> int:
+        """Return how many damaged chunks were left out so far."""
+        return len(self._torn)
 
     @property
     def topics(self) -> tuple[str, ...]:
         """Topics that the file knows, also those without messages."""
-        return tuple(self._index.topics.values())
+        return tuple(dict.fromkeys(name for names in self._topics.values() for name in names))
 
     def count(self, topic: str) -> int | None:
         """Return the number of messages of a topic; None where the file does not say."""
-        counts = self._index.counts
-        return next((counts.get(n) for n, name in self._index.topics.items() if name == topic), 0)
+        if self._counts is None:
+            return None
+        return sum(n for number, n in self._counts.items() if topic in self._topics.get(number, ()))
 
     def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
         """Yield the messages of some topics in the order of the file.
@@ -91,12 +139,17 @@ class McapFile:
         SourceError
             If the file cannot be read any more.
         """
-        wanted = {n: name for n, name in self._index.topics.items() if name in topics}
+        wanted = {
+            number: name
+            for number, names in self._topics.items()
+            for name in names
+            if name in topics
+        }
         with self._opened() as file:
-            for at in self._index.chunks:
+            for at in self._chunks:
                 raw = _chunk_at(file, at)
                 if raw is None:
-                    self.n_torn += 1
+                    self._torn.add(at)
                 else:
                     yield from _messages(raw, wanted)
 
@@ -109,56 +162,102 @@ class McapFile:
             raise SourceError(f"{self.path}: cannot be read ({fault.strerror})") from fault
 
 
-def _from_summary(file: BinaryIO) -> _Index | None:
-    """Return what the summary tells, None where there is none."""
-    size = file.seek(0, 2)
-    if size < FOOTER_BYTES:
-        return None
-    file.seek(size - FOOTER_BYTES)
+def _summary(file: BinaryIO, size: int) -> _Listing:
+    """Return what the summary tells; nothing where there is none that can be read to its end."""
+    file.seek(max(0, size - FOOTER_BYTES))
     end = file.read(FOOTER_BYTES)
-    if end[0] != Op.FOOTER or not end.endswith(MAGIC):
-        return None
+    if len(end) < FOOTER_BYTES or end[0] != Op.FOOTER:
+        return _Listing()
     (at,) = struct.unpack_from("<Q", end, HEAD_BYTES)
     if not 0 < at < size:
-        return None
-    found = _Index()
-    for kind, content in _records(file, at):
-        if kind == Op.FOOTER:
-            return found
-        _note(found, kind, content)
-    return None
-
-
-def _from_scan(file: BinaryIO) -> _Index:
-    """Return what is found from the beginning on."""
-    found, at = _Index(), len(MAGIC)
-    while (first := _record_head(file, at)) is not None:
-        kind, length = first
-        if kind in (Op.DATA_END, Op.FOOTER):
-            break
-        if kind == Op.CHUNK:
-            found.chunks.append(at)
-        elif kind == Op.CHANNEL:
-            _note(found, kind, file.read(length))
-        at += HEAD_BYTES + length
+        return _Listing()
+    found = _Listing()
+    try:
+        for kind, content in _records(file, at):
+            if kind == Op.FOOTER:
+                found.whole = True
+                return found
+            _note(found, kind, content)
+    except (struct.error, ValueError):
+        pass
     return found
 
 
-def _note(found: _Index, kind: int, content: bytes) -> None:
-    """Take in a record of the summary."""
+def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
+    """Return what is found from the beginning on, or before the first chunk."""
+    found, at = _Listing(), len(MAGIC)
+    while (first := _record_head(file, at)) is not None:
+        kind, length = first
+        if kind == Op.CHUNK:
+            if only_channels:
+                break
+            found.chunks[at] = length
+        elif kind == Op.CHANNEL and length <= _MAX_SUMMARY_BYTES:
+            with contextlib.suppress(struct.error, ValueError):
+                _note(found, kind, file.read(length))
+        elif kind == Op.DATA_END and length == DATA_END_BYTES - HEAD_BYTES:
+            found.whole = True
+            break
+        at += HEAD_BYTES + length
+        if at > size:
+            # The record that seems to reach beyond the end is damaged, a chunk cut off.
+            break
+    return found
+
+
+def _is_sound(file: BinaryIO, summary: _Listing) -> bool:
+    """Return whether a summary is whole and agrees with itself and with the chunks."""
+    numbers = [number for number, _ in summary.channels]
+    if not summary.whole or summary.n_chunks != len(summary.chunks) or not summary.chunks:
+        return False
+    if len(set(numbers)) < len(numbers) or summary.counts is None:
+        return False
+    return all(
+        _record_head(file, at) == (Op.CHUNK, length) for at, length in summary.chunks.items()
+    )
+
+
+def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, ...]]:
+    """Return the topics of every channel by both ends; one end that contradicts itself is left out.
+
+    Where the ends give a channel two names both count: damage makes a name that nobody asks for.
+    """
+    found: dict[int, tuple[str, ...]] = {}
+    for one in (front, summary):
+        numbers = [number for number, _ in one.channels]
+        if len(set(numbers)) == len(numbers):
+            for number, name in one.channels:
+                found[number] = tuple(dict.fromkeys((*found.get(number, ()), name)))
+    return found
+
+
+def _note(found: _Listing, kind: int, content: bytes) -> None:
+    """Take in a record.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If it is none.
+    """
     if kind == Op.CHANNEL:
         number, _, n_bytes = struct.unpack_from("<HHI", content)
-        found.topics[number] = content[8 : 8 + n_bytes].decode("utf-8", "replace")
+        found.channels.append((number, content[8 : 8 + n_bytes].decode("utf-8", "replace")))
     elif kind == Op.CHUNK_INDEX:
-        found.chunks.append(struct.unpack_from("<Q", content, 16)[0])
+        at, length = struct.unpack_from("<QQ", content, 16)
+        found.chunks[at] = length - HEAD_BYTES
     elif kind == Op.STATISTICS:
-        found.counts = dict(struct.iter_unpack("<HQ", content[46:]))
+        n_messages, _, _, _, _, n_chunks = struct.unpack_from("<QHIIII", content)
+        counts = dict(struct.iter_unpack("<HQ", content[46:]))
+        found.n_chunks = n_chunks
+        found.counts = counts if sum(counts.values()) == n_messages else None
 
 
 def _records(file: BinaryIO, at: int) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of the records from a place on; paddings without their content."""
     while (first := _record_head(file, at)) is not None:
         kind, length = first
+        if kind < Op.PADDING and length > _MAX_SUMMARY_BYTES:
+            return
         content = b"" if kind >= Op.PADDING else file.read(length)
         if kind < Op.PADDING and len(content) < length:
             return
@@ -173,7 +272,9 @@ def _record_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
     if len(head) < HEAD_BYTES or head[0] == 0:
         return None
     kind, length = struct.unpack("<BQ", head)
-    return None if length > _LARGEST else (kind, length)
+    # Paddings run ahead of the data, attachments are skipped.
+    skipped = kind >= Op.PADDING or kind not in _KNOWN
+    return None if length > MAX_RECORD_BYTES and not skipped else (kind, length)
 
 
 def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
@@ -188,17 +289,24 @@ def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
         name_at = _CHUNK_HEAD.size + 4
         compression = content[name_at : name_at + n_name].decode("ascii")
         data = content[name_at + n_name + 8 :]
-        raw = _decompressed(compression, data, raw_size)
+        raw = decompressed(compression, data, raw_size)
     except (struct.error, ValueError, OSError, pa.ArrowException):
         return None
     return raw if crc in (0, zlib.crc32(raw)) else None
 
 
-def _decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
+def decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
+    """Return the raw content of a chunk.
+
+    Raises
+    ------
+    ValueError, OSError, ArrowException
+        If it has another size than its head says, or is too large.
+    """
     if not compression:
         return data
-    if raw_size > _LARGEST:
-        raise ValueError("too large")
+    if raw_size > MAX_RECORD_BYTES:
+        raise ValueError(f"a chunk of {raw_size} bytes")
     found: bytes = pa.decompress(data, raw_size, codec=compression, asbytes=True)
     return found
 

@@ -98,6 +98,7 @@ class Recorder:
         """Write what is left and close the file; further calls do nothing."""
         with self._changed:
             if not self._closing:
+                self._chunks.finish()
                 self._hand_over()
                 self._closing = True
                 self._changed.notify()

@@ -1,6 +1,6 @@
 """A recording that is written in the caller's own time, as `aqualvs run` does it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -9,6 +9,7 @@ from aqualvs.live.recorder import records, schemas
 from aqualvs.live.recorder.chunk import ChunkBuilder
 from aqualvs.live.recorder.growing_file import GrowingFile
 from aqualvs.live.recorder.sample_encoder import RecordClock, RecorderOptions, SampleEncoder
+from aqualvs.live.recorder.schemas import Topic
 from aqualvs.live.sample import LiveSample
 
 MAX_CHUNK_BYTES = 4 << 20
@@ -30,25 +31,36 @@ class SampleChunks:
     def __init__(self, options: RecorderOptions) -> None:
         self._encoder, self._clock = SampleEncoder(options), RecordClock()
         self._chunk_ns = round(1e9 * options.chunk_s)
-        self._sequence = 0
+        self._sequence = self._publish_ns = 0
         self._begin()
 
     def _begin(self) -> None:
         self._builder = ChunkBuilder()
         self._from_ns = 0
+        self._holds_rig = False
         self.n_samples = 0
 
     def add(self, sample: LiveSample) -> bool:
         """Add a sample; returns whether the chunk is due."""
         stamp_ns = self._clock.stamp_ns(sample)
         self._from_ns = self._from_ns or stamp_ns
-        publish_ns = max(sample.utc_ns, 0)
-        for topic, data in self._encoder.messages(sample, stamp_ns):
-            self._builder.add(topic.number, self._sequence, stamp_ns, publish_ns, data)
+        self._publish_ns = max(sample.utc_ns, 0)
+        self._add(self._encoder.messages(sample, stamp_ns), stamp_ns)
         self._sequence += 1
         self.n_samples += 1
         long = stamp_ns - self._from_ns >= self._chunk_ns
         return long or self._builder.n_bytes >= MAX_CHUNK_BYTES
+
+    def finish(self) -> None:
+        """Add the rig once more, unless the present chunk holds it already."""
+        if not self._holds_rig:
+            stamp_ns = self._clock.last_ns
+            self._add(self._encoder.rig_again(stamp_ns), stamp_ns)
+
+    def _add(self, messages: Iterable[tuple[Topic, bytes]], stamp_ns: int) -> None:
+        for topic, data in messages:
+            self._holds_rig = self._holds_rig or topic is schemas.RIG
+            self._builder.add(topic.number, self._sequence, stamp_ns, self._publish_ns, data)
 
     def take(self) -> ChunkBuilder:
         """Return the messages so far, perhaps none, and begin anew."""
@@ -75,6 +87,7 @@ class Recording:
     def __init__(self, path: Path, options: RecorderOptions) -> None:
         self._chunks = SampleChunks(options)
         self._file = recording_file(path)
+        self._closed = False
 
     def write(self, sample: LiveSample) -> None:
         """Add a sample; it is in the file after `RecorderOptions.chunk_s` at the latest."""
@@ -83,6 +96,10 @@ class Recording:
 
     def close(self) -> None:
         """Write what is left and close the file; further calls do nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._chunks.finish()
         try:
             self._flush()
         except OSError:

@@ -52,10 +52,10 @@ class DiveRecording:
     Attributes
     ----------
     path : Path
-    rig : Rig
-        That the dive was measured with at its beginning.
-    options : ScannerOptions
-        As the dive was measured.
+    rig : Rig or None
+        That the dive was measured with at its beginning; None where it is lost or not understood.
+    options : ScannerOptions or None
+        As the dive was measured; likewise.
     n_frames : int or None
         None where a torn file does not say.
     fps : float or None
@@ -71,21 +71,42 @@ class DiveRecording:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = McapFile(path)
-        stored = next(self._file.messages([schemas.RIG.name]), None)
-        if stored is None or schemas.STRIPES.name not in self._file.topics:
+        if schemas.STRIPES.name not in self._file.topics:
             raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
-        try:
-            text, exact, options = messages.rig_texts_of(stored.data)
-            self.rig: Rig = rig_from_record(text, exact, str(path))
-            self.options: ScannerOptions = options_from_text(options)
-        except (ValueError, KeyError, TypeError) as fault:
-            raise SourceError(
-                f"{path}: its rig cannot be understood ({fault}); "
-                "was it written by a later version?"
-            ) from fault
+        self.rig: Rig | None = None
+        self.options: ScannerOptions | None = None
+        self._no_rig = "its rig is in none of its undamaged parts; add --rig"
+        # Told every minute, the rig outlives the part that held it first.
+        stored = next(self._file.messages([schemas.RIG.name]), None)
+        if stored is not None:
+            self._read_rig(stored.data)
         self.n_frames = self._file.count(schemas.STRIPES.name)
         self.has_pictures = next(self._file.messages([schemas.PICTURE.name]), None) is not None
         self.fps = self._mean_rate()
+
+    def need_rig(self) -> Rig:
+        """Return the rig.
+
+        Raises
+        ------
+        SourceError
+            If it is lost or not understood.
+        """
+        if self.rig is None:
+            raise SourceError(f"{self.path}: {self._no_rig}")
+        return self.rig
+
+    def _read_rig(self, message: bytes) -> None:
+        try:
+            text, exact, options = messages.rig_texts_of(message)
+            rig = rig_from_record(text, exact, str(self.path))
+            self.options = options_from_text(options)
+            self.rig = rig
+        except (AqualvsError, ValueError, KeyError, TypeError) as fault:
+            self._no_rig = (
+                f"its rig cannot be understood ({fault}); was it written by a later version? "
+                "Add --rig"
+            )
 
     @property
     def n_torn(self) -> int:

@@ -5,8 +5,8 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-import yaml
 
+from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.dome import Dome
@@ -19,6 +19,7 @@ from aqualvs.scanning.pipeline import ScannerOptions
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.threshold import ThresholdOptions
+from aqualvs.yamlfile import parse_yaml
 
 
 def rig_yaml(rig: Rig) -> str:
@@ -58,7 +59,8 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     ValueError
         If the numbers do not belong to it.
     """
-    rig = rig_from_mapping(yaml.safe_load(text), source_name=source_name, need_lasers=False)
+    content = parse_yaml(text, source_name, RigError)
+    rig = rig_from_mapping(content, source_name=source_name, need_lasers=False)
     numbers = json.loads(exact)
     return replace(
         rig,

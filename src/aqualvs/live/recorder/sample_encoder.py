@@ -15,6 +15,9 @@ from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame
 
 _HEALTH_EVERY_NS = 1_000_000_000
+# The rig is told again after a second, then at intervals that double up to a minute, and at the
+# end: a part that is damaged, the first one too, takes no rig with it.
+_RIG_AGAIN_NS, _RIG_EVERY_NS = 1_000_000_000, 60_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +72,8 @@ class SampleEncoder:
         self._options = options
         self._rig: Rig | None = None
         self._exact = ""
+        self._rig_texts: tuple[str, str, str] | None = None
+        self._rig_wait_ns = self._rig_from_ns = 0
         self._health_from_ns = self._points_from_ns = 0
 
     def messages(self, sample: LiveSample, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
@@ -86,14 +91,29 @@ class SampleEncoder:
             yield schemas.HEALTH, messages.health_message(sample.health, stamp_ns)
 
     def rig_messages(self, rig: Rig, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
-        """Yield the rig if it is not the one before; its water is told with every frame."""
+        """Yield the rig if it is not the one before, or due again; its water is in every frame."""
+        if self._is_new(rig):
+            self._rig, self._exact = rig, rig_exact(rig)
+            self._rig_texts = messages.rig_texts(rig, self._options.scanner)
+            self._rig_wait_ns = _RIG_AGAIN_NS
+        elif stamp_ns >= self._rig_from_ns:
+            self._rig_wait_ns = min(2 * self._rig_wait_ns, _RIG_EVERY_NS)
+        else:
+            return
+        self._rig_from_ns = stamp_ns + self._rig_wait_ns
+        yield from self.rig_again(stamp_ns)
+
+    def rig_again(self, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+        """Yield the rig that was told last, to the same bit."""
+        if self._rig_texts is not None:
+            yield schemas.RIG, messages.rig_message(self._rig_texts, stamp_ns)
+
+    def _is_new(self, rig: Rig) -> bool:
         if rig is self._rig:
-            return
-        exact = rig_exact(rig if self._rig is None else rig.in_water(self._rig.n_water))
-        if exact == self._exact:
-            return
-        self._rig, self._exact = rig, rig_exact(rig)
-        yield schemas.RIG, messages.rig_message(rig, self._options.scanner, stamp_ns)
+            return False
+        return self._exact != rig_exact(
+            rig if self._rig is None else rig.in_water(self._rig.n_water)
+        )
 
     def _pictures(self, frame: Frame, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
         kind = self._options.pictures
@@ -120,19 +140,24 @@ class RecordClock:
     """Gives every sample a time that rises, whatever the system's clock does.
 
     That of the first sample is the system's; from there on the monotonic clock counts.
+
+    Attributes
+    ----------
+    last_ns : int
+        Time of the last sample.
     """
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
-        self._last_ns = 0
+        self.last_ns = 0
 
     def stamp_ns(self, sample: LiveSample) -> int:
         """Return the time of a sample's arrival, nanoseconds since 1970."""
         arrived_ns = sample.instants.arrived_ns
         if self._offset_ns is None:
             self._offset_ns = sample.utc_ns - arrived_ns
-        self._last_ns = max(self._offset_ns + arrived_ns, self._last_ns + 1)
-        return self._last_ns
+        self.last_ns = max(self._offset_ns + arrived_ns, self.last_ns + 1)
+        return self.last_ns
 
 
 def _is_silence(sample: LiveSample) -> bool:

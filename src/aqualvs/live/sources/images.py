@@ -36,9 +36,11 @@ class ImageSource:
         self._paths = images_in(paths) if isinstance(paths, Path) else list(paths)
         if not self._paths:
             raise SourceError(f"{self.name}: no images; name at least one")
-        first = _read(self._paths[0])
+        first = read_image(self._paths[0])
         if first is None:
-            raise SourceError(f"{self._paths[0]}: not a readable image; remove or replace it")
+            raise SourceError(
+                f"{self._paths[0]}: not a readable image, or too large; remove or replace it"
+            )
         self.size_px = (first.shape[1], first.shape[0])
         self.n_frames = len(self._paths)
 
@@ -46,7 +48,7 @@ class ImageSource:
         """Yield the readable images; unreadable ones leave a gap in the index."""
         last = -1
         for index, path in enumerate(self._paths):
-            image = _read(path)
+            image = read_image(path)
             if image is None:
                 continue
             self._check_size(path, image)
@@ -54,7 +56,9 @@ class ImageSource:
             yield Frame(index, index / self.fps, luma, chroma)
             last = index
         if last + 1 < self.n_frames:
-            raise SourceError(f"{self._paths[-1]}: not a readable image; remove or replace it")
+            raise SourceError(
+                f"{self._paths[-1]}: not a readable image, or too large; remove or replace it"
+            )
 
     def _check_size(self, path: Path, image: ImagePlane) -> None:
         size = (image.shape[1], image.shape[0])
@@ -100,11 +104,25 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", path.name)]
 
 
-def _read(path: Path) -> ImagePlane | None:
-    """Return the image, grey if it is grey, or None if it cannot be decoded."""
+def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
+    """Return an image, or None if it cannot be decoded.
+
+    Parameters
+    ----------
+    path : Path
+    how : int
+        OpenCV's flag; the default returns grey images as grey.
+
+    Returns
+    -------
+    image : array or None
+        None for pipes and devices too, and for images of more pixels than OpenCV is told to take
+        (`aqualvs/__init__.py`).
+    """
     level = cv2.utils.logging.setLogLevel(0)
     try:
-        image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
+        return cast("ImagePlane | None", cv2.imread(str(path), how) if path.is_file() else None)
+    except cv2.error:
+        return None
     finally:
         cv2.utils.logging.setLogLevel(level)
-    return cast("ImagePlane | None", image)

@@ -1,11 +1,15 @@
 """Images from MCAP files: Foxglove's messages, and those of ROS 1 and ROS 2."""
 
+import contextlib
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, Any, BinaryIO, TypeAlias, cast
 
 from aqualvs.errors import OptionError, SourceError
+from aqualvs.live.recorder.reader import MAX_RECORD_BYTES, decompressed
+from aqualvs.live.recorder.records import HEAD_BYTES
 from aqualvs.live.sources.image_messages import ImageMessage
 from aqualvs.live.sources.image_schemas import (
     image_of_json,
@@ -53,14 +57,8 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
 
 
 def _image_topics(path: Path) -> list[Topic]:
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-
-    with path.open("rb") as stream:
-        try:
-            summary = make_reader(stream).get_summary()
-        except (McapError, struct.error, OSError, ValueError):
-            summary = None
+    with _opened(path) as stream:
+        summary = _summary(stream)
         if summary is None:
             return _listed(path, stream)
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
@@ -72,10 +70,9 @@ def _image_topics(path: Path) -> list[Topic]:
         ]
 
 
-def _listed(path: Path, stream: IO[bytes]) -> list[Topic]:
+def _listed(path: Path, stream: "_Bounded") -> list[Topic]:
     """Find the topics of a file without index by reading it to its end, or as far as it goes."""
     found: dict[str, Topic] = {}
-    stream.seek(0)
     try:
         for schema, channel, _ in _read(path, stream, None):
             if schema is not None and kind_of_schema(schema.name):
@@ -88,7 +85,7 @@ def _listed(path: Path, stream: IO[bytes]) -> list[Topic]:
 
 def _messages(path: Path, topic: str) -> Iterator[Logged]:
     readers: dict[int, _Reader] = {}
-    with path.open("rb") as stream:
+    with _opened(path) as stream:
         for schema, channel, message in _read(path, stream, topic):
             if schema is None:
                 continue
@@ -100,26 +97,113 @@ def _messages(path: Path, topic: str) -> Iterator[Logged]:
                 yield message.log_time, None
 
 
-def _read(path: Path, stream: IO[bytes], topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
+def _read(path: Path, stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
     """Yield schemas, channels and messages; says in one line where the file breaks off."""
-    from mcap.exceptions import McapError
-    from mcap.reader import NonSeekingReader, make_reader
-
+    summary = _summary(stream)
     try:
-        reader = make_reader(stream)
-        try:
-            has_index = reader.get_summary() is not None
-        except (McapError, struct.error, OSError, ValueError):
-            has_index = False
-        if not has_index:
-            stream.seek(0)
-            reader = NonSeekingReader(stream)
-        yield from reader.iter_messages(topic, log_time_order=has_index)
-    except (McapError, struct.error, EOFError, ValueError) as fault:
+        if summary is not None and summary.chunk_indexes:
+            yield from _by_index(stream, summary, topic)
+        else:
+            yield from _by_order(stream, topic)
+    except _faults() as fault:
         raise SourceError(
-            f"{path}: no MCAP file, or cut short ({type(fault).__name__}); "
+            f"{path}: no MCAP file, damaged, or cut short ({type(fault).__name__}); "
             "what could be read was, copy it again for the rest"
         ) from fault
+
+
+def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[tuple[Any, ...]]:
+    """Yield what the chunks of a topic hold, in the order of their times."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Chunk, Message
+
+    wanted = {n for n, one in summary.channels.items() if topic is None or one.topic == topic}
+    for index in sorted(summary.chunk_indexes, key=lambda one: int(one.message_start_time)):
+        listed = index.message_index_offsets
+        if listed and wanted.isdisjoint(listed):
+            continue
+        stream.seek(index.chunk_start_offset + HEAD_BYTES)
+        records = _records_of(Chunk.read(ReadDataStream(cast("IO[bytes]", stream))))
+        found = [one for one in records if isinstance(one, Message) and one.channel_id in wanted]
+        for message in sorted(found, key=lambda one: int(one.log_time)):
+            channel = summary.channels[message.channel_id]
+            yield summary.schemas.get(channel.schema_id), channel, message
+
+
+def _by_order(stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield what a file without index holds, from its beginning on."""
+    from mcap.records import Channel, Chunk, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    schemas, channels = {}, {}
+    stream.seek(0)
+    for record in StreamReader(cast("IO[bytes]", stream), emit_chunks=True).records:
+        for one in _records_of(record) if isinstance(record, Chunk) else [record]:
+            if isinstance(one, Schema):
+                schemas[one.id] = one
+            elif isinstance(one, Channel):
+                channels[one.id] = one
+            elif isinstance(one, Message):
+                channel = channels[one.channel_id]
+                if topic is None or channel.topic == topic:
+                    yield schemas.get(channel.schema_id), channel, one
+
+
+def _records_of(chunk: Any) -> list[Any]:
+    """Return the records in a chunk; the package would take any amount of memory for them."""
+    from mcap.stream_reader import breakup_chunk
+
+    raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+    return list(breakup_chunk(replace(chunk, compression="", data=raw)))
+
+
+def _summary(stream: "_Bounded") -> Any:
+    """Return the summary of a file, None where it has none that can be read."""
+    from mcap.reader import SeekingReader
+
+    try:
+        stream.seek(0)
+        return SeekingReader(cast("IO[bytes]", stream)).get_summary()
+    except _faults():
+        return None
+
+
+def _faults() -> tuple[type[Exception], ...]:
+    """Return what a damaged file raises, here and in the package that reads it."""
+    from mcap.exceptions import McapError
+    from pyarrow import ArrowException
+
+    return (McapError, ArrowException, struct.error, OSError, EOFError, ValueError, LookupError)
+
+
+class _Bounded:
+    """A file of which no more is read at once than a record may hold."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, n: int = -1) -> bytes:
+        """Return the next bytes.
+
+        Raises
+        ------
+        ValueError
+            If these are too many.
+        """
+        if not 0 <= n <= MAX_RECORD_BYTES:
+            raise ValueError(f"a record of {n} bytes")
+        return self._file.read(n)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[_Bounded]:
+    try:
+        file = path.open("rb")
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
+    with file:
+        yield _Bounded(file)
 
 
 def _reader(path: Path, schema: Any, encoding: str) -> _Reader:

@@ -139,11 +139,16 @@ class MessageSource:
     def _survey(self) -> tuple[tuple[int, int], float | None]:
         """Return the size of the first picture, and the rate of the first ones."""
         size, times = None, []
-        for frame in self._frames():
-            size = size or (frame.luma.shape[1], frame.luma.shape[0])
-            times.append((frame.index, frame.time_s))
-            if len(times) == 10:
-                break
+        try:
+            for frame in self._frames():
+                size = size or (frame.luma.shape[1], frame.luma.shape[0])
+                times.append((frame.index, frame.time_s))
+                if len(times) == 10:
+                    break
+        except SourceError:
+            # What comes before the damage counts; it is told when it is reached again.
+            if size is None:
+                raise
         if size is None:
             raise SourceError(f"{self.name}: no image can be decoded")
         (first, began), (last, ended) = times[0], times[-1]

@@ -3,6 +3,7 @@
 What reads streams, cameras and recordings is imported where it is used: most dives are videos.
 """
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from aqualvs.live.sources.base import FrameSource
 from aqualvs.live.sources.feed import Feed
 from aqualvs.live.sources.images import IMAGE_SUFFIXES, ImageSource
 from aqualvs.live.sources.video import VideoSource
+from aqualvs.special_files import refuse_special
 
 if TYPE_CHECKING:
     from aqualvs.live.sources.remote import Transport
@@ -59,14 +61,15 @@ def open_source(
         If `fps` is given for a video or is not positive; if `topic` is missing, wrong, or given
         for what has none; if a package is missing.
     """
-    if fps is not None and not fps > 0:
-        raise OptionError(f"frame rate {fps:g}: must be positive")
+    if fps is not None and not 0 < fps < math.inf:
+        raise OptionError(f"frame rate {fps:g}: must be positive and finite")
     if is_address(where):
         _no(topic, where, "a stream has no topics; leave the topic out")
         return _video(str(where), fps)
     path, topic = _split_topic(where, topic)
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder; check the path")
+    refuse_special(path)
     if path.suffix.lower() == ".mcap" or is_bag(path):
         _no(fps, path, "a recording has its own clock; leave the frame rate out")
         return _recording(path, topic)
@@ -132,8 +135,8 @@ def open_feed(
     from aqualvs.live.sources.paced import PacedFeed
 
     text = str(where)
-    if fps is not None and not fps > 0:
-        raise OptionError(f"frame rate {fps:g}: must be positive")
+    if fps is not None and not 0 < fps < math.inf:
+        raise OptionError(f"frame rate {fps:g}: must be positive and finite")
     if is_camera(text):
         _no(transport or topic, text, "a camera has neither transport nor topic; leave it out")
         return CameraFeed(text, CameraOptions(size_px=size_px, fps=fps, pixel_format=pixel_format))

@@ -1,0 +1,339 @@
+"""Read YAML files: the only reader of the package.
+
+Values are plain: None, bool, int, float, str, lists and dicts of them. Numbers are decimal, as
+PyYAML writes them; what looks like a date, an octal or a sexagesimal number is text. Nothing is
+built by recursion, so that no file, however nested, exhausts the stack.
+"""
+
+import re
+import stat
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from aqualvs.errors import AqualvsError
+
+__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "parse_yaml", "read_text", "read_yaml"]
+
+MAX_BYTES = 8_000_000
+"""Size of a file; a list of 10,000 dives has about one million bytes."""
+MAX_DEPTH = 50
+"""Levels of lists and mappings; a rig in a run.yaml has 7."""
+MAX_VALUES = 400_000
+"""Scalars, lists and mappings of a file, each alias counted as what it stands for."""
+
+# PyYAML's own resolver (YAML 1.1) less octal, hexadecimal, binary and sexagesimal numbers.
+_INT = re.compile(r"[-+]?(?:0|[1-9][0-9_]*)")
+_FLOAT = re.compile(
+    r"(?:[-+]?[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+][0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+)
+_WORDS: Final[dict[str, bool | None]] = {
+    **dict.fromkeys(["yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"], True),
+    **dict.fromkeys(["no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"], False),
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+}
+# NumPy's and the recording's integers have 64 bits.
+_MAX_INT = 2**63 - 1
+_MAX_DIGITS = len(str(_MAX_INT))
+_TAG = "tag:yaml.org,2002:"
+_COLLECTION_TAGS = (None, "!", f"{_TAG}seq", f"{_TAG}map")
+# The parser in C is ten times as fast; not every build of PyYAML has it.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_UNPRINTABLE = yaml.reader.Reader.NON_PRINTABLE
+_NO_KEY: Final = object()
+_MERGE: Final = object()
+
+
+class _TextError(Exception):
+    """What is wrong with a text, in which line (from 1; 0 if unknown), and the remedy."""
+
+    def __init__(self, problem: str, line: int, remedy: str = "mend that line") -> None:
+        super().__init__(problem)
+        place = f" in line {line}" if line else ""
+        self.text = f"{problem}{place}; {remedy}"
+
+
+def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
+    """Return the content of a YAML file.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, as messages call it: "a rig file".
+    error : type
+        Exception to raise.
+
+    Raises
+    ------
+    AqualvsError
+        Of type `error`; one line that names the file, the line in it and the remedy.
+    """
+    return parse_yaml(read_text(path, what, error), str(path), error)
+
+
+def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
+    """Return the text of a file in UTF-8, with or without a byte order mark.
+
+    Parameters
+    ----------
+    path, what, error
+        As `read_yaml` takes them.
+
+    Raises
+    ------
+    AqualvsError
+        Of type `error`; one line, if the file is missing, unreadable, too large or not text.
+    """
+    remedy = f"give the path of {what}"
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise error(f"{path}: is a folder; {remedy} in it")
+        # To open a FIFO may wait for ever; a device may have no end.
+        if not stat.S_ISREG(mode):
+            raise error(f"{path}: is no regular file; {remedy}")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise error(f"{path}: no such file; {remedy}") from None
+    except OSError as fault:
+        raise error(f"{path}: cannot be read ({fault.strerror}); {remedy}") from None
+    except ValueError:
+        raise error(f"{str(path)!r}: is no path; {remedy}") from None
+    if len(content) > MAX_BYTES:
+        raise error(f"{path}: is larger than {MAX_BYTES / 1e6:g} MB; {remedy}")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise error(f"{path}: is not text in UTF-8; {remedy}") from None
+
+
+def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:
+    """Return the content of a YAML text.
+
+    Parameters
+    ----------
+    text : str
+    source : str
+        How messages call the text.
+    error : type
+        Exception to raise.
+
+    Raises
+    ------
+    AqualvsError
+        Of type `error`; one line that names the source, the line in it and the remedy.
+    """
+    try:
+        return _parse(text)
+    except _TextError as fault:
+        raise error(f"{source}: {fault.text}") from None
+
+
+def _parse(text: str) -> Any:
+    control = _UNPRINTABLE.search(text)
+    if control is not None:
+        line = text.count("\n", 0, control.start()) + 1
+        raise _TextError(f"is not YAML: control character U+{ord(control[0]):04X}", line)
+    builder = _Builder()
+    try:
+        for event in yaml.parse(text, Loader=_LOADER):
+            builder.add(event)
+    except yaml.MarkedYAMLError as error:
+        problem = " ".join((error.problem or error.context or "malformed").split())
+        mark = error.problem_mark
+        # The parser in C puts what is missing at the end into the line after the last.
+        line = 0 if mark is None else min(mark.line + 1, max(1, len(text.splitlines())))
+        raise _TextError(f"is not YAML: {problem}", line) from None
+    except (yaml.YAMLError, ValueError):
+        # The parser in Python leaks a ValueError for an escape that is no character.
+        raise _TextError("is not YAML", 0, "mend it") from None
+    return builder.content
+
+
+class _Node:
+    """A value under construction, or an anchored one.
+
+    Attributes
+    ----------
+    value : object
+    anchor : str or None
+    count, height : int
+        Values that it holds, itself included, and levels of lists and mappings.
+    key : object
+        Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
+    merges : bool
+        Whether it is `<<`, plain and without a tag.
+    merged : list of dict
+        Mappings to fill up from.
+    """
+
+    __slots__ = ("anchor", "count", "height", "key", "merged", "merges", "value")
+
+    def __init__(self, value: Any, anchor: str | None, *, count: int = 1, height: int = 0) -> None:
+        self.value = value
+        self.anchor = anchor
+        self.count = count
+        self.height = height
+        self.key: Any = _NO_KEY
+        self.merges = False
+        self.merged: list[dict[Any, Any]] = []
+
+
+class _Builder:
+    """Make plain values of a parser's events, one after another."""
+
+    def __init__(self) -> None:
+        self.content: Any = None
+        self._open: list[_Node] = []
+        self._anchors: dict[str, _Node] = {}
+        self._n_documents = 0
+        self._n_values = 0
+
+    def add(self, event: yaml.Event) -> None:
+        """Take the next event.
+
+        Raises
+        ------
+        _TextError
+            If a limit is passed, or a value is not plain.
+        """
+        line = 0 if event.start_mark is None else event.start_mark.line + 1
+        if isinstance(event, yaml.ScalarEvent):
+            node = _Node(_scalar(event, line), event.anchor)
+            node.merges = event.value == "<<" and event.tag is None and event.implicit[0]
+            self._place(node, line)
+        elif isinstance(event, yaml.AliasEvent):
+            self._place(self._anchored(event.anchor or "", line), line)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            self._begin(event, line)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            self._end(line)
+        elif isinstance(event, yaml.DocumentStartEvent):
+            self._n_documents += 1
+            if self._n_documents > 1:
+                raise _TextError("a second document begins", line, "leave it out")
+
+    def _begin(self, event: yaml.CollectionStartEvent, line: int) -> None:
+        if event.tag not in _COLLECTION_TAGS:
+            raise _foreign(event.tag, line)
+        if len(self._open) >= MAX_DEPTH:
+            raise _too_deep(line)
+        parent = self._open[-1] if self._open else None
+        if parent is not None and isinstance(parent.value, dict) and parent.key is _NO_KEY:
+            raise _TextError("a key that is a list or a mapping", line, "write a word as the key")
+        value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
+        self._open.append(_Node(value, event.anchor, height=1))
+
+    def _end(self, line: int) -> None:
+        node = self._open.pop()
+        for extra in node.merged:
+            for key, value in extra.items():
+                node.value.setdefault(key, value)
+        self._place(node, line)
+
+    def _anchored(self, name: str, line: int) -> _Node:
+        node = self._anchors.get(name)
+        if node is None:
+            raise _TextError(f"alias *{name} without its anchor before it", line)
+        if len(self._open) + node.height > MAX_DEPTH:
+            raise _too_deep(line)
+        self._n_values += node.count - 1
+        return _Node(node.value, None, count=node.count, height=node.height)
+
+    def _place(self, node: _Node, line: int) -> None:
+        """Put a finished value where it belongs."""
+        self._n_values += 1
+        if self._n_values > MAX_VALUES:
+            raise _TextError(
+                f"more than {MAX_VALUES:,} values", line, "split the file, or thin it out"
+            )
+        if node.anchor is not None:
+            self._anchors[node.anchor] = node
+        if not self._open:
+            self.content = node.value
+            return
+        parent = self._open[-1]
+        parent.count += node.count
+        parent.height = max(parent.height, node.height + 1)
+        if isinstance(parent.value, list):
+            parent.value.append(node.value)
+        elif parent.key is _NO_KEY:
+            self._take_key(parent, node, line)
+        else:
+            self._take_value(parent, node, line)
+
+    @staticmethod
+    def _take_key(parent: _Node, node: _Node, line: int) -> None:
+        if isinstance(node.value, dict | list):
+            raise _TextError("a key that is a list or a mapping", line, "write a word as the key")
+        if node.merges:
+            parent.key = _MERGE
+        elif node.value in parent.value:
+            raise _TextError(f"key {_shown(node.value)} appears twice", line, "keep one of them")
+        else:
+            parent.key = node.value
+
+    @staticmethod
+    def _take_value(parent: _Node, node: _Node, line: int) -> None:
+        key, parent.key = parent.key, _NO_KEY
+        if key is not _MERGE:
+            parent.value[key] = node.value
+            return
+        merged = node.value if isinstance(node.value, list) else [node.value]
+        if parent.merged or not all(isinstance(one, dict) for one in merged):
+            raise _TextError("<< that is no mapping, or appears twice", line)
+        parent.merged = merged
+
+
+def _scalar(event: yaml.ScalarEvent, line: int) -> Any:
+    """Return the value of a scalar: by its tag, by its looks if it is plain, else its text."""
+    text: str = event.value
+    tag, plain = event.tag, bool(event.implicit[0])
+    if tag in (f"{_TAG}str", "!") or (tag is None and not plain):
+        return text
+    value = _plain(text, line)
+    if tag is None:
+        return value
+    name = tag.removeprefix(_TAG)
+    kinds = {"bool": bool, "float": float, "int": int, "null": type(None)}
+    if name not in kinds or name == tag:
+        raise _foreign(tag, line)
+    if name == "float" and type(value) is int:
+        value = float(value)
+    if type(value) is not kinds[name]:
+        raise _TextError(f"{_shown(text)} is no {name}", line)
+    return value
+
+
+def _plain(text: str, line: int) -> Any:
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INT.fullmatch(text):
+        digits = text.replace("_", "")
+        if len(digits.lstrip("+-")) > _MAX_DIGITS or abs(int(digits)) > _MAX_INT:
+            raise _TextError(
+                f"whole number of {len(digits.lstrip('+-'))} digits", line, "shorten it"
+            )
+        return int(digits)
+    if _FLOAT.fullmatch(text):
+        return float(text.replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
+    return text
+
+
+def _shown(value: object) -> str:
+    """Return a value in one line, cut where it is long."""
+    text = f"'{value}'" if isinstance(value, str) and value.isprintable() else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _foreign(tag: str, line: int) -> _TextError:
+    shown = f"!!{tag.removeprefix(_TAG)}" if tag.startswith(_TAG) else tag
+    return _TextError(f"tag {_shown(shown)}", line, "leave the tag out")
+
+
+def _too_deep(line: int) -> _TextError:
+    return _TextError(f"nested deeper than {MAX_DEPTH} levels", line, "remove levels")
