@@ -24,7 +24,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
-from aqualvs.scanning.stripe import POSITION, PeakFinder, Returns, SearchImage
+from aqualvs.scanning.stripe import N_MEASURES, POSITION, PeakFinder, Returns, SearchImage
 from aqualvs.scanning.stripe import WIDTH as PEAK_WIDTH
 
 Rows = NDArray[np.float32]
@@ -210,15 +210,15 @@ def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
         search.lowest,
         search.highest,
         reach_px,
-        _PEAKS_PER_LINE * n_lines,
         np.array([search.colour.value]),
     )
     grey = np.empty((0, 0), np.uint8)
     levels = np.rint(light).astype(np.uint8)
-    along_x = search.axis is SearchAxis.ALONG_X
-    line, table = finder.find(
-        SearchImage(levels, grey, grey, along_x, search.line_px), _MIN_CONTRAST
-    )
+    most = _PEAKS_PER_LINE * n_lines
+    line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
+    image = SearchImage(levels, grey, grey, search.line_px)
+    n = finder.find(image, _MIN_CONTRAST, 1, line, table)
+    line, table = line[:n], table[:, :n]
     position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]
     # Flanks must lie in the picture.
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
