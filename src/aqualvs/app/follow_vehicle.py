@@ -19,9 +19,9 @@ from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.autopilot import NetPilot
 from aqualvs.control.controller import RangeYawController
-from aqualvs.control.gains_file import load_gains
 from aqualvs.control.safety import SafetyGate
 from aqualvs.control.setpoint import SetpointHolder
+from aqualvs.control.tune import usable_gains
 from aqualvs.errors import AqualvsError
 from aqualvs.live.ardusub_link import ArduSubLink
 from aqualvs.live.mavlink_link import MavlinkLink
@@ -102,7 +102,8 @@ def follow_and_tell(
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)
     holder.put(setpoint)
-    steering = NetPilot(mission, RangeYawController(load_gains(request.gains)), SafetyGate(limits))
+    gains = usable_gains(request.gains)
+    steering = NetPilot(mission, RangeYawController(gains), SafetyGate(limits))
     scanner = Scanner(rig, request.scanner)
     with Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite):
         warm_up(scanner)
