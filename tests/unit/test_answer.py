@@ -51,6 +51,15 @@ def test_a_posture_that_repeats_under_thrust_is_frozen_until_it_changes() -> Non
     assert found[20:] == [None] * 5
 
 
+def test_time_that_stands_still_changes_nothing() -> None:
+    """The very first step after engaging, and one after a pause, last no time."""
+    watch, rng = AnswerWatch(GAINS.vehicle), np.random.default_rng(5)
+    watch.done(0.0, HELD)
+    for now_s in (0.0, 0.0, 0.04, 0.04, 9.0, 8.0):
+        assert watch.see(now_s, noisy(rng), state_at(now_s)) is None
+        watch.done(now_s, HELD)
+
+
 def test_without_thrust_nothing_need_move() -> None:
     assert set(watched([posture_at(0.6)] * 50, NEUTRAL)) == {None}
 

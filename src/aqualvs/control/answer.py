@@ -178,7 +178,7 @@ class AnswerWatch:
         push = (forward * math.cos(yaw) + right * math.sin(yaw)) / self._vehicle.mass
         if push <= 0.0:
             self._backed_s = now_s
-        if self._effort != NEUTRAL:
+        if self._effort != NEUTRAL and step > 0.0:
             self._thrust_s += step
             share = step / (step + min(self._thrust_s, _BALANCE_S))
             self._balance += share * (push - self._balance)
