@@ -145,7 +145,7 @@ def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) ->
 def test_a_vehicle_that_moves_unseen_is_given_back() -> None:
     """The picture stands still, yet has noise: efforts alone tell."""
     neutral_s, _, decisions = frozen_hold("bluerov2", Loss.STUCK, before=0.75)
-    assert neutral_s <= 2.0
+    assert neutral_s <= 2.5
     assert decisions[-1].reason is Reason.NO_ANSWER
     assert not decisions[-1].engaged
     assert Reason.NO_ANSWER.takes_over
