@@ -32,7 +32,7 @@ class Wire:
         self.heard: dict[tuple[str, int, int], Received] = {}
         self.sent: list[Any] = []
         self.works = True
-        self.conflict = ""
+        self.conflict = self.rival = ""
         self.told: dict[str, float] = {}
         self.asked: list[str] = []
 

@@ -182,14 +182,14 @@ def test_a_vehicle_file_says_who_steers(clip: Path, tmp_path: Path) -> None:
     fake.play(parameters={"MAV_GCS_SYSID": 250.0}, station_id=250)
     file = tmp_path / "vehicle.yaml"
     try:
-        with follow(fake, clip, tmp_path) as one:
+        with follow(fake, clip, tmp_path / "refused") as one:
             until(
                 lambda: "set MAV_GCS_SYSID 255, or ground_station 250" in one.press(),
                 "the reason why not",
                 PATIENCE_S,
             )
         file.write_text("aqualvs_vehicle: 1\nground_station: 250\n", encoding="utf-8")
-        with follow(fake, clip, tmp_path, "--vehicle-file", str(file)) as one:
+        with follow(fake, clip, tmp_path / "obeyed", "--vehicle-file", str(file)) as one:
             one.engage()
             until(lambda: fake.steered(), "efforts")
             assert {message["system"] for message in fake.steered()} == {250}

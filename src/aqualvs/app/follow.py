@@ -22,11 +22,11 @@ from aqualvs.app.overwriting import Claim
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.follow_log import FollowLog
-from aqualvs.control.gains_file import load_gains
 from aqualvs.control.mission import HoldMission, Mission
 from aqualvs.control.plan import load_plan
 from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.control.tune import usable_gains
 from aqualvs.errors import OptionError
 from aqualvs.simulation.cameras import simulated_camera
 from aqualvs.simulation.example_rigs import example_rig
@@ -177,34 +177,33 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     case = _case(request, limits, setpoint)
     files = [request.out / name for name in (FOLLOW_CSV, TRUTH_CSV, PAGE, *FIGURE_FILES)]
-    claim = Claim("follow", files, overwrite=request.overwrite)
-    rng = np.random.default_rng([request.seed, 53])
-    freeze_s = math.inf if request.freeze is None else request.freeze
-    frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
-    eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
-    if request.rendered:
-        camera = simulated_camera(request.camera or "ideal")
-        eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
-    loop = case.loop(eye, mission)
-    with ExitStack() as undo:
-        page = None
-        if request.dashboard is not None:
-            holder = SetpointHolder(rig.working_range)
-            holder.put(setpoint)
-            served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
-            page = LoopPage(served, rig, loop, holder)
-            undo.callback(page.close)
-        _run(loop, request, page, tell)
-    write_log(loop.log, request.out / TRUTH_CSV)
-    facts = RunFacts(
-        vehicle=case.model.name,
-        current=request.current,
-        waves=request.waves,
-        rendered=request.rendered,
-        fps=request.fps,
-    )
-    report = write_report(loop.log, facts, request.out)
-    claim.settle()
+    with Claim("follow", files, overwrite=request.overwrite):
+        rng = np.random.default_rng([request.seed, 53])
+        freeze_s = math.inf if request.freeze is None else request.freeze
+        frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
+        eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
+        if request.rendered:
+            camera = simulated_camera(request.camera or "ideal")
+            eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
+        loop = case.loop(eye, mission)
+        with ExitStack() as undo:
+            page = None
+            if request.dashboard is not None:
+                holder = SetpointHolder(rig.working_range)
+                holder.put(setpoint)
+                served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
+                page = LoopPage(served, rig, loop, holder)
+                undo.callback(page.close)
+            _run(loop, request, page, tell)
+        write_log(loop.log, request.out / TRUTH_CSV)
+        facts = RunFacts(
+            vehicle=case.model.name,
+            current=request.current,
+            waves=request.waves,
+            rendered=request.rendered,
+            fps=request.fps,
+        )
+        report = write_report(loop.log, facts, request.out)
     for line in summary_lines(loop.log, facts):
         tell(line)
     tell(f"written: {report}")
@@ -215,7 +214,7 @@ def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimC
     model = vehicle_model(request.vehicle, request.pilot_gain)
     return SimCase(
         model=model,
-        gains=tuned_gains(model) if request.gains is None else load_gains(request.gains),
+        gains=tuned_gains(model) if request.gains is None else usable_gains(request.gains),
         water=sea(
             current=request.current,
             current_to=request.current_to,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from aqualvs.app.journal import LABELS, POINTS_SCHEMA, read_journal
-from aqualvs.app.outputs import JOURNAL, POINTS_PARQUET, POSTURE_CSV
+from aqualvs.app.outputs import JOURNAL, POINTS_PARQUET, POSTURE_CSV, check_run_files
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Reason, Refusal
@@ -75,6 +75,7 @@ def check_stored(run_folder: Path) -> None:
     SourceError
         As `stored_scans`.
     """
+    check_run_files(run_folder)
     next(_posture_rows(run_folder / POSTURE_CSV), None)
     next(_batches(run_folder), None)
 

@@ -55,7 +55,7 @@ _WORDS = {
     Reason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
     Reason.NO_STATION: "no ground station heard; stopped until engaged again",
     Reason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
-    Reason.CONFLICT: "somebody else speaks as the vehicle; stopped until engaged again",
+    Reason.CONFLICT: "two speak as the vehicle; stopped until engaged again",
     Reason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
     Reason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
     Reason.CLOCK: "time ran backwards; stopped for this update",
@@ -177,6 +177,9 @@ class SafetyGate:
     def engage(self, now_s: float, state: VehicleState) -> Reason | None:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
         refused = self._vehicle_refuses(now_s, state)
+        if refused is None and state.rival:
+            # Which of them is the vehicle nobody knows; one who comes later is the other.
+            refused = Reason.CONFLICT
         self.latched = Reason.NOT_ENGAGED if refused else None
         return refused
 

@@ -193,6 +193,7 @@ class ArduSubLink:
             roll=roll,
             pitch=pitch,
             doubt=self._response.doubt(),
+            rival=self.link.rival,
         )
 
     def send(self, effort: Effort) -> None:
