@@ -104,7 +104,7 @@ def follow(
         ),
     ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
-    seed: Annotated[int, typer.Option(help="Sim: of waves and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Sim: of waves and noise.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Hold a distance to a net, or follow it."""
