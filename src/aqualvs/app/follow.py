@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_fast_eye import Blind, Loss, SampledEye
 from aqualvs.app.follow_figures import FIGURE_FILES
 from aqualvs.app.follow_rendered import RenderedEye
 from aqualvs.app.follow_report import PAGE, RunFacts, summary_lines, write_report
@@ -106,6 +106,8 @@ class SimRequest:
     camera : str or None
         Simulated camera that takes the rendered frames; the ideal one if left out.
     seed : int
+    freeze : float or None
+        When the picture begins to stand still, in seconds; never if left out.
     dashboard : str or None
         Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
     token : str or None
@@ -129,6 +131,7 @@ class SimRequest:
     rendered: bool = False
     camera: str | None = None
     seed: int = 0
+    freeze: float | None = None
     dashboard: str | None = None
     token: str | None = None
     overwrite: bool = False
@@ -159,6 +162,8 @@ class SimRequest:
                 f"--current {self.current:g} m/s, --net-sway {self.net_sway:g} m: choose 0 to 2, "
                 "and 0 to 1"
             )
+        if self.freeze is not None and not self.freeze >= 0.0:
+            raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
 
 
 _LEAST_S, _LEAST_RADIUS = 1.0, 2.0
@@ -178,31 +183,33 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     case = _case(request, limits, setpoint)
     files = [request.out / name for name in (FOLLOW_CSV, TRUTH_CSV, PAGE, *FIGURE_FILES)]
-    claim = Claim("follow", files, overwrite=request.overwrite)
-    rng = np.random.default_rng([request.seed, 53])
-    eye: Eye = SampledEye(case.net, rng, working_range=rig.working_range)
-    if request.rendered:
-        eye = RenderedEye(case.net, rig, rng, camera=simulated_camera(request.camera or "ideal"))
-    loop = case.loop(eye, mission)
-    with ExitStack() as undo:
-        page = None
-        if request.dashboard is not None:
-            holder = SetpointHolder(rig.working_range)
-            holder.put(setpoint)
-            served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
-            page = LoopPage(served, rig, loop, holder)
-            undo.callback(page.close)
-        _run(loop, request, page, tell)
-    write_log(loop.log, request.out / TRUTH_CSV)
-    facts = RunFacts(
-        vehicle=case.model.name,
-        current=request.current,
-        waves=request.waves,
-        rendered=request.rendered,
-        fps=request.fps,
-    )
-    report = write_report(loop.log, facts, request.out)
-    claim.settle()
+    with Claim("follow", files, overwrite=request.overwrite):
+        rng = np.random.default_rng([request.seed, 53])
+        freeze_s = math.inf if request.freeze is None else request.freeze
+        frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
+        eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
+        if request.rendered:
+            camera = simulated_camera(request.camera or "ideal")
+            eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
+        loop = case.loop(eye, mission)
+        with ExitStack() as undo:
+            page = None
+            if request.dashboard is not None:
+                holder = SetpointHolder(rig.working_range)
+                holder.put(setpoint)
+                served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
+                page = LoopPage(served, rig, loop, holder)
+                undo.callback(page.close)
+            _run(loop, request, page, tell)
+        write_log(loop.log, request.out / TRUTH_CSV)
+        facts = RunFacts(
+            vehicle=case.model.name,
+            current=request.current,
+            waves=request.waves,
+            rendered=request.rendered,
+            fps=request.fps,
+        )
+        report = write_report(loop.log, facts, request.out)
     for line in summary_lines(loop.log, facts):
         tell(line)
     tell(f"written: {report}")

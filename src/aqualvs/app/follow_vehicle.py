@@ -98,7 +98,6 @@ def follow_and_tell(
     AqualvsError
         If an input cannot be used, or the source can never work.
     """
-    claim = Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite)
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)
@@ -106,15 +105,15 @@ def follow_and_tell(
     gains = usable_gains(request.gains)
     steering = NetPilot(mission, RangeYawController(gains), SafetyGate(limits))
     scanner = Scanner(rig, request.scanner)
-    warm_up(scanner)
-    with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
-        pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
-        runner = _runner(request, scanner, link, pilot, holder, tell)
-        tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
-        listen(pilot, sys.stdin if keys is None else keys, tell)
-        with StopSignals() as stop:
-            fault = runner.run(lambda: stop.caught is not None)
-    claim.settle()
+    with Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite):
+        warm_up(scanner)
+        with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
+            pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
+            runner = _runner(request, scanner, link, pilot, holder, tell)
+            tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
+            listen(pilot, sys.stdin if keys is None else keys, tell)
+            with StopSignals() as stop:
+                fault = runner.run(lambda: stop.caught is not None)
     if fault is not None:
         raise fault
     return 0
