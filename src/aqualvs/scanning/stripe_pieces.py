@@ -24,7 +24,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
-from aqualvs.scanning.stripe import POSITION, PeakFinder, Returns, SearchImage
+from aqualvs.scanning.stripe import N_MEASURES, POSITION, PeakFinder, Returns, SearchImage
 from aqualvs.scanning.stripe import WIDTH as PEAK_WIDTH
 
 Rows = NDArray[np.float32]
@@ -205,20 +205,14 @@ def find_pieces(frame: Frame, search: StripeSearch) -> Pieces:
 def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     n_lines, length = light.shape
     reach_px = max(_LEAST_REACH, round(_REACH_SHARE * width_px))
-    finder = PeakFinder(
-        length,
-        search.lowest,
-        search.highest,
-        reach_px,
-        _PEAKS_PER_LINE * n_lines,
-        np.array([search.colour.value]),
-    )
+    directions = np.array([search.colour.value])
+    finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
-    levels = np.rint(light).astype(np.uint8)
-    along_x = search.axis is SearchAxis.ALONG_X
-    line, table = finder.find(
-        SearchImage(levels, grey, grey, along_x, search.line_px), _MIN_CONTRAST
-    )
+    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px)
+    most = _PEAKS_PER_LINE * n_lines
+    line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
+    n = finder.find(image, _MIN_CONTRAST, 1, line, table)
+    line, table = line[:n], table[:, :n]
     position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]
     # Flanks must lie in the picture.
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
