@@ -445,8 +445,12 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
 
 def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
     """Return the length (P,) of each piece with all pieces that go on where another ends."""
+    if table.shape[1] == 0:
+        return table[LENGTH]
     ends = _ends(table)
-    linked = np.array([_goes_on(one, ends, width_px) for one in ends]).reshape(len(ends), -1)
+    linked = np.zeros((len(ends), len(ends)), bool)
+    for k, one in enumerate(ends):
+        linked[k] = _goes_on(one, ends, width_px)
     linked |= linked.T | np.eye(len(ends), dtype=bool)
     _, row = connected_components(csr_array(linked), directed=False)
     return np.bincount(row, table[LENGTH], len(ends)).astype(np.float64)[row]
