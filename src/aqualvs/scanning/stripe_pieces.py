@@ -446,14 +446,14 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
 def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
     """Return the length (P,) of each piece with all pieces that go on where another ends."""
     if table.shape[1] == 0:
-        return table[LENGTH]
+        return np.zeros(0)
     ends = _ends(table)
     linked = np.zeros((len(ends), len(ends)), bool)
     for k, one in enumerate(ends):
         linked[k] = _goes_on(one, ends, width_px)
     linked |= linked.T | np.eye(len(ends), dtype=bool)
     _, row = connected_components(csr_array(linked), directed=False)
-    return np.bincount(row, table[LENGTH], len(ends)).astype(np.float64)[row]
+    return np.asarray(np.bincount(row, table[LENGTH])[row], np.float64)
 
 
 def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
