@@ -177,8 +177,9 @@ class AnswerWatch:
             self._moments.clear()
             self._told = math.nan
             step = 0.0
-        forward, right = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
-        push = (forward * math.cos(yaw) + right * math.sin(yaw)) / self._vehicle.mass
+        # Thrust to the side is for the drag of a way along the target, and promises nothing.
+        forward, _ = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
+        push = forward * math.cos(yaw) / self._vehicle.mass
         if push <= 0.0:
             self._backed_s = now_s
         if self._effort != NEUTRAL and step > 0.0:
