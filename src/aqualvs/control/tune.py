@@ -49,7 +49,7 @@ _SLUGGISH = 4.0
 # Where the bisection of a gain begins and ends, in 1/s.
 _LEAST, _GREATEST = 0.05, 20.0
 # Delays and frames in seconds, and m/s: beyond them nothing is steered.
-_MOST_S, _MOST_CURRENT = 10.0, 10.0
+_MOST_S, _MOST_CURRENT = 60.0, 10.0
 # Packaged gains have 0.40 to 0.55, half as much again 0.28 to 0.37, twice as much 0.13 to 0.19.
 _LEAST_USABLE_MODULUS = 0.25
 
