@@ -703,6 +703,9 @@ class Bench:
                 name,
                 name.lower().lstrip("-").replace("-", "_"),
                 shown[:30] or name,
+                # Another option may be missing, or contradict it.
+                "--",
+                "No such option",
                 str(self.home),
                 *words,
             ),

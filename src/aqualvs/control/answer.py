@@ -53,13 +53,13 @@ class AnswerLimits:
     turned : float
         Turn of the heading within `window_s` that a yaw which stands still must answer to, in
         radians. An even way along a curved net turns the heading, too: at 0.3 m/s and a radius of
-        8 m by 3 degrees.
+        8 m by 4 degrees.
     """
 
     repeats_s: float = 0.2
     quiet: float = 0.1
-    window_s: float = 1.2
-    promised: float = 0.25
+    window_s: float = 1.7
+    promised: float = 0.4
     turned: float = math.radians(8.0)
 
     def __post_init__(self) -> None:
@@ -178,7 +178,7 @@ class AnswerWatch:
         push = (forward * math.cos(yaw) + right * math.sin(yaw)) / self._vehicle.mass
         if push <= 0.0:
             self._backed_s = now_s
-        if self._effort != NEUTRAL:
+        if self._effort != NEUTRAL and step > 0.0:
             self._thrust_s += step
             share = step / (step + min(self._thrust_s, _BALANCE_S))
             self._balance += share * (push - self._balance)
