@@ -64,7 +64,7 @@ class StripeOptions:
 
     min_contrast: int = 6
     reach_share: float = 0.045
-    min_likelihood: float = 0.3
+    min_likelihood: float = 0.1
     min_share: float = 0.25
     max_returns: int = 16384
 
@@ -313,7 +313,7 @@ def _next_with(mark: np.uint64, words: NDArray[np.uint64], at: int) -> int:
         found = words[index] ^ other
     # The lowest of these bits alone shifts the number of its byte to the top.
     lowest = found & (~found + np.uint64(1))
-    return (index << 3) + np.int64((lowest * _BYTE_NUMBERS) >> np.uint64(56))
+    return (index << 3) + int((lowest * _BYTE_NUMBERS) >> np.uint64(56))
 
 
 @inline_borrowing_kernel
