@@ -7,7 +7,7 @@ STAMP := $(VENV)/.ready
 CODE := src tests tools benchmarks ros2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench docs clean
+.PHONY: help setup demo test fuzz kills lint format bench docs clean
 
 help: ## List the tasks
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -20,6 +20,12 @@ demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
 test: $(STAMP) ## Run all tests: those that watch a clock one by one, the others two at a time
 	$(BIN)/python -m pytest --ignore=tests/live --numprocesses=2 --dist=loadfile
 	$(BIN)/python -m pytest tests/live
+
+fuzz: $(STAMP) ## Try 2,000 malformed files and options (SEED=1 CASES=2000); lists what is not refused
+	PYTHONPATH=tests $(BIN)/python tests/fuzz_cases.py --seed $(or $(SEED),1) --cases $(or $(CASES),2000)
+
+kills: $(STAMP) ## Kill run, batch, live and follow at 100 random moments (SEED=1 CASES=100)
+	PYTHONPATH=tests $(BIN)/python tests/kill_cases.py --seed $(or $(SEED),1) --kills $(or $(CASES),100)
 
 lint: $(STAMP) ## Check style, types and the direction of imports
 	$(BIN)/ruff check $(CODE)

@@ -7,7 +7,7 @@ event. What needs a limit states one that holds with four busy programs on each 
 import time
 from collections.abc import Callable
 
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 """So long is waited for what must happen in the end; only a test that fails waits so long."""
 
 

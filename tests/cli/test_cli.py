@@ -222,3 +222,15 @@ def test_a_fault_is_one_line_whatever_the_file_is_called(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "rig\\nof\\x1b[31mmine.yaml: no such file" in error
+
+
+def test_a_fault_with_a_huge_value_stays_short(tmp_path, capsys):
+    path = tmp_path / "rig.yaml"
+    path.write_text(f"aqualvs_rig: 1\nname: {'x' * 100_000}\nimage: {'y' * 100_000}\n")
+    (tmp_path / "plan.yaml").write_text(f"aqualvs_plan: {'y' * 100_000}\n")
+    assert main(["check", str(path)]) == 2
+    assert main(["follow", "--sim", "--plan", str(tmp_path / "plan.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 2
+    assert len(error) < 5000
+    assert "plan.yaml: aqualvs_plan is 'yyy" in error

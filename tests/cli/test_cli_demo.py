@@ -17,9 +17,9 @@ def short_dive(tmp_path_factory):
 def test_the_demo_measures_and_compares(short_dive, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("aqualvs.app.demo.bundled_dive", lambda: short_dive)
     out = tmp_path / "out"
-    # The second time it replaces the first.
-    for _ in range(2):
-        assert main(["demo", "-o", str(out)]) == 0
+    # The second time it replaces the first, when asked to.
+    for options in ([], ["--overwrite"]):
+        assert main(["demo", "-o", str(out), *options]) == 0
         said = capsys.readouterr().out
         assert "posture in 3 of 3 frames" in said
         assert "against the truth in 3 frames" in said

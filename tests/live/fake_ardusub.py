@@ -31,6 +31,7 @@ FAST_EVERY, SLOW_EVERY, STICKS_EVERY = 2, 10, 3
 GUIDED_LAPSE_S = 3.0
 MANUAL, GUIDED = 19, 4
 STATION = (255, 190)
+PULSES = (("MIN", 1100.0), ("TRIM", 1500.0), ("MAX", 1900.0), ("DZ", 0.0), ("REVERSED", 0.0))
 # As ArduSub 4.7 has them after a reset, with its names.
 PARAMETERS = {
     "MAV_GCS_SYSID": 255.0,
@@ -43,6 +44,10 @@ PARAMETERS = {
     "PILOT_SPEED_UP": 500.0,
     "PILOT_SPEED_DN": 0.0,
     "RNGFND1_TYPE": 0.0,
+    "THR_DZ": 100.0,
+    **{f"RC{n}_{part}": value for n in (3, 4, 5, 6) for part, value in PULSES},
+    "RC3_DZ": 30.0,
+    "RC4_DZ": 40.0,
 }
 # For system 1, in body axes (BODY_NED, BODY_FRD), with all but speeds and turning rate left out.
 SPEEDS_ALONE = ((1, 8, 1479), (1, 12, 1479))
@@ -168,15 +173,27 @@ class Vehicle:
         if not self.lapsed and now - self.sticks_at > self.lapse_s:
             self.lapsed, self.sticks = True, (0.0, 0.0, 0.0, 0.0)
             say(event="fail-safe", after_s=now - self.sticks_at)
-        wanted = tuple(self.gain * s for s in self.sticks)
+        wanted = self.asked()
         if self.mode == GUIDED:
             wanted = self.speeds if now - self.speeds_at < GUIDED_LAPSE_S else (0.0,) * 4
         self.motion.step(wanted if self.armed else (0.0,) * 4, STEP_S)
 
     def channels(self) -> list[int]:
-        """What the stick channels hold, in microseconds."""
-        forward, right, down, clockwise = (round(400 * self.gain * s) for s in self.sticks)
-        return [1500, 1500, 1500 - down, 1500 + clockwise, 1500 + forward, 1500 + right]
+        """What the stick channels hold, in whole microseconds (joystick.cpp)."""
+        forward, right, down, clockwise = (400 * self.gain * s for s in self.sticks)
+        pulses = (1500, 1500, 1500 - down, 1500 + clockwise, 1500 + forward, 1500 + right)
+        return [min(max(int(pulse), 1100), 1900) for pulse in pulses]
+
+    def asked(self) -> tuple[float, ...]:
+        """What depth hold makes of them: dead zones of RC4_DZ and THR_DZ times gain, no expo."""
+        _, _, throttle, yaw, forward, right = self.channels()
+        dead = int(self.parameters.get("RC4_DZ", 40.0) * self.gain)
+        turn = math.copysign(max(abs(yaw - 1500) - dead, 0) / (400 - dead), yaw - 1500)
+        control, middle = 1000 * (throttle - 1130) / 770, 1000 * 370 / 770
+        band = self.parameters.get("THR_DZ", 100.0) * self.gain
+        up = max(control - middle - band, 0.0) / (1000 - middle - band)
+        down = max(middle - band - control, 0.0) / (middle - band)
+        return (forward - 1500) / 400, (right - 1500) / 400, down - up, turn
 
 
 class Wire:

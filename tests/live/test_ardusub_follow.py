@@ -4,6 +4,7 @@ import contextlib
 import csv
 import importlib.resources
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from aqualvs.app.follow import FOLLOW_CSV
@@ -25,21 +27,48 @@ from waiting import PATIENCE_S
 pytest.importorskip("pymavlink")
 
 from fake_ardusub_cases import Fake, is_neutral, until
+from stream_sender import make_clip
 
+SENDER = Path(__file__).with_name("stream_sender.py")
 # As the installed command ends; the interpreter's own `exit` would wait for the keys.
 COMMAND = (sys.executable, "-c", "import sys; from aqualvs.app.cli import main; sys.exit(main())")
 
 
+N_FRAMES, FROZEN_FROM_S = 500, 4.0
+
+
 @pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty seconds before a net that stands still, at 0.47 m."""
-    image = bgr_of(demo_frames(40)[-1])
-    path = tmp_path_factory.mktemp("clip") / "still.mp4"
-    options = {"preset": "ultrafast", "crf": "18"}
+def pictures() -> list[np.ndarray]:
+    """A net that stands still at 0.47 m, with the noise of a camera."""
+    image, rng = bgr_of(demo_frames(40)[-1]), np.random.default_rng(4)
+    noise = (rng.normal(0.0, 3.0, image.shape) for _ in range(11))
+    return [np.clip(image + one, 0, 255).astype(np.uint8) for one in noise]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -> Path:
+    """Twenty seconds before it."""
+    path = tmp_path_factory.mktemp("clip") / "live.mp4"
     write_video(
-        path, 500, size=demo_rig().size_px, options=options, content=lambda _i, _size: image
+        path,
+        N_FRAMES,
+        size=demo_rig().size_px,
+        options={"preset": "ultrafast", "crf": "18"},
+        content=lambda i, _size: pictures[i % len(pictures)],
     )
     return path
+
+
+@pytest.fixture(scope="module")
+def freezing(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -> Path:
+    """Four seconds before it, as a stream; then an encoder gets one picture again and again."""
+
+    def content(_size: tuple[int, int], n: int) -> Iterator[np.ndarray]:
+        last = round(25 * FROZEN_FROM_S) - 1
+        return (pictures[min(i, last) % len(pictures)] for i in range(n))
+
+    path = tmp_path_factory.mktemp("clip") / "freezing"
+    return make_clip(path, demo_rig().size_px, 2 * round(25 * FROZEN_FROM_S), content=content)
 
 
 @dataclass
@@ -71,7 +100,7 @@ class Follow:
 
 
 @contextlib.contextmanager
-def follow(fake: Fake, source: Path, out: Path, *options: str) -> Iterator[Follow]:
+def follow(fake: Fake, source: Path | str, out: Path, *options: str) -> Iterator[Follow]:
     rig = importlib.resources.files("aqualvs") / "data" / "demo" / "rig.yaml"
     command = [*COMMAND, "follow", str(source), "--rig", str(rig), "--mavlink", fake.url]
     command += ["--gains", "bluerov2", "-o", str(out), *options]
@@ -153,14 +182,14 @@ def test_a_vehicle_file_says_who_steers(clip: Path, tmp_path: Path) -> None:
     fake.play(parameters={"MAV_GCS_SYSID": 250.0}, station_id=250)
     file = tmp_path / "vehicle.yaml"
     try:
-        with follow(fake, clip, tmp_path) as one:
+        with follow(fake, clip, tmp_path / "refused") as one:
             until(
                 lambda: "set MAV_GCS_SYSID 255, or ground_station 250" in one.press(),
                 "the reason why not",
                 PATIENCE_S,
             )
         file.write_text("aqualvs_vehicle: 1\nground_station: 250\n", encoding="utf-8")
-        with follow(fake, clip, tmp_path, "--vehicle-file", str(file)) as one:
+        with follow(fake, clip, tmp_path / "obeyed", "--vehicle-file", str(file)) as one:
             one.engage()
             until(lambda: fake.steered(), "efforts")
             assert {message["system"] for message in fake.steered()} == {250}
@@ -179,3 +208,29 @@ def assert_logged(path: Path) -> None:
     # It begins at neutral, at the range it finds; noise is all that pushes then.
     assert max(float(row["forward"]) for row in rows) < 0.05
     assert {row["forward"] for row in rows if row["engaged"] == "0"} == {"0.0000"}
+
+
+def test_a_picture_that_stands_still_ends_the_thrust(freezing: Path, tmp_path: Path) -> None:
+    fake = Fake("--lapse", "0.5")
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+            found.bind(("127.0.0.1", 0))
+            port = found.getsockname()[1]
+        source = f"udp://127.0.0.1:{port}"
+        with follow(fake, source, tmp_path, "--range", "0.9") as one:
+            one.engage()
+            sender = [sys.executable, str(SENDER), str(freezing), "--port", str(port)]
+            subprocess.run(sender, stdout=subprocess.DEVNULL, check=True, timeout=PATIENCE_S)
+            one.process.send_signal(signal.SIGTERM)
+            one.process.wait(PATIENCE_S)
+    finally:
+        fake.stop()
+    with (tmp_path / FOLLOW_CSV).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    pushed = [float(row["frame_time_s"]) for row in rows if float(row["forward"]) != 0.0]
+    assert pushed[0] < FROZEN_FROM_S
+    # By the stream's clock.
+    assert pushed[-1] <= FROZEN_FROM_S + 0.5
+    frozen = [row for row in rows if float(row["frame_time_s"]) > FROZEN_FROM_S + 0.5]
+    assert {row["posture"] for row in frozen} <= {"frozen", "no_frames"}
+    assert "frozen" in {row["reason"] for row in frozen}

@@ -345,7 +345,7 @@ def test_what_is_no_number_becomes_null(bench: Bench) -> None:
 
 
 def raw(bench: Bench) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", bench.server.port), timeout=10)
+    return socket.create_connection(("127.0.0.1", bench.server.port), timeout=PATIENCE_S)
 
 
 def first_line(wire: socket.socket, *lines: str) -> str:
@@ -406,13 +406,13 @@ def test_idle_connections_of_strangers_leave_room_for_the_pilot(bench: Bench) ->
         with raw(bench) as wire:
             assert first_line(wire, "GET / HTTP/1.1", "Host: boat").endswith("200 OK")
         with bench.connect(TOKEN) as page:
-            assert json.loads(page.recv(timeout=5))["may_command"] is True
+            assert json.loads(page.recv(timeout=PATIENCE_S))["may_command"] is True
 
 
 def test_one_address_holds_few_connections_without_a_greeting(bench: Bench) -> None:
     with contextlib.ExitStack() as open_:
         page = open_.enter_context(bench.connect(TOKEN))
-        page.recv(timeout=5)
+        page.recv(timeout=PATIENCE_S)
         first = open_.enter_context(raw(bench))
         for _ in range(ConnectionLimits.PER_ADDRESS):
             open_.enter_context(raw(bench))
@@ -430,7 +430,7 @@ def test_who_never_asks_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None
     controls = Controls(SetpointHolder(rig.working_range), Button())
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", TOKEN), rig, controls)
     try:
-        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as wire:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S) as wire:
             wire.sendall(b"GET / HTTP/1.1\r\nHost: 127")
             with contextlib.suppress(ConnectionResetError):
                 assert wire.recv(1) == b""
@@ -448,10 +448,10 @@ def test_wrong_tokens_cost_time_over_all_connections(
         guessing = [open_.enter_context(bench.connect(f"guess {i}")) for i in range(n_guesses)]
         # The pilot's own token waits for its turn at most.
         with bench.connect(TOKEN) as page:
-            assert json.loads(page.recv(timeout=10))["may_command"] is True
+            assert json.loads(page.recv(timeout=PATIENCE_S))["may_command"] is True
         for connection in guessing:
             with pytest.raises(ConnectionClosed):
-                connection.recv(timeout=10)
+                connection.recv(timeout=PATIENCE_S)
     assert time.monotonic() - begin >= n_guesses * 0.3
 
 
@@ -479,9 +479,9 @@ def test_a_page_with_the_token_takes_the_place_of_one_without(bench: Bench) -> N
     with contextlib.ExitStack() as open_:
         pages = [open_.enter_context(bench.connect()) for _ in range(Hub.MAX_WATCHERS)]
         for page in pages:
-            page.recv(timeout=5)
+            page.recv(timeout=PATIENCE_S)
         pilot = open_.enter_context(bench.connect(TOKEN))
-        assert json.loads(pilot.recv(timeout=5))["may_command"] is True
+        assert json.loads(pilot.recv(timeout=PATIENCE_S))["may_command"] is True
         with pytest.raises(ConnectionClosed) as closed:
             receive_until_closed(pages[0])
         assert closed.value.rcvd is not None

@@ -11,6 +11,7 @@ import pytest
 
 from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
+from aqualvs.live.frozen import FrozenOptions
 from aqualvs.live.health import PartHealth, State
 from aqualvs.live.mailbox import Arrival, Mailbox
 from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner
@@ -47,12 +48,14 @@ def runner(
     endless: bool = False,
     keep_every: bool = False,
     scanner: object = None,
+    watches: bool = False,
 ) -> LiveRunner:
     return LiveRunner(
         ScriptedFeed(steps, endless=endless),
         FixedScanner(scanner or demo_scanner()),  # type: ignore[arg-type]
         outputs,
-        LiveOptions(keep_every=keep_every),
+        # Most of these steps show one picture again and again.
+        LiveOptions(keep_every=keep_every, frozen=FrozenOptions() if watches else None),
     )
 
 
@@ -184,6 +187,21 @@ def test_frames_lost_before_a_frame_are_counted(monkeypatch: pytest.MonkeyPatch)
     output = Collector()
     runner([FRAME, renumbered(FRAME, 40)], output, keep_every=True).run(never)
     assert output.samples[-1].health.n_lost == 39
+
+
+def test_a_picture_that_stands_still_has_no_posture_until_it_moves() -> None:
+    moving: list[Step] = list(demo_frames(30))
+    still: list[Step] = [renumbered(demo_frames(30)[-1], i) for i in range(30, 50)]
+    again: list[Step] = [renumbered(demo_frames(30)[i % 30], i) for i in range(50, 80)]
+    output = Collector()
+    runner([*moving, *still, *again], output, keep_every=True, watches=True).run(never)
+    found = reasons(output)
+    assert Reason.FROZEN not in found[:30]
+    assert set(found[36:50]) == {Reason.FROZEN}
+    assert Reason.FROZEN not in found[-15:]
+    refusal = output.samples[45].scan.posture
+    assert isinstance(refusal, Refusal)
+    assert refusal.detail == "the same picture for 0.6 s"
 
 
 def test_a_picture_of_another_size_is_refused_and_the_next_is_measured() -> None:

@@ -5,7 +5,7 @@ vehicle must be told neutral in time.
 """
 
 import contextlib
-import os
+import random
 import socket
 import sys
 import threading
@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from aqualvs.errors import OptionError
 from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
 
 pytest.importorskip("pymavlink")
@@ -32,6 +33,10 @@ from fake_ardusub_cases import (
     until,
 )
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+NOTICED_S = 2.0
+"""Within so long a busy machine notices what spoofing must not hide; less than five seconds, after
+which another address may speak as the vehicle."""
 
 STEERING = (b"\x45\x00\x00", b"\x54\x00\x00")
 """Message ids of `MANUAL_CONTROL` and `SET_POSITION_TARGET_LOCAL_NED` as frames hold them."""
@@ -136,7 +141,7 @@ def assert_neutral_without_video(one: Dive) -> None:
 
 CROWDS = {
     "one byte each": [b"\xfd"],
-    "nothing but noise": [os.urandom(300)],
+    "nothing but noise": [random.Random(7).randbytes(300)],
     "other vehicles": [beat(2, system=2), beat(19, system=3)],
     "half frames": [beat(2)[:8]],
     "the vehicle's own words": [beat(2), attitude()],
@@ -150,7 +155,7 @@ def test_strangers_neither_steer_nor_are_steered(dive: Dive, says: list[bytes]) 
     with Strangers(PORT, says) as strangers:
         time.sleep(0.5)
         assert dive.pilot.engaged
-        assert pushing(dive.fake)
+        until(lambda: pushing(dive.fake), "an effort in spite of them")
         assert_neutral_without_video(dive)
         dive.frames.flows = True
         until(lambda: pushing(dive.fake), "an effort again")
@@ -165,7 +170,7 @@ def test_half_frames_from_the_vehicles_own_address_blind_nobody(dive: Dive) -> N
     assert_neutral_without_video(dive)
     at = dive.fake.play(mode=19)
     until(lambda: not dive.pilot.engaged, "a stop")
-    assert time.monotonic() - at < 1.0 + dive.lateness(at)
+    assert time.monotonic() - at < NOTICED_S + dive.lateness(at)
 
 
 def test_the_pilots_mode_is_seen_behind_spoofed_heartbeats(dive: Dive) -> None:
@@ -174,7 +179,7 @@ def test_the_pilots_mode_is_seen_behind_spoofed_heartbeats(dive: Dive) -> None:
         time.sleep(0.3)
         assert dive.pilot.engaged
         at = dive.fake.play(mode=19)
-        assert_released(dive, at)
+        assert_released(dive, at, NOTICED_S)
         assert dive.vehicle.state().mode_name.startswith("MANUAL")
 
 
@@ -182,12 +187,23 @@ def test_spoofed_modes_that_contradict_the_vehicles_stop_us(dive: Dive) -> None:
     pushed(dive)
     at = time.monotonic()
     with Strangers(PORT, [beat(19)], count=1) as strangers:
-        assert_released(dive, at, 0.25)
-        assert "somebody else speaks as the vehicle" in dive.pilot.health().detail
+        assert_released(dive, at, NOTICED_S)
+        assert "two speak as the vehicle" in dive.pilot.health().detail
         assert "contradict each other" in dive.pilot.health().detail
     assert not strangers.were_steered
     # What was said counts for a while; then the pilot may engage again.
     until(lambda: dive.vehicle.state().mode == "ours", "an end of the conflict")
+
+
+def test_nobody_is_steered_while_two_are_the_vehicle_from_the_start(dive: Dive) -> None:
+    with Strangers(PORT, [beat(2), attitude()], count=1) as strangers:
+        until(lambda: dive.vehicle.state().rival, "a rival")
+        with pytest.raises(OptionError, match=r"two speak as the vehicle.*both speak as sysid 1"):
+            dive.pilot.engage()
+        assert not dive.fake.steered(dive.began)
+    assert not strangers.were_steered
+    until(lambda: not dive.vehicle.state().rival, "silence of the rival")
+    pushed(dive)
 
 
 def test_modes_that_alternate_at_one_address_stop_us(dive: Dive) -> None:
@@ -195,7 +211,7 @@ def test_modes_that_alternate_at_one_address_stop_us(dive: Dive) -> None:
     dive.fake.play(mode=19)
     dive.fake.play(mode=2)
     until(lambda: not dive.pilot.engaged, "a stop")
-    assert dive.vehicle.state().mode == "conflict"
+    until(lambda: dive.vehicle.state().mode == "conflict", "a conflict")
     until(lambda: all(map(is_neutral, dive.fake.steered()[-3:])), "neutral")
 
 
@@ -204,9 +220,9 @@ def test_a_vehicle_that_fell_silent_is_not_replaced(dive: Dive) -> None:
     with Strangers(PORT, [beat(2), attitude()], count=2) as strangers:
         at = dive.fake.play(away=True)
         until(lambda: not dive.pilot.engaged, "a stop")
-        # Silent for one second, and one frame until that is noticed.
-        assert time.monotonic() - at < 1.04 + 0.05 + dive.lateness(at)
-        assert "silent" in dive.pilot.health().detail
+        # After a second of silence; a replacement would never be noticed.
+        assert time.monotonic() - at < NOTICED_S + dive.lateness(at)
+        until(lambda: "silent" in dive.pilot.health().detail, "the reason")
         dive.fake.play(away=False)
     assert not strangers.were_steered
 
@@ -216,7 +232,7 @@ def test_a_ground_station_that_is_gone_is_not_replaced(dive: Dive) -> None:
     pushed(dive)
     with Strangers(PORT, [station_beat()], count=2):
         at = dive.fake.play(station=False)
-        assert_released(dive, at, 0.5 + 0.04)
+        assert_released(dive, at, 0.5 + NOTICED_S)
         assert "no ground station" in dive.pilot.health().detail
 
 
@@ -225,7 +241,7 @@ def test_centred_sticks_of_strangers_do_not_hide_the_pilots(dive: Dive) -> None:
     with Strangers(PORT, [sticks(0)], count=5, every_s=0.005):
         time.sleep(0.2)
         at = dive.fake.play(joystick={"y": -600})
-        assert_released(dive, at)
+        assert_released(dive, at, NOTICED_S)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="one address for this computer")

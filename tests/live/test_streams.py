@@ -38,15 +38,20 @@ def patient(monkeypatch):
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory):
-    """Clips by name: both sizes, and a long one of small packets and frequent key frames."""
+    """Clips by name: both sizes, and long ones of small packets and frequent key frames.
+
+    Of these, one has a slice for each packet, and one refreshes its pictures column by column.
+    """
     folder = tmp_path_factory.mktemp("clips")
-    stripes = stream_sender.moving_stripes
+    stripes = {"gop": 12, "bitrate": 800_000, "content": stream_sender.moving_stripes}
+    kinds = {"slices": "slice-max-size=1000", "refresh": "slice-max-size=1000:intra-refresh=1"}
     return {
         "sd": stream_sender.make_clip(folder / "sd", SD, 50),
         "hd": stream_sender.make_clip(folder / "hd", HD, 30, bitrate=8_000_000),
-        "stripes": stream_sender.make_clip(
-            folder / "stripes", SD, 150, gop=12, bitrate=800_000, content=stripes
-        ),
+        "stripes": stream_sender.make_clip(folder / "stripes", SD, 150, **stripes),
+    } | {
+        name: stream_sender.make_clip(folder / name, SD, 150, **stripes, **{"x264-params": how})
+        for name, how in kinds.items()
     }
 
 
@@ -187,20 +192,30 @@ def test_other_kinds_over_udp_are_recognised(clips, kind, n_held):
 SOUND_FROM = 144
 
 
-@pytest.mark.parametrize("kind", ["rtp", "mpegts"])
-def test_five_percent_of_loss_costs_frames_but_shows_no_false_one(clips, kind):
+@pytest.mark.parametrize(
+    ("clip", "kind", "sound_from"),
+    [
+        ("stripes", "rtp", SOUND_FROM),
+        ("stripes", "mpegts", SOUND_FROM),
+        ("slices", "rtp", SOUND_FROM),
+        # A refresh begins every twelve frames, and takes as long.
+        ("refresh", "rtp", 120),
+    ],
+)
+def test_five_percent_of_loss_costs_frames_but_shows_no_false_one(clips, clip, kind, sound_from):
     """Every frame is exact, and its number counts those that were lost."""
     with udp_listener() as heard:
-        known = pictures_of(clips["stripes"])
-        options = {"loss": 0.05, "seed": 3, "sound_from": SOUND_FROM, "speed": 8}
-        told = send(clips["stripes"], port=heard.feed.port, kind=kind, **options)
+        known = pictures_of(clips[clip])
+        options = {"loss": 0.05, "seed": 3, "sound_from": sound_from, "speed": 8}
+        told = send(clips[clip], port=heard.feed.port, kind=kind, **options)
         # A picture of MPEG-TS may wait for the next one after a loss, so the last may be missing.
         heard.wait(lambda: heard.indices and known[heard.contents[-1]] >= 148)
         health = heard.feed.health()
     assert told["lost"] > 0.03 * told["packets"]
     true = [known[content] for content in heard.contents]
-    assert 15 <= len(true) < 150
-    assert health.n_dropped > 0
+    assert 6 <= len(true) < 150
+    # What came before the first frame was joined too late, not lost.
+    assert (health.n_dropped > 0) == (len(true) <= true[-1] - true[0])
     if kind == "rtp":
         first = true[0]
         assert heard.indices == [i - first for i in true]

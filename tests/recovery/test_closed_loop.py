@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from aqualvs.app.follow_fast import DiveResult, random_dives
-from aqualvs.app.follow_sim_case import tuned_gains, vehicle_model
-from aqualvs.app.follow_sim_measures import step_measures
-from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials
+from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_sim_case import SimCase, tuned_gains, vehicle_model
+from aqualvs.app.follow_sim_measures import effort_measures, hold_measures, step_measures
+from aqualvs.app.follow_trials import FROM_REST_S, RANGE, STEP, STEP_S, Trials
 from aqualvs.control.gains_file import load_gains
+from aqualvs.control.mission import HoldMission
+from aqualvs.control.setpoint import Setpoint
 
 N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))
 # Some of any kind, and the hardest that were met: a BlueROV2 Heavy that swings its pitch up with
@@ -34,10 +37,11 @@ def trials(name: str, seed: int, *, rendered: bool = False) -> Trials:
 @BOTH
 def test_holds_and_steps_in_current_and_waves(name: str) -> None:
     runs = [trials(name, seed).hold_and_step() for seed in SEEDS]
-    for _, hold, step in runs:
+    for log, hold, step in runs:
         assert hold.range_rms <= 15e-3
         assert math.degrees(hold.yaw_rms) <= 1.5
         assert hold.n_lost == hold.n_guarded == 0
+        assert effort_measures(log, "forward", FROM_REST_S).reversals <= 20.0
         assert step.overshoot <= 0.15
     # The waves of several runs cancel in part: what is left is the answer to the step. In one run
     # by itself a wave may leave the band of 20 mm some seconds after.
@@ -45,6 +49,26 @@ def test_holds_and_steps_in_current_and_waves(name: str) -> None:
     answer = step_measures(runs[0][0].column("time_s"), mean, STEP_S, RANGE, RANGE + STEP)
     assert answer.settling <= 4.0
     assert answer.overshoot <= 0.15
+
+
+@BOTH
+def test_turns_by_ten_degrees_in_calm_water(name: str) -> None:
+    """Through the dead zone of the vehicle's sticks, which the link takes out."""
+    model = vehicle_model(name)
+    for seed in SEEDS:
+        case = SimCase(model=model, gains=load_gains(model.name), seed=seed)
+        mission = HoldMission(Setpoint(RANGE))
+
+        def step(now_s: float, mission: HoldMission = mission) -> None:
+            if now_s >= 20.0:
+                mission.setpoint = Setpoint(RANGE, math.radians(10.0))
+
+        eye = SampledEye(case.net, np.random.default_rng(seed))
+        log = case.loop(eye, mission).run(28.0, step)
+        assert math.degrees(hold_measures(log, FROM_REST_S, 20.0).yaw_rms) <= 0.3
+        time_s, yaw = log.column("time_s"), np.degrees(log.column("yaw"))
+        away = time_s[(time_s > 20.0) & (np.abs(yaw - 10.0) > 1.0)]
+        assert away[-1] - 20.0 <= 3.5
 
 
 @BOTH

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aqualvs.app.batch.dive_lists import read_list
 from aqualvs.app.batch.dives import find_dives
 from aqualvs.app.batch.names import name_dives, safe_name
 from aqualvs.app.run_inputs import Water
@@ -180,3 +181,11 @@ def test_names_are_unique_whatever_the_paths(parts):
     names = name_dives([(path, "") for path in sources], {})
     assert len({name.casefold() for name in names}) == len(sources)
     assert all(name == safe_name(name) for name in names if "-" not in name)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", ".inf", "x", "[1]"])
+def test_a_number_of_a_list_must_be_one(tmp_path, value):
+    path = tmp_path / "list.yaml"
+    path.write_text(f"- {{dive: a.mp4, salinity: {value}}}\n")
+    with pytest.raises(OptionError, match=r"row 1: salinity is .*; give a number"):
+        read_list(path)

@@ -177,7 +177,8 @@ def sway_error(gains: ControlGains, yaw: float, *, beforehand: bool) -> tuple[fl
         if not beforehand:
             forward, _ = facts.thrust.forces(effort.forward, effort.right)
             side = facts.right_drag.force(0.2 * math.cos(yaw))
-            ahead, aside = facts.thrust.efforts(forward, side)
+            pairs = map(facts.thrust.effort, facts.thrust.shares(forward, side))
+            ahead, aside = facts.thrust.joined(*pairs)
             effort = replace(effort, forward=ahead, right=aside)
         plant.step(effort)
         worst = max(worst, abs(plant.distance - 0.6))

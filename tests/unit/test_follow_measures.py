@@ -9,6 +9,7 @@ import pytest
 from aqualvs.app.follow_sim_log import LoopLog, LoopRow
 from aqualvs.app.follow_sim_measures import (
     SafetyMeasures,
+    effort_measures,
     hold_measures,
     safety_measures,
     step_measures,
@@ -121,3 +122,14 @@ def test_late_neutral_is_told() -> None:
     assert not found.neutral_in_time
     in_time: SafetyMeasures = replace(found, neutral_late=0.2)
     assert in_time.neutral_in_time
+
+
+def test_reversals_and_jumps_of_an_effort() -> None:
+    # Four frames a second for two minutes: every second up, down, at rest, down.
+    efforts = (0.2, -0.1, 0.0, -0.1)
+    rows = [ROW._replace(time_s=0.25 * k, forward=efforts[k % 4]) for k in range(481)]
+    found = effort_measures(LoopLog(rows), "forward")
+    # Up to down and back again; neutral between two downs is none.
+    assert found.reversals == pytest.approx(120.0)
+    assert found.jumps == pytest.approx(120.0)
+    assert effort_measures(LoopLog(rows), "turn").reversals == 0.0

@@ -4,27 +4,31 @@ import math
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aqualvs.control.controller_ramp import QuietZone
 from aqualvs.control.gains import ControlGains, Drag
 from aqualvs.control.gains_file import VEHICLES, gains_text, load_gains, save_gains
-from aqualvs.control.gains_thrust import Layout, ThrustMap
+from aqualvs.control.gains_thrust import DeadBandCrossing, Layout, ThrustMap
 from aqualvs.errors import OptionError
 
 MAP = ThrustMap(forward=40.0, backward=30.0, right=35.0, dead_band=0.14, linear=0.7)
+
+
+def efforts(thrust: ThrustMap, forward: float, right: float) -> tuple[float, float]:
+    one, other = thrust.shares(forward, right)
+    return thrust.joined(thrust.effort(one), thrust.effort(other))
 
 
 @given(st.floats(-1.0, 1.0))
 def test_effort_turns_the_curve_round(share: float) -> None:
     effort = MAP.effort(share)
     assert abs(effort) <= 1.0
-    if abs(share) >= MAP.soft:
-        assert MAP.share(effort) == pytest.approx(share, abs=1e-9)
-    else:
-        assert abs(effort) <= MAP.effort(MAP.soft)
+    assert MAP.share(effort) == pytest.approx(share, abs=1e-9)
 
 
 @pytest.mark.parametrize("linear", [1.0, 0.5, 0.05])
@@ -38,22 +42,56 @@ def test_curve_is_monotone_and_odd(linear: float) -> None:
 
 @given(st.floats(-25.0, 25.0), st.floats(-10.0, 10.0))
 def test_vectored_thrusters_give_both_forces_at_once(forward: float, right: float) -> None:
-    one = ThrustMap(forward=40.0, backward=40.0, right=40.0, dead_band=0.14, linear=0.7, soft=1e-9)
-    found = one.forces(*one.efforts(forward, right))
+    one = ThrustMap(forward=40.0, backward=40.0, right=40.0, dead_band=0.14, linear=0.7)
+    found = one.forces(*efforts(one, forward, right))
     assert found == pytest.approx((forward, right), abs=1e-4)
 
 
 def test_forward_comes_before_sideways_where_thrust_ends() -> None:
-    forward, right = MAP.forces(*MAP.efforts(36.0, 35.0))
+    forward, right = MAP.forces(*efforts(MAP, 36.0, 35.0))
     assert forward == pytest.approx(36.0)
     assert right == pytest.approx(3.5)
 
 
 def test_straight_thrusters_do_not_share() -> None:
     both = ThrustMap(forward=5.0, backward=4.0, right=3.0, layout=Layout.STRAIGHT)
-    assert both.efforts(5.0, 3.0) == (1.0, 1.0)
+    assert efforts(both, 5.0, 3.0) == (1.0, 1.0)
     none = ThrustMap(forward=5.0, backward=4.0, right=0.0, layout=Layout.STRAIGHT)
-    assert none.efforts(-2.0, 3.0) == (-0.5, 0.0)
+    assert efforts(none, -2.0, 3.0) == (-0.5, 0.0)
+
+
+def crossings(shares: list[float], impulse: float = 0.005, great: float = 0.1) -> list[float]:
+    pair = DeadBandCrossing(MAP, impulse, great)
+    return [pair.effort(share, 0.04) for share in shares]
+
+
+def test_noise_about_zero_crosses_no_dead_band() -> None:
+    rng = np.random.default_rng(1)
+    noise = (0.01 * rng.normal(size=1000)).tolist()
+    signs = np.sign([one for one in crossings(noise) if one])
+    n_noise = np.count_nonzero(np.diff(np.sign(noise)))
+    assert n_noise > 400
+    assert np.count_nonzero(np.diff(signs)) < 0.1 * n_noise
+
+
+def test_a_dead_band_is_crossed_once_an_impulse_is_lacking() -> None:
+    found = crossings([0.1] * 3 + [-0.02] * 10)
+    assert found[:3] == [MAP.effort(0.1)] * 3
+    # 0.02 of the thrust for 0.25 s: until then the thrusters wait at the edge.
+    assert found[3:9] == [MAP.dead_band] * 6
+    assert found[9:] == [MAP.effort(-0.02)] * 4
+
+
+def test_a_great_thrust_crosses_at_once_and_nothing_is_at_rest() -> None:
+    assert crossings([0.1, -0.1, 0.0]) == [MAP.effort(0.1), MAP.effort(-0.1), -MAP.dead_band]
+    assert crossings([0.0, 0.0]) == [0.0, 0.0]
+    assert crossings([1e-4, -1e-4], impulse=0.0) == [MAP.effort(1e-4), MAP.effort(-1e-4)]
+
+
+def test_small_turning_rates_are_not_begun() -> None:
+    zone = QuietZone(0.1)
+    asked = (0.05, 0.2, 0.05, -0.05, 0.05, -0.2, -0.01, 0.0)
+    assert [zone.rate(one) for one in asked] == [0.0, 0.2, 0.05, 0.0, 0.0, -0.2, -0.01, 0.0]
 
 
 @given(st.floats(-2.0, 2.0), st.floats(0.0, 40.0), st.floats(0.0, 200.0))

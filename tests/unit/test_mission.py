@@ -351,7 +351,8 @@ def test_frame_times_that_jump_back_stop_one_step_and_start_anew() -> None:
     assert (jumped.effort, jumped.reason) == (NEUTRAL, Reason.CLOCK)
     for k in range(1, 30):
         now = loop.now + FRAME_S * k
-        decision = loop.pilot.step(now, FRAME_S * k, posture_at(0.8), None, state_at(now))
+        seen = posture_at(0.8 + 1e-4 * (k % 2))
+        decision = loop.pilot.step(now, FRAME_S * k, seen, None, state_at(now))
     assert decision.reason is None
     assert decision.effort.forward > 0.1
 

@@ -36,6 +36,7 @@ def test_nothing_passes_before_engaging() -> None:
         ({"pilot_moves": True}, Reason.PILOT_STICKS),
         ({"mode": Mode.PILOT}, Reason.PILOT_MODE),
         ({"mode": Mode.NO_STATION}, Reason.NO_STATION),
+        ({"mode": Mode.IGNORED}, Reason.IGNORED),
         ({"mode": Mode.CONFLICT}, Reason.CONFLICT),
         ({"mode": Mode.UNKNOWN}, Reason.UNKNOWN_MODE),
         ({"armed": False}, Reason.DISARMED),
@@ -59,6 +60,14 @@ def test_the_vehicle_stops_us_until_engaged_again(
     assert gate.engage(now, state_at(now)) is None
     now += 0.04
     assert gate.check(now, 0.0, posture_at(), state_at(now), ASKED) == (ASKED, None)
+
+
+def test_a_rival_keeps_us_from_engaging_but_does_not_stop_us() -> None:
+    gate = SafetyGate()
+    assert gate.engage(5.0, state_at(5.0, rival="two addresses")) is Reason.CONFLICT
+    assert gate.engage(5.0, state_at(5.0)) is None
+    rival = state_at(5.1, rival="two addresses")
+    assert gate.check(5.1, 0.0, posture_at(), rival, ASKED) == (ASKED, None)
 
 
 def test_engaging_is_refused_while_the_vehicle_is_not_ours() -> None:

@@ -10,7 +10,7 @@ import pytest
 from aqualvs.app.tune import TuneRequest, tune_and_tell
 from aqualvs.control.gains_file import VEHICLES as PACKAGED
 from aqualvs.control.gains_file import gains_text, load_gains
-from aqualvs.control.tune import Tuned, TuneOptions, tune
+from aqualvs.control.tune import Tuned, TuneOptions, tune, usable_gains
 from aqualvs.control.tune_margins import Loop, margins
 from aqualvs.control.tune_model import facts_of
 from aqualvs.control.tune_step import StepOptions, simulate_step
@@ -104,7 +104,9 @@ def test_less_delay_gives_faster_gains(tuned: dict[str, Tuned]) -> None:
 def test_facts_follow_the_pilot_gain() -> None:
     full = replace(BLUEROV2, sticks=replace(BLUEROV2.sticks, gain=1.0))
     half, whole = facts_of(BLUEROV2), facts_of(full)
-    assert whole.turning_rate == pytest.approx(2.0 * half.turning_rate, rel=1e-3)
+    # 200 of 400 us, less the 20 of 40 that the dead zone takes.
+    assert whole.turning_rate == pytest.approx(BLUEROV2.sticks.turning_rate, rel=1e-3)
+    assert half.turning_rate == pytest.approx(whole.turning_rate * 180.0 / 380.0, rel=1e-3)
     assert whole.thrust.dead_band == pytest.approx(BLUEROV2.curve.dead_band)
     # Four thrusters at 45 degrees, two of them in reverse.
     most = math.sqrt(0.5) * 2.0 * (BLUEROV2.curve.forward + BLUEROV2.curve.reverse)
@@ -134,3 +136,19 @@ def test_report_says_margins_and_steps(tmp_path: Path) -> None:
     printed: list[str] = []
     tune_and_tell(TuneRequest(model="bluerov2"), printed.append)
     assert printed[-1] == path.read_text()
+
+
+@pytest.mark.parametrize("name", PACKAGED)
+def test_gains_that_would_swing_up_are_refused(name: str, tmp_path: Path) -> None:
+    gains = usable_gains(name)
+    for axis, keys in (("range", ("position", "speed", "integral")), ("yaw", ("proportional",))):
+        own = getattr(gains, axis)
+        for factor, sound in ((1.4, True), (3.0, False), (1000.0, False)):
+            more = replace(own, **{key: factor * getattr(own, key) for key in keys})
+            path = tmp_path / "gains.yaml"
+            path.write_text(gains_text(replace(gains, **{axis: more})))
+            if sound:
+                usable_gains(path)
+            else:
+                with pytest.raises(OptionError, match=rf"gains\.yaml: the {axis} loop"):
+                    usable_gains(path)

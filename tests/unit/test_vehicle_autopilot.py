@@ -1,11 +1,13 @@
 """A simulated vehicle under efforts: signs, loops, limits, delays and what it tells."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from aqualvs.control.tune_model import facts_of, shaping_of_model
+from aqualvs.control.vehicle import Effort
 from aqualvs.errors import OptionError
 from aqualvs.simulation.vehicle import SimulatedVehicle, level_pose
 from aqualvs.simulation.vehicle_autopilot import mix_inputs, pack_pilot, thrust_of
@@ -26,14 +28,6 @@ VECTORED = pytest.mark.parametrize("model", [BLUEROV2_HEAVY, BLUEROV2], ids=["he
 FRAME = 0.04
 
 
-@dataclass(frozen=True)
-class Effort:
-    forward: float = 0.0
-    right: float = 0.0
-    down: float = 0.0
-    yaw: float = 0.0
-
-
 def vehicle(
     model: VehicleModel, *, heading: float = 0.0, water: WaterMotion | None = None, **options: float
 ) -> SimulatedVehicle:
@@ -43,8 +37,10 @@ def vehicle(
 
 
 def run(one: SimulatedVehicle, effort: Effort, seconds: float) -> None:
+    """Send efforts as a link does, with the dead zones of the sticks taken out."""
+    sticks = shaping_of_model(one.model).position(effort)
     for _ in range(round(seconds / FRAME)):
-        one.step(effort, FRAME)
+        one.step(sticks, FRAME)
 
 
 @MODELS
@@ -87,11 +83,11 @@ def test_no_thruster_no_sway() -> None:
 @MODELS
 def test_turning_rate_reaches_what_is_asked(model: VehicleModel) -> None:
     one = vehicle(model)
-    effort = Effort(yaw=0.2)
-    asked = 0.2 * model.sticks.greatest_turning_rate
+    sticks = shaping_of_model(model).position(Effort(yaw=0.2))
+    asked = 0.2 * facts_of(model).turning_rate
     rates = []
     for _ in range(200):
-        one.step(effort, FRAME)
+        one.step(sticks, FRAME)
         rates.append(one.turning[2])
     # There within a second; a few percent too fast until heading and target agree again.
     assert rates[25] > 0.8 * asked
@@ -173,19 +169,22 @@ def test_saturation_keeps_the_mix() -> None:
 
 
 def test_dead_zones_of_the_sticks() -> None:
-    sticks = Sticks(yaw_dead_zone=0.1, down_dead_zone=0.2)
-    model = replace(BLUEROV2_HEAVY, sticks=sticks)
-    one = vehicle(model, heading=0.5)
-    run(one, Effort(yaw=0.09, down=0.35), 4.0)
+    """Positions of the sticks themselves, without a link that takes the dead zones out."""
+    sticks = BLUEROV2_HEAVY.sticks
+    one = vehicle(BLUEROV2_HEAVY, heading=0.5)
+    for _ in range(100):
+        one.step(Effort(yaw=0.09, down=0.18), FRAME)
     assert one.heading == pytest.approx(0.5, abs=math.radians(5.0))
     assert one.pose.translation[2] == pytest.approx(6.0, abs=0.03)
-    run(one, Effort(yaw=0.3), 5.0)
+    for _ in range(125):
+        one.step(Effort(yaw=0.3), FRAME)
     # 60 µs of the stick at this gain, 20 of them in the dead zone.
     asked = sticks.turning_rate * 40.0 / 380.0
     assert one.turning[2] == pytest.approx(asked, rel=0.1)
-    # ArduSub: (200 - 20) of (400 - 20) µs past the dead zone, and (250 - 100) of (500 - 100).
-    assert sticks.greatest_turning_rate == pytest.approx(math.radians(151.875) * 180.0 / 380.0)
-    assert sticks.greatest_climb_rate == pytest.approx(0.5 * 150.0 / 400.0)
+    # ArduSub: (200 - 20) of (400 - 20) µs past the dead zone; (740 - 530) of (1000 - 530) up.
+    facts = facts_of(BLUEROV2_HEAVY)
+    assert facts.turning_rate == pytest.approx(math.radians(151.875) * 180.0 / 380.0, rel=1e-3)
+    assert facts.climb_rate == pytest.approx(0.5 * 210.0 / 470.0, rel=0.01)
 
 
 def test_latency_delays_an_effort_exactly() -> None:
@@ -293,7 +292,7 @@ def test_faults_are_refused() -> None:
     with pytest.raises(OptionError, match="gain"):
         Sticks(gain=0.0)
     with pytest.raises(OptionError, match="dead zones"):
-        Sticks(down_dead_zone=0.6)
+        Sticks(throttle_dead_zone=600)
     with pytest.raises(OptionError, match="thrust curve"):
         ThrustCurve(lag=0.0)
     with pytest.raises(OptionError, match="factors"):

@@ -167,16 +167,46 @@ def test_nothing_in_nothing() -> None:
 def test_how_long_a_piece_must_be_is_an_option() -> None:
     image = picture((0.0, 1.0, 100.0))
     image[:, :200] = picture()[:, :200]
-    image[:, 230:] = picture()[:, 230:]
-    assert len(find_stripes(image)) > 20
-    # 30 px of 360.
-    assert len(find_stripes(image, WholePictureOptions(min_length_share=0.1))) == 0
+    image[:, 280:] = picture()[:, 280:]
+    assert len(find_stripes(image)) > 60
+    # 80 px of 360.
+    assert len(find_stripes(image, WholePictureOptions(min_length_share=0.25))) == 0
+
+
+def test_a_bright_stripe_without_colour_is_no_laser() -> None:
+    """A highlight on steel is thin, long and straight, but white."""
+    image = picture(noise=1.0)
+    image[150:154, 40:300] = 200
+    assert len(find_stripes(image)) == 0
+
+
+def test_a_line_broken_by_dark_squares_is_found_in_its_pieces() -> None:
+    image = picture((0.0, 1.0, 100.0))
+    dark = picture(noise=1.5) // 6
+    for first in range(0, SIZE[0], 72):
+        image[:, first : first + 36] = dark[:, first : first + 36]
+    found = find_stripes(image)
+    assert np.all(np.abs(distances(found, (0.0, 1.0, 100.0))) < 2.0)
+    assert len(found) > 0.9 * 0.5 * SIZE[0]
+
+
+def test_short_dashes_without_a_certain_line_are_left_out() -> None:
+    image = picture((0.0, 1.0, 100.0))
+    for first in range(0, SIZE[0], 72):
+        image[:, first : first + 58] = picture()[:, first : first + 58]
+    assert len(find_stripes(image)) == 0
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
 def test_senseless_options_are_refused(share: float) -> None:
     with pytest.raises(OptionError, match=f"min_length_share is {share}; use 0 to 1"):
         WholePictureOptions(min_length_share=share)
+
+
+@pytest.mark.parametrize("likelihood", [0.0, 1.0, float("nan")])
+def test_senseless_likelihoods_are_refused(likelihood: float) -> None:
+    with pytest.raises(OptionError, match=f"min_likelihood is {likelihood}; use 0 to 1"):
+        WholePictureOptions(min_likelihood=likelihood)
 
 
 # Channels as OpenCV has them (blue, green, red) of which two change places.

@@ -140,6 +140,8 @@ _command(
 # Older versions of Typer keep this class in Click, newer ones in a private module of their own.
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 _EXIT_BAD_INPUT = 2
+# Characters of a fault.
+_LONGEST = 2000
 _EXIT_INTERRUPTED = 130
 _EXIT_BROKEN_PIPE = 141
 
@@ -205,6 +207,9 @@ def _usage(fault: Exception) -> str:
 def _complain(message: str, code: int) -> int:
     # Names of files, and values in them, may hold line feeds and other control characters.
     line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message)
+    if len(line) > _LONGEST:
+        # A value of a megabyte in a file; the name of the file is at the front, the remedy behind.
+        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
     print(f"aqualvs: error: {line}", file=sys.stderr)
     return code
 

@@ -2,9 +2,11 @@
 
 import contextlib
 import errno
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from aqualvs.errors import OutputError
 
@@ -49,6 +51,22 @@ def replace_text(path: Path, text: str) -> None:
         os.replace(draft, path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    ValueError
+        If it is no JSON in UTF-8, or nested too deeply.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as fault:
+        raise ValueError("nested too deeply") from fault
 
 
 def explain(path: Path, fault: OSError) -> str:

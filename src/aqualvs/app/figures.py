@@ -10,7 +10,7 @@ from pyarrow import parquet
 
 from aqualvs.app.disk import writing
 from aqualvs.app.net_figures import FIGURES, Reflections, draw_figures
-from aqualvs.app.outputs import POINTS_PARQUET
+from aqualvs.app.outputs import POINTS_PARQUET, check_run_files
 from aqualvs.app.overwriting import Claim
 from aqualvs.app.report_rig import LaserFacts, lasers_of, working_range_m
 from aqualvs.app.report_run import read_run_file
@@ -98,6 +98,7 @@ def figures(
     OutputError
         If the pictures cannot be written.
     """
+    check_run_files(folder)
     run, trouble = read_run_file(folder)
     if trouble:
         raise SourceError(f"{folder}: {trouble} Give the folder of a run that has one.")

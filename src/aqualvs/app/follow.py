@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aqualvs.app.follow_fast_eye import SampledEye
+from aqualvs.app.follow_fast_eye import Blind, Loss, SampledEye
 from aqualvs.app.follow_figures import FIGURE_FILES
 from aqualvs.app.follow_rendered import RenderedEye
 from aqualvs.app.follow_report import PAGE, RunFacts, summary_lines, write_report
@@ -22,11 +22,11 @@ from aqualvs.app.overwriting import Claim
 from aqualvs.app.pilot_page import serve_page
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.follow_log import FollowLog
-from aqualvs.control.gains_file import load_gains
 from aqualvs.control.mission import HoldMission, Mission
 from aqualvs.control.plan import load_plan
 from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.control.tune import usable_gains
 from aqualvs.errors import OptionError
 from aqualvs.simulation.cameras import simulated_camera
 from aqualvs.simulation.example_rigs import example_rig
@@ -106,6 +106,8 @@ class SimRequest:
     camera : str or None
         Simulated camera that takes the rendered frames; the ideal one if left out.
     seed : int
+    freeze : float or None
+        When the picture begins to stand still, in seconds; never if left out.
     dashboard : str or None
         Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
     token : str or None
@@ -129,6 +131,7 @@ class SimRequest:
     rendered: bool = False
     camera: str | None = None
     seed: int = 0
+    freeze: float | None = None
     dashboard: str | None = None
     token: str | None = None
     overwrite: bool = False
@@ -141,8 +144,12 @@ class SimRequest:
         OptionError
             Naming the value.
         """
-        if not self.seconds >= _LEAST_S:
-            raise OptionError(f"--seconds {self.seconds:g}: choose at least {_LEAST_S:g}")
+        if not _LEAST_S <= self.seconds <= _MOST_S:
+            raise OptionError(
+                f"--seconds {self.seconds:g}: choose at least {_LEAST_S:g}, at most {_MOST_S:g}"
+            )
+        if not _LEAST_FPS <= self.fps <= _MOST_FPS:
+            raise OptionError(f"--fps {self.fps:g}: choose {_LEAST_FPS:g} to {_MOST_FPS:g}")
         if self.camera is not None and not self.rendered:
             raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
         if self.cage_radius and not self.cage_radius >= _LEAST_RADIUS:
@@ -155,9 +162,13 @@ class SimRequest:
                 f"--current {self.current:g} m/s, --net-sway {self.net_sway:g} m: choose 0 to 2, "
                 "and 0 to 1"
             )
+        if self.freeze is not None and not self.freeze >= 0.0:
+            raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
 
 
 _LEAST_S, _LEAST_RADIUS = 1.0, 2.0
+# A day; the slowest and fastest that cameras are.
+_MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
 
 
 def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:
@@ -172,31 +183,33 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     case = _case(request, limits, setpoint)
     files = [request.out / name for name in (FOLLOW_CSV, TRUTH_CSV, PAGE, *FIGURE_FILES)]
-    claim = Claim("follow", files, overwrite=request.overwrite)
-    rng = np.random.default_rng([request.seed, 53])
-    eye: Eye = SampledEye(case.net, rng, working_range=rig.working_range)
-    if request.rendered:
-        eye = RenderedEye(case.net, rig, rng, camera=simulated_camera(request.camera or "ideal"))
-    loop = case.loop(eye, mission)
-    with ExitStack() as undo:
-        page = None
-        if request.dashboard is not None:
-            holder = SetpointHolder(rig.working_range)
-            holder.put(setpoint)
-            served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
-            page = LoopPage(served, rig, loop, holder)
-            undo.callback(page.close)
-        _run(loop, request, page, tell)
-    write_log(loop.log, request.out / TRUTH_CSV)
-    facts = RunFacts(
-        vehicle=case.model.name,
-        current=request.current,
-        waves=request.waves,
-        rendered=request.rendered,
-        fps=request.fps,
-    )
-    report = write_report(loop.log, facts, request.out)
-    claim.settle()
+    with Claim("follow", files, overwrite=request.overwrite):
+        rng = np.random.default_rng([request.seed, 53])
+        freeze_s = math.inf if request.freeze is None else request.freeze
+        frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
+        eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
+        if request.rendered:
+            camera = simulated_camera(request.camera or "ideal")
+            eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
+        loop = case.loop(eye, mission)
+        with ExitStack() as undo:
+            page = None
+            if request.dashboard is not None:
+                holder = SetpointHolder(rig.working_range)
+                holder.put(setpoint)
+                served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
+                page = LoopPage(served, rig, loop, holder)
+                undo.callback(page.close)
+            _run(loop, request, page, tell)
+        write_log(loop.log, request.out / TRUTH_CSV)
+        facts = RunFacts(
+            vehicle=case.model.name,
+            current=request.current,
+            waves=request.waves,
+            rendered=request.rendered,
+            fps=request.fps,
+        )
+        report = write_report(loop.log, facts, request.out)
     for line in summary_lines(loop.log, facts):
         tell(line)
     tell(f"written: {report}")
@@ -207,7 +220,7 @@ def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimC
     model = vehicle_model(request.vehicle, request.pilot_gain)
     return SimCase(
         model=model,
-        gains=tuned_gains(model) if request.gains is None else load_gains(request.gains),
+        gains=tuned_gains(model) if request.gains is None else usable_gains(request.gains),
         water=sea(
             current=request.current,
             current_to=request.current_to,

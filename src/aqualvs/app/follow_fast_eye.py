@@ -24,6 +24,10 @@ class Loss(StrEnum):
     """Frames come, but nothing is measured in them."""
     STREAM = "stream"
     """No frames come."""
+    FROZEN = "frozen"
+    """The last picture comes again and again: its posture repeats to the bit."""
+    STUCK = "stuck"
+    """Frames come with noise of their own, but show what was there at the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,16 +94,29 @@ class SampledEye:
         self._noise = noise or PostureNoise()
         self._blind = tuple(blind)
         self._working_range = working_range
+        self._stuck: tuple[Blind, NetPosture] | None = None
+        self._last: Posture | Refusal | None = None
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
         """Return what the frame exposed now gives."""
-        truth = self._net.posture_at(world_from_dome, time_s)
+        self._last = self._look(self._net.posture_at(world_from_dome, time_s), time_s)
+        return self._last
+
+    def _look(self, truth: NetPosture, time_s: float) -> Posture | Refusal | None:
         # Drawn in any case: the noise of a frame does not depend on what happened before.
         draws = self._rng.normal(size=3)
         wild = self._rng.uniform() < self._noise.outliers
-        for blind in self._blind:
-            if blind.start_s <= time_s < blind.end_s:
-                return None if blind.loss is Loss.STREAM else Refusal(Reason.TOO_FEW_POINTS)
+        blind = next((one for one in self._blind if one.start_s <= time_s < one.end_s), None)
+        if blind is not None:
+            if blind.loss is Loss.STREAM:
+                return None
+            if blind.loss is Loss.TARGET:
+                return Refusal(Reason.TOO_FEW_POINTS)
+            if blind.loss is Loss.FROZEN and self._last is not None:
+                return self._last
+            if self._stuck is None or self._stuck[0] is not blind:
+                self._stuck = blind, truth
+            truth = self._stuck[1]
         near, far = self._working_range
         if not near <= truth.range <= far:
             return Refusal(Reason.OUT_OF_RANGE, f"{truth.range:.2f} m")

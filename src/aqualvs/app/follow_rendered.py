@@ -1,14 +1,16 @@
 """A scanner that is run on rendered pictures: every frame goes through the real pipeline."""
 
+import math
 from collections import deque
 
 import numpy as np
 
 from aqualvs.geometry.transforms import SE3
+from aqualvs.live.frozen import FrozenPicture
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
-from aqualvs.scanning.posture import Posture, Refusal
-from aqualvs.scanning.scan import Frame, Scan, planes_of_image
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.scan import Frame, Planes, Scan, planes_of_image
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
@@ -42,6 +44,8 @@ class RenderedEye:
         Rays along each side of a pixel.
     camera : SimulatedCamera
         Takes the pictures; they are measured before it compresses them.
+    freeze_s : float
+        From then on the last picture comes again and again, with time stamps that run on.
 
     Attributes
     ----------
@@ -58,22 +62,33 @@ class RenderedEye:
         options: ScannerOptions | None = None,
         samples: int = 1,
         camera: SimulatedCamera = IDEAL,
+        freeze_s: float = math.inf,
     ) -> None:
         self._net, self._rng = net, rng
         self._scene = net_scene() if scene is None else scene
         self._renderer = Renderer(rig, samples=samples, camera=camera)
         self._scanner = Scanner(rig, options)
         self._n_frames = 0
+        self._freeze_s, self._frozen = freeze_s, FrozenPicture()
+        self._planes: Planes | None = None
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
         """Return what the frame exposed now gives."""
-        scene = self._net.scene_at(world_from_dome, time_s, self._scene)
-        image = self._renderer.render(scene, time_s, self._rng).image
-        # OpenCV's order of colours.
-        planes = planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
-        frame = Frame(self._n_frames, time_s, *planes)
+        if self._planes is None or time_s < self._freeze_s:
+            self._planes = self._rendered(world_from_dome, time_s)
+        frame = Frame(self._n_frames, time_s, *self._planes)
         self._n_frames += 1
+        # As the live run does.
+        still_s = self._frozen.update(time_s, frame.luma)
+        if still_s > 0.0:
+            return Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
         scan = self._scanner.process(frame)
         self.shots.append((frame, scan))
         return scan.posture
+
+    def _rendered(self, world_from_dome: SE3, time_s: float) -> Planes:
+        scene = self._net.scene_at(world_from_dome, time_s, self._scene)
+        image = self._renderer.render(scene, time_s, self._rng).image
+        # OpenCV's order of colours.
+        return planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))

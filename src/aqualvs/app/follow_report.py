@@ -8,7 +8,12 @@ from pathlib import Path
 from aqualvs.app.disk import replace_text, writing
 from aqualvs.app.follow_figures import draw_follow_figures
 from aqualvs.app.follow_sim_log import LoopLog
-from aqualvs.app.follow_sim_measures import hold_measures, safety_measures
+from aqualvs.app.follow_sim_measures import (
+    JUMP,
+    effort_measures,
+    hold_measures,
+    safety_measures,
+)
 
 PAGE = "follow.html"
 SETTLED_S = 10.0
@@ -47,6 +52,7 @@ def summary(log: LoopLog) -> list[tuple[str, str]]:
             f"{1e3 * hold.range_rms:.1f} mm (worst {1e3 * hold.range_worst:.0f} mm)",
         ),
         ("yaw error, rms", f"{math.degrees(hold.yaw_rms):.2f} deg"),
+        *_efforts(log, start_s),
         ("frames without a posture", f"{hold.n_lost}"),
         ("frames at which the safety gate stepped in", f"{hold.n_guarded}"),
         (
@@ -61,6 +67,18 @@ def summary(log: LoopLog) -> list[tuple[str, str]]:
     if math.isfinite(safety.lost_s):
         figures.append(("LOST", f"the net, for good, at {safety.lost_s:.1f} s"))
     return figures
+
+
+def _efforts(log: LoopLog, start_s: float) -> list[tuple[str, str]]:
+    """Return how often the efforts turned round."""
+    names = {"forward": "forward", "right": "right", "turn": "yaw"}
+    found = {name: effort_measures(log, column, start_s) for column, name in names.items()}
+    reversals = ", ".join(f"{name} {one.reversals:.0f}" for name, one in found.items())
+    jumps = ", ".join(f"{name} {one.jumps:.0f}" for name, one in found.items())
+    return [
+        ("reversals of the effort a minute", reversals),
+        (f"jumps of the effort above {JUMP:g} a minute", jumps),
+    ]
 
 
 def summary_lines(log: LoopLog, facts: RunFacts) -> list[str]:

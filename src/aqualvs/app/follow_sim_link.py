@@ -2,6 +2,7 @@
 
 import math
 
+from aqualvs.control.tune_model import shaping_of_model
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.simulation.vehicle import SimulatedVehicle
 
@@ -27,6 +28,7 @@ class SimulatedLink:
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self.vehicle = vehicle
         self.effort = NEUTRAL
+        self._shaping = shaping_of_model(vehicle.model)
         self._unsent: Effort | None = None
         self._closed = False
 
@@ -52,7 +54,8 @@ class SimulatedLink:
     def send(self, effort: Effort) -> None:
         """Ask for an effort."""
         if not self._closed:
-            self.effort = self._unsent = effort
+            self.effort = effort
+            self._unsent = self._shaping.position(effort)
 
     def pass_time(self, until_s: float) -> None:
         """Let the vehicle move until a time; nothing if that is not ahead."""

@@ -59,6 +59,26 @@ class StepMeasures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EffortMeasures:
+    """How often an effort turns round: thrusters wear by it, and shake the camera.
+
+    Attributes
+    ----------
+    reversals : float
+        Changes of the sign a minute; neutral between two of one sign is none.
+    jumps : float
+        Changes by more than `JUMP` from one frame to the next, a minute.
+    """
+
+    reversals: float
+    jumps: float
+
+
+JUMP = 0.25
+"""Of an effort: about what crossing a dead band takes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyMeasures:
     """Of a whole run.
 
@@ -110,6 +130,25 @@ def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> Hold
         n_lost=sum(row.refusal != "" for row in rows),
         n_guarded=sum(row.reason != "" for row in rows),
     )
+
+
+def effort_measures(log: LoopLog, name: str, start_s: float = 0.0) -> EffortMeasures:
+    """Return how often an effort turned round from `start_s` on.
+
+    Parameters
+    ----------
+    log : LoopLog
+    name : {"forward", "right", "down", "turn"}
+        Of the effort.
+    start_s : float
+    """
+    here = _between(log, start_s, math.inf)
+    efforts, time_s = log.column(name)[here], log.column("time_s")[here]
+    minutes = max((time_s[-1] - time_s[0]) / 60.0, 1e-9) if len(time_s) else math.inf
+    signs = np.sign(efforts)
+    reversals = np.count_nonzero(np.diff(signs[signs != 0.0]))
+    jumps = np.count_nonzero(np.abs(np.diff(efforts)) > JUMP)
+    return EffortMeasures(reversals=reversals / minutes, jumps=jumps / minutes)
 
 
 def step_measures(

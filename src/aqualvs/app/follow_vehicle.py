@@ -19,9 +19,9 @@ from aqualvs.app.run_inputs import Water, prepared_rig
 from aqualvs.app.stopping import StopSignals
 from aqualvs.control.autopilot import NetPilot
 from aqualvs.control.controller import RangeYawController
-from aqualvs.control.gains_file import load_gains
 from aqualvs.control.safety import SafetyGate
 from aqualvs.control.setpoint import SetpointHolder
+from aqualvs.control.tune import usable_gains
 from aqualvs.errors import AqualvsError
 from aqualvs.live.ardusub_link import ArduSubLink
 from aqualvs.live.mavlink_link import MavlinkLink
@@ -98,22 +98,22 @@ def follow_and_tell(
     AqualvsError
         If an input cannot be used, or the source can never work.
     """
-    claim = Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite)
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)
     holder.put(setpoint)
-    steering = NetPilot(mission, RangeYawController(load_gains(request.gains)), SafetyGate(limits))
+    gains = usable_gains(request.gains)
+    steering = NetPilot(mission, RangeYawController(gains), SafetyGate(limits))
     scanner = Scanner(rig, request.scanner)
-    warm_up(scanner)
-    with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
-        pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
-        runner = _runner(request, scanner, link, pilot, holder, tell)
-        tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
-        listen(pilot, sys.stdin if keys is None else keys, tell)
-        with StopSignals() as stop:
-            fault = runner.run(lambda: stop.caught is not None)
-    claim.settle()
+    with Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite):
+        warm_up(scanner)
+        with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
+            pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
+            runner = _runner(request, scanner, link, pilot, holder, tell)
+            tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
+            listen(pilot, sys.stdin if keys is None else keys, tell)
+            with StopSignals() as stop:
+                fault = runner.run(lambda: stop.caught is not None)
     if fault is not None:
         raise fault
     return 0

@@ -103,15 +103,14 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
         tell(f"{run_folder}: points completed from the journal of a run that was killed")
     stored = StoredDive(run_folder)
     net = stored.net_pass(request)
-    claim = claim_run(folder, NET_FILES, overwrite=place.overwrite)
-    with StopSignals() as stop, progress(str(run_folder), stored.n_frames) as tick:
-        for scan in stored_scans(run_folder):
-            net.add(scan)
-            tick(1)
-            if stop.caught:
-                break
-    result = net.write(folder, stored.video)
-    claim.settle()
+    with claim_run(folder, NET_FILES, overwrite=place.overwrite):
+        with StopSignals() as stop, progress(str(run_folder), stored.n_frames) as tick:
+            for scan in stored_scans(run_folder):
+                net.add(scan)
+                tick(1)
+                if stop.caught:
+                    break
+        result = net.write(folder, stored.video)
     for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
         tell(line)
     if stop.caught:

@@ -2,12 +2,12 @@
 
 import base64
 import csv
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from aqualvs.app.disk import read_json
 from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
 from aqualvs.app.report_findings import Card
 from aqualvs.app.report_html import Raw, table, text
@@ -236,13 +236,16 @@ def _number(row: Row, name: str) -> float | None:
 
 
 def _rows(path: Path) -> list[Row]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return [row for row in csv.DictReader(file) if None not in row.values()]
+    try:
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            return [row for row in csv.DictReader(file) if None not in row.values()]
+    except csv.Error:
+        return []
 
 
 def _facts(path: Path) -> Mapping[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except (OSError, ValueError):
         return {}
     found = content.get("aqualvs_net") if isinstance(content, dict) else None

@@ -28,6 +28,7 @@ from aqualvs.app.runfile import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.app.tally import Tally, tally_of
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.scanning.scan import Scan
+from aqualvs.special_files import refuse_special
 
 POSTURE_CSV = "posture.csv"
 POSTURE_BARE_CSV = "posture_bare.csv"
@@ -224,6 +225,18 @@ def _is_run(folder: Path) -> bool:
         return False
 
 
+def check_run_files(folder: Path) -> None:
+    """Refuse a folder with a pipe or a device in the place of a run's file.
+
+    Raises
+    ------
+    SourceError
+        With its path.
+    """
+    for name in RUN_FILES:
+        refuse_special(folder / name)
+
+
 def recover(folder: Path) -> bool:
     """Complete the folder of a run that was killed.
 
@@ -239,6 +252,7 @@ def recover(folder: Path) -> bool:
     """
     if not (folder / POSTURE_CSV).is_file():
         raise OutputError(f"{folder}: holds no run (no {POSTURE_CSV}); give the folder of a run")
+    check_run_files(folder)
     journal = folder / JOURNAL
     check_idle(journal)
     if not journal.exists():

@@ -96,18 +96,16 @@ class Claim:
         if not isinstance(noted, dict) or noted.get(_WRITER) != self._writer:
             raise OutputError(
                 f"{path}: exists, and 'aqualvs {self._writer}' did not write it; move it away, or "
-                "choose another place with --out"
+                "choose another place with -o"
             )
         mark = noted.get(_MARK)
         if mark is not None and mark != _mark(path):
             raise OutputError(
                 f"{path}: has changed since 'aqualvs {self._writer}' wrote it; move it away, or "
-                "choose another place with --out"
+                "choose another place with -o"
             )
         if not overwrite:
-            raise OutputError(
-                f"{path}: exists; choose another place with --out, or add --overwrite"
-            )
+            raise OutputError(f"{path}: exists; choose another place with -o, or add --overwrite")
 
     def __enter__(self) -> Self:
         """Return the claim."""

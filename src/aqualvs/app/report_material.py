@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from aqualvs.app.net_report import NetTables, net_warnings, read_net
+from aqualvs.app.outputs import check_run_files
 from aqualvs.app.report_findings import warnings_of
 from aqualvs.app.report_frames import (
     Picture,
@@ -83,6 +84,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     SourceError
         If `posture.csv`, or the truth, cannot be read or holds no frame.
     """
+    check_run_files(run_dir)
     run, trouble = read_run_file(run_dir)
     track = read_track(run_dir / "posture.csv")
     source = _source(run_dir, run)

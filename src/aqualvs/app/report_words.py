@@ -19,6 +19,7 @@ REASON_WORDS: dict[str, str] = {
     Reason.CORRUPT_FRAME: "frame could not be decoded",
     Reason.WRONG_SIZE: "picture of another size",
     Reason.NO_FRAMES: "stream silent",
+    Reason.FROZEN: "picture stands still",
 }
 
 LABEL_WORDS: dict[Label, str] = {

@@ -52,24 +52,25 @@ def score_and_tell(
         )
     benchmark = load_set(truth)
     files = [] if out is None else [out / name for name in SCORE_FILES]
-    claim = Claim("score", files, overwrite=overwrite)
-    arguments = list(results)
-    systems = [read_system(argument, benchmark) for argument in arguments]
-    if own is not None:
-        mine = run_own(benchmark, own, tell, overwrite=overwrite)
-        systems += [read_system(argument, benchmark) for argument in mine]
-    names = [system.name for system in systems]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise OptionError(f"{twice}: two systems of this name; give NAME=PATH")
-    scores = score_systems(benchmark, systems)
-    for line in lines(scores, dives=dives):
-        tell(line)
-    for system in systems:
-        if system.missing:
-            tell(f"{system.name}: no file for {', '.join(system.missing)}: counted as no answer")
-    if out is not None:
-        with writing(out):
-            written = write_scores(scores, out)
-        claim.settle()
-        tell(f"scores: {', '.join(map(str, written))}")
+    with Claim("score", files, overwrite=overwrite):
+        arguments = list(results)
+        systems = [read_system(argument, benchmark) for argument in arguments]
+        if own is not None:
+            mine = run_own(benchmark, own, tell, overwrite=overwrite)
+            systems += [read_system(argument, benchmark) for argument in mine]
+        names = [system.name for system in systems]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise OptionError(f"{twice}: two systems of this name; give NAME=PATH")
+        scores = score_systems(benchmark, systems)
+        for line in lines(scores, dives=dives):
+            tell(line)
+        for system in systems:
+            if system.missing:
+                tell(
+                    f"{system.name}: no file for {', '.join(system.missing)}: counted as no answer"
+                )
+        if out is not None:
+            with writing(out):
+                written = write_scores(scores, out)
+            tell(f"scores: {', '.join(map(str, written))}")

@@ -10,6 +10,7 @@ import numpy as np
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.special_files import refuse_special
 from aqualvs.yamlfile import read_yaml
 
 SET_FILE = "benchmark.yaml"
@@ -126,6 +127,7 @@ def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]
     SourceError
         If it cannot be read, holds no row, or lacks a column.
     """
+    refuse_special(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             table = csv.DictReader(file)

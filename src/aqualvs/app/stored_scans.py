@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from aqualvs.app.journal import LABELS, POINTS_SCHEMA, read_journal
-from aqualvs.app.outputs import JOURNAL, POINTS_PARQUET, POSTURE_CSV
+from aqualvs.app.outputs import JOURNAL, POINTS_PARQUET, POSTURE_CSV, check_run_files
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Reason, Refusal
@@ -75,6 +75,7 @@ def check_stored(run_folder: Path) -> None:
     SourceError
         As `stored_scans`.
     """
+    check_run_files(run_folder)
     next(_posture_rows(run_folder / POSTURE_CSV), None)
     next(_batches(run_folder), None)
 
@@ -94,6 +95,8 @@ def _posture_rows(path: Path) -> Iterator[dict[str, str]]:
             yield from (row for row in reader if row[last] is not None)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; give the folder of a run") from None
+    except csv.Error as fault:
+        raise SourceError(f"{path}: is damaged ({fault}); run the dive again") from None
     except OSError as fault:
         raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the disk") from fault
 

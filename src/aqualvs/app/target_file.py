@@ -147,7 +147,8 @@ def _mesh_filter(path: Path, content: Any, net: NetFacts | None) -> MeshFilterOp
     _refuse_unknown(path, "mesh_filter.", content, _LENGTHS)
     lengths = {} if net is None else net.filter_lengths()
     for name, value in content.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
             raise OptionError(f"{path}: mesh_filter.{name} is {value!r}; give millimetres")
         lengths[name.removesuffix("_mm")] = 1e-3 * value
     try:

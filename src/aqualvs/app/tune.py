@@ -50,16 +50,15 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
     if model is None:
         raise OptionError(f"tune {request.model}: no such model; use one of {', '.join(VEHICLES)}")
     files = [] if request.output is None else [request.output]
-    claim = Claim("tune", files, overwrite=request.overwrite)
-    tuned = tune(model, request.options)
-    for line in report(model, tuned, request.options):
-        tell(line)
-    if request.output is None:
-        tell(gains_text(tuned.gains))
-    else:
-        save_gains(tuned.gains, request.output)
-        claim.settle()
-        tell(f"written to {request.output}")
+    with Claim("tune", files, overwrite=request.overwrite):
+        tuned = tune(model, request.options)
+        for line in report(model, tuned, request.options):
+            tell(line)
+        if request.output is None:
+            tell(gains_text(tuned.gains))
+        else:
+            save_gains(tuned.gains, request.output)
+            tell(f"written to {request.output}")
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:

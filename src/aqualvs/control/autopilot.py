@@ -3,12 +3,14 @@
 import math
 from dataclasses import dataclass
 
+from aqualvs.control.answer import AnswerWatch
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.mission import Guidance, Mission, Stage
 from aqualvs.control.safety import Reason, SafetyGate
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.posture import Reason as NoPosture
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,8 @@ class NetPilot:
             )
         self.mission, self.controller = mission, controller
         self.gate = gate or SafetyGate()
+        self._watch = AnswerWatch(controller.gains.vehicle)
+        self._doubt: Reason | None = None
         self._posture: Posture | None = None
         self._seen_s = self._frame_s = -math.inf
         self._asked: Effort | None = None
@@ -94,7 +98,8 @@ class NetPilot:
         if refused is None:
             self.mission.restart()
             self.controller.reset()
-            self._asked = None
+            self._watch.restart()
+            self._asked = self._doubt = None
         return refused
 
     def disengage(self) -> None:
@@ -128,7 +133,7 @@ class NetPilot:
             _, reason = self.gate.check(now_s, math.inf, None, state, NEUTRAL)
             stopped = reason if reason is not None and reason.takes_over else Reason.CLOCK
             return Decision(NEUTRAL, stopped, _IDLE, self.engaged)
-        present = self._present(now_s, time_s, posture)
+        present = self._present(now_s, time_s, posture, state)
         guidance = self._guide(now_s, present, state)
         asked = self._ask(time_s, present, filtered, guidance)
         effort, reason = self.gate.check(
@@ -138,7 +143,9 @@ class NetPilot:
             state,
             asked or NEUTRAL,
             range_rate=None if filtered is None else filtered.range_rate,
+            doubt=self._doubt,
         )
+        self._watch.done(now_s, effort)
         self._settle(asked, effort, reason)
         reason = self._end(guidance) or reason or _mission_says(guidance)
         return Decision(effort, reason, guidance, self.engaged)
@@ -157,15 +164,22 @@ class NetPilot:
         self._frame_s = time_s
         self._posture, self._seen_s, self._asked = None, -math.inf, None
         self.controller.reset()
+        self._watch.reset()
         return True
 
     def _present(
-        self, now_s: float, time_s: float, posture: Posture | Refusal | None
+        self, now_s: float, time_s: float, posture: Posture | Refusal | None, state: VehicleState
     ) -> Posture | None:
         """Return the posture of a new frame; a picture that stands still is none."""
+        if isinstance(posture, Refusal) and posture.reason is NoPosture.FROZEN:
+            self._doubt = Reason.FROZEN
+            return None
         if not (isinstance(posture, Posture) and time_s > self._frame_s):
             return None
         self._frame_s = time_s
+        self._doubt = self._watch.see(now_s, posture, state)
+        if self._doubt is Reason.FROZEN:
+            return None
         self._posture, self._seen_s = posture, now_s
         return posture
 

@@ -12,9 +12,10 @@ turn, are made up for beforehand.
 
 import math
 
-from aqualvs.control.controller_ramp import Ramp
+from aqualvs.control.controller_ramp import QuietZone, Ramp
 from aqualvs.control.disturbance import SwellFilter
 from aqualvs.control.gains import ControlGains, gain_schedule
+from aqualvs.control.gains_thrust import DeadBandCrossing
 from aqualvs.control.pid import Pid, PidOptions
 from aqualvs.control.setpoint import Setpoint
 from aqualvs.control.vehicle import Effort
@@ -71,6 +72,9 @@ class RangeYawController:
         self._swell = SwellFilter(near.swell_period, near.swell_damping)
         self._swing_gain = near.speed * near.swell
         self._slope = _Slope(gains.rate_time)
+        band = thrust, near.crossing_impulse, near.crossing_share
+        self._pairs = (DeadBandCrossing(*band), DeadBandCrossing(*band))
+        self._quiet = QuietZone(turn.quiet_rate)
         self.reset()
 
     def reset(self) -> None:
@@ -79,6 +83,7 @@ class RangeYawController:
         self._turn.reset()
         self._slope.reset()
         self._swell.reset()
+        self._let_go()
         self._time_s = math.nan
         self._stopped_s = math.nan
         self._running = False
@@ -93,6 +98,7 @@ class RangeYawController:
         self._turn.pause()
         self._slope.reset()
         self._swell.reset()
+        self._let_go()
 
     def engage(self, time_s: float, range: float, yaw: float, effort: Effort) -> None:
         """Take over from somebody who steers, without a jump.
@@ -110,6 +116,10 @@ class RangeYawController:
         forward, _ = vehicle.thrust.forces(effort.forward, effort.right)
         self.reset()
         self._start(time_s, range, yaw)
+        parts = vehicle.thrust.split(effort.forward, effort.right)
+        for pair, part in zip(self._pairs, parts, strict=True):
+            pair.reset(part)
+        self._quiet.reset(effort.yaw)
         self._speed.engage(time_s, 0.0, 0.0, forward / vehicle.mass)
         self._turn.engage(time_s, 0.0, 0.0, -effort.yaw * vehicle.turning_rate)
 
@@ -161,8 +171,14 @@ class RangeYawController:
         self._yaw_ramp.step(setpoint.yaw, step)
         turn = self._turning(time_s, yaw, yaw_rate)
         forward, right = self._forces(step, range, yaw, rate, sway, turn)
-        self._effort = self._as_effort(forward, right, turn, down)
+        self._effort = self._as_effort(step, forward, right, turn, down)
         return self._effort
+
+    def _let_go(self) -> None:
+        """Begin with thrusters and turning at rest."""
+        for pair in self._pairs:
+            pair.reset()
+        self._quiet.reset()
 
     def _start(self, time_s: float, range: float, yaw: float) -> None:
         """Begin at a posture, with what is still known of the disturbance."""
@@ -226,9 +242,16 @@ class RangeYawController:
         push = (drag.force(ahead + passing) - held) / vehicle.mass
         return push, gain_schedule(self.gains.range, damping)
 
-    def _as_effort(self, forward: float, right: float, turn: float, down: float) -> Effort:
+    def _as_effort(
+        self, step: float, forward: float, right: float, turn: float, down: float
+    ) -> Effort:
         vehicle = self.gains.vehicle
-        ahead, aside = vehicle.thrust.efforts(forward, right)
+        shares = vehicle.thrust.shares(forward, right)
+        one, other = (
+            pair.effort(share, step) for pair, share in zip(self._pairs, shares, strict=True)
+        )
+        ahead, aside = vehicle.thrust.joined(one, other)
+        turn = self._quiet.rate(turn)
         return Effort(
             forward=ahead,
             right=aside,

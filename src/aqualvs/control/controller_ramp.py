@@ -1,4 +1,4 @@
-"""Setpoints that change at a bounded speed and acceleration."""
+"""Setpoints that change at a bounded speed, and turning rates that rest at zero."""
 
 import math
 
@@ -47,3 +47,31 @@ class Ramp:
         share = dt / (dt + self._lag)
         self.seen_rate += share * (self.rate - self.seen_rate)
         self.seen += share * (self.value - self.seen)
+
+
+class QuietZone:
+    """Leaves small turning rates out, so that the vehicle's own heading hold has its say.
+
+    From rest a rate must exceed `quiet`; one that has begun ends when it changes its sign.
+
+    Parameters
+    ----------
+    quiet : float
+        In rad/s.
+    """
+
+    def __init__(self, quiet: float) -> None:
+        self._quiet = quiet
+        self.reset()
+
+    def reset(self, rate: float = 0.0) -> None:
+        """Begin at rest, or with a rate that is in force."""
+        self._side = math.copysign(1.0, rate) if rate else 0.0
+
+    def rate(self, asked: float) -> float:
+        """Return the turning rate to ask of the vehicle."""
+        if abs(asked) > self._quiet:
+            self._side = math.copysign(1.0, asked)
+        elif asked * self._side <= 0.0:
+            self._side = 0.0
+        return asked if self._side else 0.0

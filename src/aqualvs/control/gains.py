@@ -97,6 +97,9 @@ class RangeGains:
     lag : float
         Time from an effort until pictures show it, in seconds: so much later a setpoint's change
         is expected to be seen.
+    crossing_impulse, crossing_share : float
+        Thrust across the thrusters' dead band that must be lacking before it is crossed: as share
+        of the full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
     swell : float
         Share by which `speed` is greater for errors that swing with the swell's period; 0 for
         calm water.
@@ -112,6 +115,8 @@ class RangeGains:
     ramp_speed: float = 0.15
     ramp_acceleration: float = 0.12
     jerk: float = 8.0
+    crossing_impulse: float = 0.005
+    crossing_share: float = 0.1
     swell: float = 0.0
     swell_period: float = 5.0
     swell_damping: float = 0.15
@@ -124,7 +129,7 @@ class RangeGains:
         OptionError
             Naming the first.
         """
-        free = ("integral", "lag", "swell")
+        free = ("integral", "lag", "swell", "crossing_impulse", "crossing_share")
         _check_positive(self, "range", [f.name for f in fields(self) if f.name not in free])
         _check_not_negative(self, "range", free)
 
@@ -149,6 +154,8 @@ class YawGains:
         Greatest change of the turning rate asked for, in rad/s².
     lag : float
         As of the range.
+    quiet_rate : float
+        Turning rate below which none is begun, in rad/s.
     """
 
     proportional: float
@@ -159,6 +166,7 @@ class YawGains:
     ramp_rate: float = math.radians(15.0)
     ramp_acceleration: float = math.radians(15.0)
     acceleration: float = math.radians(200.0)
+    quiet_rate: float = math.radians(0.8)
 
     def __post_init__(self) -> None:
         """Refuse gains that are not positive; integral, derivative and lag may be 0.
@@ -168,7 +176,7 @@ class YawGains:
         OptionError
             Naming the first.
         """
-        free = ("integral", "derivative", "lag")
+        free = ("integral", "derivative", "lag", "quiet_rate")
         _check_positive(self, "yaw", [f.name for f in fields(self) if f.name not in free])
         _check_not_negative(self, "yaw", free)
 

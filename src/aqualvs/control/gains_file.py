@@ -77,6 +77,8 @@ class RangePart(Part):
     ramp_speed_m_s: Positive = 0.15
     ramp_acceleration_m_s2: Positive = 0.12
     jerk_m_s3: Positive = 8.0
+    crossing_impulse_s: NotNegative = 0.005
+    crossing_share: NotNegative = 0.1
 
 
 class YawPart(Part):
@@ -90,6 +92,7 @@ class YawPart(Part):
     ramp_rate_deg_s: Positive = 15.0
     ramp_acceleration_deg_s2: Positive = 15.0
     acceleration_deg_s2: Positive = 200.0
+    quiet_rate_deg_s: NotNegative = 0.8
 
 
 class GainsFile(Part):
@@ -200,6 +203,8 @@ def _range(part: RangePart) -> RangeGains:
         ramp_speed=part.ramp_speed_m_s,
         ramp_acceleration=part.ramp_acceleration_m_s2,
         jerk=part.jerk_m_s3,
+        crossing_impulse=part.crossing_impulse_s,
+        crossing_share=part.crossing_share,
     )
 
 
@@ -213,6 +218,7 @@ def _yaw(part: YawPart) -> YawGains:
         ramp_rate=math.radians(part.ramp_rate_deg_s),
         ramp_acceleration=math.radians(part.ramp_acceleration_deg_s2),
         acceleration=math.radians(part.acceleration_deg_s2),
+        quiet_rate=math.radians(part.quiet_rate_deg_s),
     )
 
 
@@ -234,6 +240,8 @@ def _content(gains: ControlGains) -> GainsFile:
             ramp_speed_m_s=near.ramp_speed,
             ramp_acceleration_m_s2=near.ramp_acceleration,
             jerk_m_s3=near.jerk,
+            crossing_impulse_s=near.crossing_impulse,
+            crossing_share=near.crossing_share,
         ),
         yaw=YawPart(
             proportional_per_s=turn.proportional,
@@ -244,6 +252,7 @@ def _content(gains: ControlGains) -> GainsFile:
             ramp_rate_deg_s=_degrees(turn.ramp_rate),
             ramp_acceleration_deg_s2=_degrees(turn.ramp_acceleration),
             acceleration_deg_s2=_degrees(turn.acceleration),
+            quiet_rate_deg_s=_degrees(turn.quiet_rate),
         ),
         rate_time_s=gains.rate_time,
         memory_s=gains.memory,

@@ -34,9 +34,6 @@ class ThrustMap:
         Share of the curve that is straight.
     layout : Layout
         Of the level thrusters.
-    soft : float
-        Share of the full thrust below which the dead band is crossed gradually: noise about zero
-        then does not make thrusters chatter.
     """
 
     forward: float
@@ -45,7 +42,6 @@ class ThrustMap:
     dead_band: float = 0.0
     linear: float = 1.0
     layout: Layout = Layout.VECTORED
-    soft: float = 0.01
 
     def __post_init__(self) -> None:
         """Refuse what cannot be turned round.
@@ -60,10 +56,10 @@ class ThrustMap:
                 f"thrust: forward {self.forward:g}, backward {self.backward:g}, right "
                 f"{self.right:g} N; the first two are positive, the last 0 or more"
             )
-        if not (0.0 <= self.dead_band < 1.0 and 0.0 < self.linear <= 1.0 and 0.0 < self.soft < 1.0):
+        if not (0.0 <= self.dead_band < 1.0 and 0.0 < self.linear <= 1.0):
             raise OptionError(
-                f"thrust: dead band {self.dead_band:g}, linear {self.linear:g}, soft "
-                f"{self.soft:g}; shares between 0 and 1"
+                f"thrust: dead band {self.dead_band:g}, linear {self.linear:g}; shares between 0 "
+                "and 1"
             )
 
     def effort(self, share: float) -> float:
@@ -78,8 +74,8 @@ class ThrustMap:
             return 0.0
         return math.copysign(x * (self.linear + (1.0 - self.linear) * x), effort)
 
-    def efforts(self, forward: float, right: float) -> tuple[float, float]:
-        """Return efforts forward and right for forces in newtons.
+    def shares(self, forward: float, right: float) -> tuple[float, float]:
+        """Return shares of the full thrust of both pairs of thrusters for forces in newtons.
 
         What is beyond the thrusters is cut: sideways first, for distance matters more.
         """
@@ -87,9 +83,20 @@ class ThrustMap:
         ahead = _clipped(forward / full, 1.0)
         aside = 0.0 if self.right == 0.0 else _clipped(right / self.right, 1.0)
         if self.layout is Layout.STRAIGHT:
-            return self.effort(ahead), self.effort(aside)
+            return ahead, aside
         aside = _clipped(aside, 1.0 - abs(ahead))
-        one, other = self.effort(ahead + aside), self.effort(ahead - aside)
+        return ahead + aside, ahead - aside
+
+    def split(self, forward: float, right: float) -> tuple[float, float]:
+        """Return the efforts of both pairs of thrusters for those forward and right."""
+        if self.layout is Layout.STRAIGHT:
+            return forward, right
+        return forward + right, forward - right
+
+    def joined(self, one: float, other: float) -> tuple[float, float]:
+        """Return efforts forward and right for those of both pairs of thrusters."""
+        if self.layout is Layout.STRAIGHT:
+            return one, other
         return 0.5 * (one + other), 0.5 * (one - other)
 
     def forces(self, forward: float, right: float) -> tuple[float, float]:
@@ -97,17 +104,56 @@ class ThrustMap:
         if self.layout is Layout.STRAIGHT:
             ahead, aside = self.share(forward), self.share(right)
         else:
-            one, other = self.share(forward + right), self.share(forward - right)
+            one, other = map(self.share, self.split(forward, right))
             ahead, aside = 0.5 * (one + other), 0.5 * (one - other)
         return ahead * (self.forward if ahead > 0.0 else self.backward), aside * self.right
 
     def _past_dead_band(self, size: float) -> float:
-        if size < self.soft:
-            return size / self.soft * self._past_dead_band(self.soft)
         bent = 1.0 - self.linear
         # The root of bent x² + linear x = size in the form that holds for bent = 0.
         x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
         return self.dead_band + (1.0 - self.dead_band) * x
+
+
+class DeadBandCrossing:
+    """Efforts of one pair of thrusters: its dead band is crossed once, with hysteresis.
+
+    Where the thrust asked for changes its sign, the effort waits at the edge of the dead band, with
+    the thrusters about to start, until the thrust that is lacking has added up to an impulse, or is
+    great. Noise about zero crosses nothing.
+
+    Parameters
+    ----------
+    thrust : ThrustMap
+    impulse : float
+        Share of the full thrust, times seconds.
+    great : float
+        Share of the full thrust that crosses at once.
+    """
+
+    def __init__(self, thrust: ThrustMap, impulse: float, great: float) -> None:
+        self._thrust, self._impulse, self._great = thrust, impulse, great
+        self.reset()
+
+    def reset(self, effort: float = 0.0) -> None:
+        """Begin in the middle of the dead band, or beyond it where an effort is in force."""
+        beyond = abs(effort) > self._thrust.dead_band
+        self._side, self._lacking = math.copysign(1.0, effort) if beyond else 0.0, 0.0
+
+    def effort(self, share: float, step: float) -> float:
+        """Return the effort for a share of the full thrust, `step` seconds after the last one."""
+        against = -share * self._side if self._side else abs(share)
+        if against <= 0.0:
+            self._lacking = max(self._lacking + against * step, 0.0)
+            return self._thrust.effort(share) if share else self._edge()
+        self._lacking += against * step
+        if self._lacking <= self._impulse and against < self._great:
+            return self._edge()
+        self._side, self._lacking = math.copysign(1.0, share), 0.0
+        return self._thrust.effort(share)
+
+    def _edge(self) -> float:
+        return self._side * self._thrust.dead_band
 
 
 def _clipped(value: float, most: float) -> float:

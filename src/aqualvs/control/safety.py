@@ -27,6 +27,8 @@ class Reason(StrEnum):
     UNKNOWN_MODE = "unknown_mode"
     PILOT_STICKS = "pilot_sticks"
     CLOCK = "clock"
+    FROZEN = "frozen"
+    NO_ANSWER = "no_answer"
     NO_POSTURE = "no_posture"
     NOT_FINITE = "not_finite"
     TOO_CLOSE = "too_close"
@@ -53,10 +55,12 @@ _WORDS = {
     Reason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
     Reason.NO_STATION: "no ground station heard; stopped until engaged again",
     Reason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
-    Reason.CONFLICT: "somebody else speaks as the vehicle; stopped until engaged again",
+    Reason.CONFLICT: "two speak as the vehicle; stopped until engaged again",
     Reason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
     Reason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
     Reason.CLOCK: "time ran backwards; stopped for this update",
+    Reason.FROZEN: "the picture stands still; neutral until it moves",
+    Reason.NO_ANSWER: "the posture does not answer to the efforts; stopped until engaged again",
     Reason.NO_POSTURE: "no valid posture; neutral until it is back",
     Reason.NOT_FINITE: "a number is not finite; neutral for this update",
     Reason.TOO_CLOSE: "closer than the least range; backing away",
@@ -76,6 +80,7 @@ _TAKES_OVER = frozenset(
         Reason.CONFLICT,
         Reason.UNKNOWN_MODE,
         Reason.PILOT_STICKS,
+        Reason.NO_ANSWER,
         Reason.GAVE_UP,
     }
 )
@@ -172,6 +177,9 @@ class SafetyGate:
     def engage(self, now_s: float, state: VehicleState) -> Reason | None:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
         refused = self._vehicle_refuses(now_s, state)
+        if refused is None and state.rival:
+            # Which of them is the vehicle nobody knows; one who comes later is the other.
+            refused = Reason.CONFLICT
         self.latched = Reason.NOT_ENGAGED if refused else None
         return refused
 
@@ -188,6 +196,7 @@ class SafetyGate:
         effort: Effort,
         *,
         range_rate: float | None = None,
+        doubt: Reason | None = None,
     ) -> tuple[Effort, Reason | None]:
         """Return what may be sent, and why it differs from what was asked.
 
@@ -205,8 +214,10 @@ class SafetyGate:
             What controllers ask for.
         range_rate : float, optional
             In m/s, where a filter knows it; else it follows from postures in a row.
+        doubt : Reason, optional
+            Why the posture is not to be trusted, where something has noticed.
         """
-        refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state)
+        refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state, doubt)
         refused = refused or self._sight_refuses(posture_age_s, posture) or _refused_effort(effort)
         if refused is not None or posture is None:
             return NEUTRAL, refused or Reason.NO_POSTURE
@@ -224,11 +235,15 @@ class SafetyGate:
             return Reason.CLOCK
         return None
 
-    def _vehicle_stops(self, now_s: float, state: VehicleState) -> Reason | None:
-        """Return why the vehicle may not be steered; it lasts until engaged again."""
+    def _vehicle_stops(
+        self, now_s: float, state: VehicleState, doubt: Reason | None
+    ) -> Reason | None:
+        """Return why the vehicle may not be steered; most reasons last until engaged again."""
         if self.latched is None:
             self.latched = self._vehicle_refuses(now_s, state)
-        return self.latched
+        if self.latched is None and doubt is not None and doubt.takes_over:
+            self.latched = doubt
+        return self.latched or doubt
 
     def _vehicle_refuses(self, now_s: float, state: VehicleState) -> Reason | None:
         # A heartbeat from the future is of another clock, and tells nothing.

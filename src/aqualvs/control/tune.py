@@ -25,6 +25,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from aqualvs.control.gains import (
     YawGains,
     gain_schedule,
 )
+from aqualvs.control.gains_file import load_gains
 from aqualvs.control.tune_margins import Loop, Margins, margins, worst
 from aqualvs.control.tune_model import Turning, facts_of, tidy, turning_of
 from aqualvs.errors import OptionError
@@ -46,6 +48,10 @@ _SWELL = 1.2
 _SLUGGISH = 4.0
 # Where the bisection of a gain begins and ends, in 1/s.
 _LEAST, _GREATEST = 0.05, 20.0
+# Delays and frames in seconds, and m/s: beyond them nothing is steered.
+_MOST_S, _MOST_CURRENT = 10.0, 10.0
+# Packaged gains have 0.40 to 0.55, half as much again 0.28 to 0.37, twice as much 0.13 to 0.19.
+_LEAST_USABLE_MODULUS = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,21 +97,23 @@ class TuneOptions:
         OptionError
             Naming the value.
         """
-        if not 0.0 <= self.delay <= self.greatest_delay:
+        if not 0.0 <= self.delay <= self.greatest_delay <= _MOST_S:
             raise OptionError(
-                f"tune: delay {self.delay:g} s; choose 0 to the greatest, {self.greatest_delay:g} s"
+                f"tune: delay {self.delay:g} s; choose 0 to the greatest, "
+                f"{self.greatest_delay:g} s, and that up to {_MOST_S:g} s"
             )
-        if not (self.frame > 0.0 and min(self.mass_factor, self.drag_factor) >= 1.0):
+        if not (0.0 < self.frame <= _MOST_S and min(self.mass_factor, self.drag_factor) >= 1.0):
             raise OptionError(
                 f"tune: frame {self.frame:g} s, factors {self.mass_factor:g} and "
-                f"{self.drag_factor:g}; the first is positive, the others are at least 1"
+                f"{self.drag_factor:g}; the first is positive, up to {_MOST_S:g} s, the others are "
+                "at least 1"
             )
         moduli = (self.least_modulus, self.least_late_modulus, self.least_yaw_modulus)
-        if not (self.current >= 0.0 and 0.0 < min(moduli) <= max(moduli) < 1.0):
+        if not (0.0 <= self.current <= _MOST_CURRENT and 0.0 < min(moduli) <= max(moduli) < 1.0):
             raise OptionError(
                 f"tune: current {self.current:g} m/s, least moduli "
-                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 or more, the others "
-                "between 0 and 1"
+                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 to {_MOST_CURRENT:g}, "
+                "the others between 0 and 1"
             )
 
 
@@ -174,6 +182,39 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
         margins(_yaw_loop(turn.lag(), gains.yaw, usual)),
         _yaw_worst(turn, gains.yaw, options),
     )
+
+
+def usable_gains(source: Path | str) -> ControlGains:
+    """Load gains and refuse those with which a loop would swing up.
+
+    The vehicle is taken as the gains describe it: their `lag`, of the vehicle and the posture
+    together, counts as a delay, at least that of `TuneOptions`.
+
+    Parameters
+    ----------
+    source : Path or str
+        As `load_gains` takes it.
+
+    Raises
+    ------
+    OptionError
+        As `load_gains`; or with the axis, and what is left of its margins.
+    """
+    gains = load_gains(source)
+    usual = TuneOptions().delay
+    loops = {
+        "range": _range_loop(gains.vehicle, 0.0, gains.range, max(gains.range.lag, usual), 0.0),
+        "yaw": _yaw_loop(0.0, gains.yaw, max(gains.yaw.lag, usual)),
+    }
+    for axis, loop in loops.items():
+        found = margins(loop)
+        if not _enough(found, _LEAST_USABLE_MODULUS):
+            left = f"modulus {found.modulus:.2f}" if found.stable else "unstable"
+            raise OptionError(
+                f"{source}: the {axis} loop would swing up ({left}, at least "
+                f"{_LEAST_USABLE_MODULUS:g} is needed); make gains with aqualvs tune"
+            )
+    return gains
 
 
 def _range_gains(speed: float, lag: float) -> RangeGains:

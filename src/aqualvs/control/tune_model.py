@@ -7,21 +7,37 @@ import numpy as np
 
 from aqualvs.control.gains import Drag, VehicleFacts
 from aqualvs.control.gains_thrust import Layout, ThrustMap
+from aqualvs.control.sticks import StickChannel, StickShaping
 from aqualvs.errors import OptionError
 from aqualvs.simulation.vehicle_models import FORWARD, RIGHT, YAW, VehicleModel
 
 
 def facts_of(model: VehicleModel) -> VehicleFacts:
     """Return what a controller should know of a simulated vehicle, its pilot gain included."""
+    sticks, shaping = model.sticks, shaping_of_model(model)
     return VehicleFacts(
         name=model.name,
         mass=tidy(model.mass + model.added_mass[0]),
         forward_drag=Drag(model.linear_drag[0], model.quadratic_drag[0]),
         right_drag=Drag(model.linear_drag[1], model.quadratic_drag[1]),
         thrust=_thrust_map(model),
-        turning_rate=math.radians(tidy(math.degrees(model.sticks.greatest_turning_rate))),
-        climb_rate=tidy(model.sticks.greatest_climb_rate),
+        turning_rate=math.radians(tidy(math.degrees(sticks.turning_rate * shaping.turning_share))),
+        climb_rate=tidy(sticks.climb_rate * shaping.climbing_share),
         dome_forward=model.dome_position[0],
+    )
+
+
+def shaping_of_model(model: VehicleModel) -> StickShaping:
+    """Return what a link must take out of a simulated vehicle's sticks."""
+    sticks, own = model.sticks, StickShaping()
+    yaw, forward, right = sticks.trims
+    return StickShaping(
+        gain=sticks.gain,
+        throttle_dead_zone=sticks.throttle_dead_zone,
+        throttle=own.throttle,
+        yaw=StickChannel(trim=yaw, dead_zone=sticks.yaw_dead_zone),
+        forward=StickChannel(trim=forward),
+        right=StickChannel(trim=right),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.gains import ControlGains
 from aqualvs.control.setpoint import Setpoint
+from aqualvs.control.tune_model import shaping_of_model
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.simulation.vehicle import SimulatedVehicle, level_pose
 from aqualvs.simulation.vehicle_models import VehicleModel
@@ -82,7 +83,7 @@ def simulate_step(
     vehicle = SimulatedVehicle(
         model, water or WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
     )
-    controller = RangeYawController(gains)
+    controller, shaping = RangeYawController(gains), shaping_of_model(model)
     n_rest, n_after = (round(span / options.frame) for span in (_REST_S, _AFTER_S))
     time = options.frame * np.arange(-n_rest, n_after, dtype=np.float64)
     ranges = np.empty(len(time))
@@ -93,7 +94,7 @@ def simulate_step(
         rates = ((ranges[k] - before[0]) / options.frame, (yaw - before[1]) / options.frame)
         before = (ranges[k], yaw)
         effort = controller.update(now, *before, *rates, Setpoint(goal))
-        vehicle.step(effort, options.frame)
+        vehicle.step(shaping.position(effort), options.frame)
     return _answer(time, ranges, options)
 
 

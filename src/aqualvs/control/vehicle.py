@@ -70,6 +70,8 @@ class VehicleState:
         Radians; heading clockwise from north.
     doubt : str
         Why it seems not to do what it is told; empty if it does, or nothing is known.
+    rival : str
+        Who else speaks as the vehicle, and agrees with it; empty if nobody does.
     """
 
     heard_s: float = float("-inf")
@@ -82,6 +84,7 @@ class VehicleState:
     roll: float | None = None
     pitch: float | None = None
     doubt: str = ""
+    rival: str = ""
 
 
 class VehicleLink(Protocol):

@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+from aqualvs.control.sticks import PARAMETERS, shaping_of
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.ardusub_link_commands import (
@@ -20,7 +21,6 @@ from aqualvs.live.ardusub_link_commands import (
     GuidedCommander,
     StickCommander,
     is_finite,
-    sticks_of,
 )
 from aqualvs.live.ardusub_link_depth import DepthChoice
 from aqualvs.live.ardusub_link_response import StickResponse
@@ -162,6 +162,10 @@ class ArduSubLink:
         self._depth = DepthChoice(self.link, _FRESH_S)
         self._response = StickResponse(self.link)
         self._watch = ParameterWatch(self.link, FOR_STICKS)
+        # The autopilot takes ten requests at once.
+        self._shapes = [
+            ParameterWatch(self.link, PARAMETERS[k : k + 10]) for k in range(0, len(PARAMETERS), 10)
+        ]
         self._advised = not advises
         # A watchdog sends from a thread of its own.
         self._sending = threading.Lock()
@@ -176,6 +180,7 @@ class ArduSubLink:
         parameters = self._watch.read()
         self._advise(parameters)
         mode, mode_name = self._mode(beat, parameters)
+        self._shape(beat)
         roll, pitch, heading = self._attitude()
         return VehicleState(
             heard_s=self._heard_s(beat),
@@ -188,6 +193,7 @@ class ArduSubLink:
             roll=roll,
             pitch=pitch,
             doubt=self._response.doubt(),
+            rival=self.link.rival,
         )
 
     def send(self, effort: Effort) -> None:
@@ -237,14 +243,26 @@ class ArduSubLink:
 
     def _send(self, effort: Effort) -> bool:
         with self._sending:
-            if self.options.command is Command.STICKS:
-                sticks = sticks_of(effort)
+            if isinstance(self._commander, StickCommander):
+                sticks = self._commander.sticks(effort)
                 self._sticks.note(sticks)
                 self._response.note(sticks)
             message = self._commander.message(effort)
             sent = self.link.send(message, urgent=True, to_vehicle=True)
             self._sent_s = time.monotonic() if sent else self._sent_s
         return sent
+
+    def _shape(self, beat: Received) -> None:
+        """Take out of the sticks what the vehicle, as it tells, makes of them."""
+        if not isinstance(self._commander, StickCommander):
+            return
+        known: dict[str, float] = {}
+        for watch in self._shapes:
+            known = watch.read()
+        keeps_place = SUB_MODES.get(beat.message.custom_mode) == "POSHOLD"
+        with self._sending:
+            self._commander.shaping = shaping_of(known)
+            self._commander.keeps_place = keeps_place
 
     def _advise(self, parameters: dict[str, float]) -> None:
         """Log once what the vehicle's settings mean, as soon as they are known or silent."""

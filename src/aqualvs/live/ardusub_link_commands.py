@@ -2,14 +2,11 @@
 
 import math
 import time
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol
 
+from aqualvs.control.sticks import MIDDLE, Sticks, StickShaping
 from aqualvs.control.vehicle import Effort
-
-FULL, MIDDLE = 1000, 500
-"""Full deflection of x, y and r; z runs from 0 (down) over 500 (neutral) to 1000 (up)."""
 
 _MAX_SEQ = 256
 
@@ -22,24 +19,6 @@ class Command(StrEnum):
     GUIDED = "guided"
     """`SET_POSITION_TARGET_LOCAL_NED`: speeds in the body's axes, by the vehicle's own position
     estimate."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sticks:
-    """The axes of `MANUAL_CONTROL` as ArduSub takes them.
-
-    Attributes
-    ----------
-    x, y, r : int
-        Forward, right, clockwise, -1000 to 1000.
-    z : int
-        Up, 0 to 1000; 500 is neutral, whatever the MAVLink specification says.
-    """
-
-    x: int = 0
-    y: int = 0
-    z: int = MIDDLE
-    r: int = 0
 
 
 class Packable(Protocol):
@@ -61,16 +40,6 @@ def is_finite(effort: Effort) -> bool:
     return all(map(math.isfinite, (effort.forward, effort.right, effort.down, effort.yaw)))
 
 
-def sticks_of(effort: Effort) -> Sticks:
-    """Return the stick positions for an effort of finite parts, limited to full deflection."""
-    return Sticks(
-        x=round(FULL * _limited(effort.forward)),
-        y=round(FULL * _limited(effort.right)),
-        z=MIDDLE - round(MIDDLE * _limited(effort.down)),
-        r=round(FULL * _limited(effort.yaw)),
-    )
-
-
 class StickCommander:
     """Efforts as `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
 
@@ -84,15 +53,27 @@ class StickCommander:
         would take the two for one.
     target : int
         System id of the vehicle.
+
+    Attributes
+    ----------
+    shaping : StickShaping
+        What the vehicle makes of sticks; ArduSub's default until it has told.
+    keeps_place : bool
+        Whether its mode is POSHOLD.
     """
 
     def __init__(self, dialect: Any, packer: Any, *, target: int) -> None:
+        self.shaping, self.keeps_place = StickShaping(), False
         self._message = dialect.MAVLink_manual_control_message(target, 0, 0, MIDDLE, 0, 0)
         self._packer = packer
 
+    def sticks(self, effort: Effort) -> Sticks:
+        """Return the stick positions for an effort of finite parts."""
+        return self.shaping.sticks(effort, keeps_place=self.keeps_place)
+
     def message(self, effort: Effort) -> Packable:
         """Return the message; no button is ever pressed."""
-        sticks, told = sticks_of(effort), self._message
+        sticks, told = self.sticks(effort), self._message
         told.x, told.y, told.z, told.r = sticks.x, sticks.y, sticks.z, sticks.r
         return _OnBehalf(told, self._packer)
 

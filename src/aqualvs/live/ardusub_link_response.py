@@ -10,7 +10,7 @@ import time
 from collections import deque
 from typing import Any
 
-from aqualvs.live.ardusub_link_commands import FULL, Sticks
+from aqualvs.control.sticks import FULL, Sticks
 from aqualvs.live.mavlink_link import MavlinkLink
 
 # Sticks and answers are looked at for so long, and are so many at least: six messages of three

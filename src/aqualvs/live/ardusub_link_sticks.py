@@ -14,7 +14,7 @@ import time
 from collections import deque
 from typing import Any
 
-from aqualvs.live.ardusub_link_commands import FULL, MIDDLE, Sticks
+from aqualvs.control.sticks import FULL, MIDDLE, Sticks
 from aqualvs.live.mavlink_link import MavlinkLink, Received
 
 FRESH_S = 1.0

@@ -237,6 +237,11 @@ class MavlinkLink:
         """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
         return self._peers.conflict
 
+    @property
+    def rival(self) -> str:
+        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        return self._peers.rival
+
     def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
         """Ask the autopilot for parameters and wait for the answers.
 

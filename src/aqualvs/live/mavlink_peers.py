@@ -119,8 +119,7 @@ class PeerTable:
             home = self._homes.get(self._system)
         if home is None or not found:
             return ""
-        who = f"{_shown(home.peer)} and {_shown(found[-1])} both speak as sysid {self._system}"
-        return f"{who}; only the first is obeyed"
+        return f"{_shown(home.peer)} and {_shown(found[-1])} both speak as sysid {self._system}"
 
     def receivers(self) -> list[Peer]:
         """Return the addresses that were heard lately: the vehicle's, then the others'."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from aqualvs.control.mission import Guidance
 from aqualvs.control.safety import Reason
-from aqualvs.control.vehicle import Effort, VehicleState
+from aqualvs.control.vehicle import Effort, Mode, VehicleState
 from aqualvs.live.health import State
 
 _TELL_MODE = (
@@ -63,8 +63,10 @@ class PilotReport:
 
 def words_of(reason: Reason, state: VehicleState) -> str:
     """Return why efforts do not pass, with what the vehicle says of it."""
-    told = f" ({state.mode_name})" if reason in _TELL_MODE and state.mode_name else ""
-    return f"{reason.words}{told}"
+    told = state.mode_name if reason in _TELL_MODE else ""
+    if reason is Reason.CONFLICT and state.mode is not Mode.CONFLICT:
+        told = state.rival
+    return f"{reason.words} ({told})" if told else reason.words
 
 
 def _aim(guidance: Guidance) -> str:

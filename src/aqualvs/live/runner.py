@@ -3,11 +3,12 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from aqualvs.errors import AqualvsError
 from aqualvs.live.frame_reader import FrameReader
+from aqualvs.live.frozen import FrozenOptions, FrozenPicture
 from aqualvs.live.health import Health
 from aqualvs.live.health_monitor import HealthMonitor
 from aqualvs.live.mailbox import Arrival, Mailbox
@@ -75,10 +76,13 @@ class LiveOptions:
         A stream that is silent for so long has no posture any more.
     keep_every : bool
         Measure every frame, whatever delay that adds: for files.
+    frozen : FrozenOptions or None
+        When a picture counts as frozen, and has no posture; None where none does.
     """
 
     stale_after_s: float = 0.15
     keep_every: bool = False
+    frozen: FrozenOptions | None = field(default_factory=FrozenOptions)
 
 
 class LiveRunner:
@@ -113,6 +117,8 @@ class LiveRunner:
         # Those that never wait come first: waking a thread takes longer than a datagram.
         ordered = sorted(outputs, key=lambda output: not output.inline)
         self._workers = [OutputWorker(output) for output in ordered]
+        frozen = self._options.frozen
+        self._frozen = None if frozen is None else FrozenPicture(frozen)
         self._last: Frame | None = None
         self._heard_ns = self._told_ns = 0
         self._trouble = ""
@@ -180,6 +186,10 @@ class LiveRunner:
             refusal = Refusal(
                 Reason.WRONG_SIZE, f"picture of {width}x{height} px, but the rig has {need} px"
             )
+            return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
+        still_s = self._frozen.update(frame.time_s, frame.luma) if self._frozen else 0.0
+        if still_s > 0.0:
+            refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
         try:
             returns = scanner.detect(frame)

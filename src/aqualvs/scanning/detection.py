@@ -87,8 +87,8 @@ class FrameDetector:
             else {}
         )
         self._room = options.max_returns
-        # Peaks of all directions, one after the other. Rows of a length that is a power of two would
-        # all fall on the same few places of the processor's cache.
+        # Peaks of all directions, one after the other. Were rows as long as a power of two, all
+        # would fall on the same few places of the processor's cache.
         self._line = np.empty(len(self._finders) * self._room, np.int64)
         self._table = np.empty((N_MEASURES, len(self._line) + _CACHE_LINE))
         self._threshold = (

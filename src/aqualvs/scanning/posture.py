@@ -46,6 +46,8 @@ class Reason(StrEnum):
     """The picture has another size than the rig's."""
     NO_FRAMES = "no_frames"
     """A live stream is silent: there is no picture to measure in."""
+    FROZEN = "frozen"
+    """A live stream repeats its last picture; its time stamps run on."""
 
 
 @dataclass(frozen=True, slots=True)

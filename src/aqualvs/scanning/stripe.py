@@ -313,7 +313,7 @@ def _next_with(mark: np.uint64, words: NDArray[np.uint64], at: int) -> int:
         found = words[index] ^ other
     # The lowest of these bits alone shifts the number of its byte to the top.
     lowest = found & (~found + np.uint64(1))
-    return (index << 3) + np.int64((lowest * _BYTE_NUMBERS) >> np.uint64(56))
+    return (index << 3) + int((lowest * _BYTE_NUMBERS) >> np.uint64(56))
 
 
 @inline_borrowing_kernel

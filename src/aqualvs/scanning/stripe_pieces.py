@@ -14,6 +14,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
@@ -22,7 +24,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
-from aqualvs.scanning.stripe import POSITION, PeakFinder, Returns, SearchImage
+from aqualvs.scanning.stripe import N_MEASURES, POSITION, PeakFinder, Returns, SearchImage
 from aqualvs.scanning.stripe import WIDTH as PEAK_WIDTH
 
 Rows = NDArray[np.float32]
@@ -83,6 +85,10 @@ _MOST_OWN = 9.0
 # same line: at most this share of the picture's width away, and so many pixels, and for each pixel
 # of the gap such a share, off its direction.
 _HELP, _MOST_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
+# At a line's end, at most so many returns follow, each within so many pixels of where the line is
+# due by its slope over so many returns, as high as this share of its height at least, and with
+# fewer than so many search lines missed.
+_MOST_FOLLOWING, _FOLLOW_PX, _SLOPE_RETURNS, _LEAST_HEIGHT_SHARE, _MOST_MISSED = 8, 1.2, 6, 0.3, 4
 
 
 class Pieces(NamedTuple):
@@ -199,26 +205,20 @@ def find_pieces(frame: Frame, search: StripeSearch) -> Pieces:
 def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     n_lines, length = light.shape
     reach_px = max(_LEAST_REACH, round(_REACH_SHARE * width_px))
-    finder = PeakFinder(
-        length,
-        search.lowest,
-        search.highest,
-        reach_px,
-        _PEAKS_PER_LINE * n_lines,
-        np.array([search.colour.value]),
-    )
+    directions = np.array([search.colour.value])
+    finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
-    levels = np.rint(light).astype(np.uint8)
-    along_x = search.axis is SearchAxis.ALONG_X
-    line, table = finder.find(
-        SearchImage(levels, grey, grey, along_x, search.line_px), _MIN_CONTRAST
-    )
+    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px)
+    most = _PEAKS_PER_LINE * n_lines
+    line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
+    n = finder.find(image, _MIN_CONTRAST, 1, line, table)
+    line, table = line[:n], table[:, :n]
     position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]
     # Flanks must lie in the picture.
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
     inside = (position >= margin) & (position < length - 1 - margin)
-    columns = (column[inside] for column in (position, height, width))
-    return Returns(line[inside], *columns, np.ones(np.count_nonzero(inside)))
+    position, height, width = (column[inside] for column in (position, height, width))
+    return Returns(line[inside], position, height, width, np.ones(len(position)))
 
 
 def _smooth_chains(returns: Returns, search: StripeSearch) -> tuple[IntArray, IntArray]:
@@ -345,7 +345,8 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 def _believed_along(table: FloatArray) -> FloatArray:
     """Return chroma along the laser's colour for each level (P,); a white core says nothing."""
     along = np.minimum(table[ALONG], _MOST_RATIO)
-    return np.where(table[TOP] >= _WHITE, np.maximum(along, _LEAST_ALONG), along)
+    believed: FloatArray = np.where(table[TOP] >= _WHITE, np.maximum(along, _LEAST_ALONG), along)
+    return believed
 
 
 class OwnLines(NamedTuple):
@@ -430,11 +431,29 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
         Minus infinity for all where none is certain.
     """
     log_odds = general_evidence(table, width_px, has_colour=has_colour) @ _GENERAL
+    # Dashes in a row are as long as all of them together.
+    likely = np.flatnonzero(log_odds > 0.0)
+    in_a_row = table[:, likely]
+    in_a_row[LENGTH] = _length_in_a_row(in_a_row, width_px)
+    log_odds[likely] = general_evidence(in_a_row, width_px, has_colour=has_colour) @ _GENERAL
     lines = learn_lines(table, log_odds, has_colour=has_colour)
     if lines is None:
         return np.full(table.shape[1], -np.inf)
     found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ _OWN
     return found
+
+
+def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
+    """Return the length (P,) of each piece with all pieces that go on where another ends."""
+    if table.shape[1] == 0:
+        return np.zeros(0)
+    ends = _ends(table)
+    linked = np.zeros((len(ends), len(ends)), bool)
+    for k, one in enumerate(ends):
+        linked[k] = _goes_on(one, ends, width_px)
+    linked |= linked.T | np.eye(len(ends), dtype=bool)
+    _, row = connected_components(csr_array(linked), directed=False)
+    return np.asarray(np.bincount(row, table[LENGTH])[row], np.float64)
 
 
 def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
@@ -458,7 +477,7 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
     keep: BoolArray = log_odds >= least
     waiting = np.flatnonzero(~keep & (log_odds >= least - _HELP))
     new = np.flatnonzero(keep)
-    ends = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
+    ends = _ends(table)
     while len(new) and len(waiting):
         goes_on = np.zeros(len(waiting), bool)
         for k in new:
@@ -467,6 +486,77 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
         keep[new] = True
         waiting = waiting[~goes_on]
     return keep
+
+
+def extended(pieces: Pieces, keep: BoolArray) -> list[IntArray]:
+    """Return the chains of returns of kept pieces, each with what follows it at its ends.
+
+    A piece ends at a kink or a gap; beyond, a few returns may still be the line's.
+
+    Parameters
+    ----------
+    pieces : Pieces
+    keep : bool array, shape (P,)
+        Which pieces are lines.
+    """
+    returns = pieces.returns
+    first_of = np.searchsorted(returns.line, np.arange(len(pieces.search.lowest) + 1))
+    chains = [pieces.order[pieces.start[k] : pieces.start[k + 1]] for k in np.flatnonzero(keep)]
+    used = np.zeros(len(returns), bool)
+    for chain in chains:
+        used[chain] = True
+    longer = []
+    for chain in chains:
+        after = _following(chain, 1, returns.line, returns.position, returns.height, first_of, used)
+        before = _following(
+            chain[::-1], -1, returns.line, returns.position, returns.height, first_of, used
+        )
+        longer.append(np.concatenate([before[::-1], chain, after]))
+    return longer
+
+
+@kernel
+def _following(
+    chain: IntArray,
+    step: int,
+    line: IntArray,
+    position: FloatArray,
+    height: FloatArray,
+    first_of: IntArray,
+    used: BoolArray,
+) -> IntArray:
+    """Return and mark the returns that follow the last one of a chain, one a search line."""
+    n = chain.shape[0]
+    last, back = chain[n - 1], chain[max(n - 1 - _SLOPE_RETURNS, 0)]
+    slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
+    least = _LEAST_HEIGHT_SHARE * np.median(height[chain])
+    found = np.empty(_MOST_FOLLOWING, np.int64)
+    n_found, x, place, gap = 0, line[last], position[last], 0
+    while n_found < _MOST_FOLLOWING and gap < _MOST_MISSED:
+        x += step
+        if x < 0 or x >= first_of.shape[0] - 1:
+            break
+        gap += 1
+        best, best_miss = -1, _FOLLOW_PX
+        for i in range(first_of[x], first_of[x + 1]):
+            miss = abs(position[i] - (place + slope * gap))
+            if miss < best_miss and height[i] >= least:
+                best, best_miss = i, miss
+        if best < 0:
+            continue
+        if used[best]:
+            break
+        place, gap = position[best], 0
+        used[best] = True
+        found[n_found] = best
+        n_found += 1
+    return found[:n_found].copy()
+
+
+def _ends(table: FloatArray) -> FloatArray:
+    """Return the first and the last point (P, 2, 2) of pieces."""
+    ends: FloatArray = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
+    return ends
 
 
 def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
@@ -481,4 +571,6 @@ def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
     gap = np.abs(along).min(axis=1) - 0.5 * length
     reach = min(length, _MOST_GAP * width_px)
     allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)
-    return (gap > -0.5 * length) & (gap <= reach) & (np.abs(across).max(axis=1) <= allowed)
+    goes_on: BoolArray = np.abs(across).max(axis=1) <= allowed
+    goes_on &= (gap > -0.5 * length) & (gap <= reach)
+    return goes_on

@@ -12,7 +12,15 @@ from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
 from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.stripe_pieces import LENGTH, SMOOTHING, continued, find_pieces, line_log_odds
+from aqualvs.scanning.stripe_pieces import (
+    LENGTH,
+    SMOOTHING,
+    Pieces,
+    continued,
+    extended,
+    find_pieces,
+    line_log_odds,
+)
 
 # A stripe that runs less than 45 degrees off a search line is left to the other axis.
 _STEEPEST = 1.0
@@ -49,7 +57,7 @@ class WholePictureOptions:
         Of the lasers; green if None.
     """
 
-    min_likelihood: float = 0.6
+    min_likelihood: float = 0.5
     min_length_share: float = 0.015
     wavelength_nm: float | None = None
 
@@ -112,11 +120,8 @@ def find_stripes(
     """
     options = options or WholePictureOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
-    height, width = frame.luma.shape
-    colour = LaserColour.of(options.wavelength_nm)
-    found = [
-        find_pieces(frame, _whole_search((width, height), axis, colour)) for axis in SearchAxis
-    ]
+    width = frame.luma.shape[1]
+    found = find_all_pieces(frame, options)
     table = np.concatenate([pieces.table for pieces in found], axis=1)
     log_odds = line_log_odds(table, width, has_colour=frame.chroma is not None)
     least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
@@ -125,12 +130,25 @@ def find_stripes(
     parts, first = [], 0
     for pieces in found:
         n = len(pieces.start) - 1
-        for k in np.flatnonzero(keep[first : first + n]):
-            chain = pieces.order[pieces.start[k] : pieces.start[k + 1]]
+        for chain in extended(pieces, keep[first : first + n]):
             parts.append(_piece(pieces.search, pieces.returns, chain))
         first += n
     stripes = _joined([piece for piece in parts if _is_long(piece)])
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
+
+
+def find_all_pieces(frame: Frame, options: WholePictureOptions) -> list[Pieces]:
+    """Find pieces of stripes along both search directions, lines of lasers and others.
+
+    Parameters
+    ----------
+    frame : Frame
+    options : WholePictureOptions
+        The wavelength says in which channel lines are brightest.
+    """
+    size_px = frame.luma.shape[1], frame.luma.shape[0]
+    colour = LaserColour.of(options.wavelength_nm)
+    return [find_pieces(frame, _whole_search(size_px, axis, colour)) for axis in SearchAxis]
 
 
 def _whole_search(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> StripeSearch:

@@ -1,4 +1,4 @@
-"""A simulated vehicle in its water: give it efforts, and it moves as ArduSub's depth hold would."""
+"""A simulated vehicle in its water: move its sticks, and it goes as ArduSub's depth hold would."""
 
 import math
 from collections import deque
@@ -35,24 +35,24 @@ RATE = 400.0
 _STILL = np.zeros(4)
 
 
-class Efforts(Protocol):
-    """What a pilot's sticks ask for, -1 to 1: as `aqualvs.control.vehicle.Effort`."""
+class StickPositions(Protocol):
+    """Where the sticks stand, -1 to 1 of their full deflection."""
 
     @property
     def forward(self) -> float:
-        """Share of the greatest thrust."""
+        """Ahead."""
 
     @property
     def right(self) -> float:
-        """Share of the greatest thrust."""
+        """To starboard."""
 
     @property
     def down(self) -> float:
-        """Share of the greatest rate of descent."""
+        """Deeper."""
 
     @property
     def yaw(self) -> float:
-        """Share of the greatest turning rate, clockwise from above."""
+        """Clockwise from above."""
 
 
 def level_pose(position: FloatArray, heading: float) -> SE3:
@@ -71,10 +71,10 @@ def level_pose(position: FloatArray, heading: float) -> SE3:
 
 
 class SimulatedVehicle:
-    """A vehicle that obeys efforts.
+    """A vehicle that obeys a pilot's sticks.
 
     The world is north, east, down from the still surface; the body forward, right, down. The same
-    model, water, efforts and `rng` give the same dive.
+    model, water, sticks and `rng` give the same dive.
 
     Parameters
     ----------
@@ -89,9 +89,9 @@ class SimulatedVehicle:
     sensors : Sensors, optional
         Faults of its sensors.
     latency : float
-        Time that an effort takes to arrive, in seconds.
+        Time that stick positions take to arrive, in seconds.
     lapse : float
-        So long after the last effort has come it holds still, in seconds (FS_PILOT_TIMEOUT).
+        So long after the last ones have come it holds still, in seconds (FS_PILOT_TIMEOUT).
 
     Attributes
     ----------
@@ -174,21 +174,24 @@ class SimulatedVehicle:
         """Whether no effort has come for `lapse` seconds."""
         return self._time - self._heard >= self.lapse - 1e-9
 
-    def step(self, effort: Efforts | None, dt: float) -> None:
-        """Send an effort now, or none, and let `dt` seconds pass.
+    def step(self, sticks: StickPositions | None, dt: float) -> None:
+        """Send stick positions now, or none, and let `dt` seconds pass.
 
         Raises
         ------
         OptionError
-            If time stands still or runs backwards, or the effort is no number.
+            If time stands still or runs backwards, or a position is no number.
         """
         if not dt > 0.0:
             raise OptionError(f"vehicle: step of {dt:g} s; it must be positive")
-        if effort is not None:
-            asked = np.array([effort.forward, effort.right, effort.down, effort.yaw], np.float64)
-            if not np.all(np.isfinite(asked)):
-                raise OptionError(f"vehicle: effort {asked.tolist()}; every part must be a number")
-            self._coming.append((self._time + self.latency, asked))
+        if sticks is not None:
+            parts = (sticks.forward, sticks.right, sticks.down, sticks.yaw)
+            if not all(map(math.isfinite, parts)):
+                raise OptionError(f"vehicle: sticks {list(parts)}; every part must be a number")
+            x, y, down, r = (round(1000 * min(max(part, -1.0), 1.0)) for part in parts)
+            # The vertical axis of MANUAL_CONTROL has half of the others' units.
+            asked = self.model.sticks.asked(x, y, 500 - round(0.5 * down), r)
+            self._coming.append((self._time + self.latency, np.array(asked)))
         end = self._time + dt
         while self._time < end:
             self._take_what_has_come()

@@ -22,7 +22,7 @@ DEPTH, HEADING, SINCE_TURN, TURN_RATE, DESCENT, INTEGRAL, N_MEMORY = 0, 1, 2, 3,
 _ANGLE, _RATE, _RATE_I, _DEPTH, _CLIMB, _CLIMB_I, _INPUT, _ACCELERATION, _SETTLE = (
     *(0, 1, 4, 7, 8, 9, 10, 11, 12),
 )
-_GAIN, _FULL_TURN, _FULL_CLIMB, _DEAD_YAW, _DEAD_DOWN = 13, 14, 15, 16, 17
+_FULL_TURN, _FULL_CLIMB = 13, 14
 # Thrust curve in one row.
 _FORWARD, _REVERSE, _DEAD, _LINEAR = range(4)
 # Limits of the integrators (ATC_RAT_*_IMAX), of the heading's error and of the depth's.
@@ -36,7 +36,7 @@ class Pilot(NamedTuple):
 
     Attributes
     ----------
-    gains : array, shape (18,)
+    gains : array, shape (15,)
         Of `Autopilot` and `Sticks`.
     mixing : array, shape (n, 6)
         See `VehicleModel.mixing`.
@@ -59,8 +59,8 @@ def pack_pilot(model: VehicleModel) -> Pilot:
     """Return a model's autopilot as kernels need it."""
     own, sticks, curve = model.autopilot, model.sticks, model.curve
     gains = [own.angle, *own.rate, *own.rate_integral, own.depth, own.climb, own.climb_integral]
-    gains += [own.input_time, own.acceleration, own.settle, sticks.gain, sticks.turning_rate]
-    gains += [sticks.climb_rate, sticks.yaw_dead_zone * sticks.gain, sticks.down_dead_zone]
+    gains += [own.input_time, own.acceleration, own.settle]
+    gains += [sticks.turning_rate, sticks.climb_rate]
     return Pilot(
         np.array(gains),
         model.mixing(),
@@ -109,7 +109,7 @@ def _hold_heading(
     effort: FloatArray, heading: float, h: float, m: FloatArray, g: FloatArray
 ) -> float:
     """Return the turning rate that stick and held heading ask for."""
-    asked = g[_FULL_TURN] * _past(_clip(effort[3], 1.0) * g[_GAIN], g[_DEAD_YAW])
+    asked = g[_FULL_TURN] * effort[3]
     m[TURN_RATE] += (asked - m[TURN_RATE]) * (1.0 - np.exp(-h / g[_INPUT]))
     m[SINCE_TURN] = m[SINCE_TURN] + h if asked == 0.0 else 0.0
     if asked == 0.0 and m[SINCE_TURN] < g[_SETTLE]:
@@ -126,7 +126,7 @@ def _hold_depth(
     effort: FloatArray, depth: float, descent: float, h: float, m: FloatArray, g: FloatArray
 ) -> float:
     """Return the motor input for down."""
-    asked = g[_FULL_CLIMB] * _past(_clip(effort[2], 1.0) * g[_GAIN], g[_DEAD_DOWN])
+    asked = g[_FULL_CLIMB] * effort[2]
     m[DESCENT] += _clip(asked - m[DESCENT], g[_ACCELERATION] * h)
     error = _clip(m[DEPTH] + m[DESCENT] * h - depth, _MOST_DEPTH_ERROR)
     m[DEPTH] = depth + error
@@ -184,8 +184,8 @@ def steer(y: FloatArray, effort: FloatArray, h: float, memory: FloatArray, pilot
     _rate_loop(YAW, turn * r[2][2], y[12], _MOST_YAW, h, memory, pilot)
     descent = to_world(r, (y[7], y[8], y[9]))[2]
     pilot.inputs[DOWN] = _hold_depth(effort, y[2], descent, h, memory, g)
-    pilot.inputs[FORWARD] = g[_GAIN] * _clip(effort[0], 1.0)
-    pilot.inputs[RIGHT] = g[_GAIN] * _clip(effort[1], 1.0)
+    pilot.inputs[FORWARD] = effort[0]
+    pilot.inputs[RIGHT] = effort[1]
     for i in range(4):
         pilot.inputs[i] = _clip(pilot.inputs[i], 1.0)
     mix_inputs(pilot)
@@ -216,7 +216,7 @@ def fly(
     memory : array, shape (N_MEMORY,)
         Of the autopilot.
     effort : array, shape (4,)
-        Forward, right, down, yaw.
+        What the sticks ask for; see `Sticks.asked`.
     """
     for i in range(n):
         steer(y, effort, h, memory, pilot)

@@ -79,51 +79,101 @@ class ThrustCurve:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sticks:
-    """What the vehicle makes of an effort, as ArduSub makes it of MANUAL_CONTROL.
+    """What the vehicle makes of stick positions, as ArduSub 4.5 and later of MANUAL_CONTROL.
+
+    Its parameters are RCn_MIN 1100 and RCn_MAX 1900 us and, but for those below, as ArduSub has
+    them after a reset. No axis has an expo.
 
     Attributes
     ----------
     gain : float
-        ArduSub's pilot gain (JS_GAIN_DEFAULT): share of everything that a full stick asks for.
+        Pilot gain (JS_GAIN_DEFAULT): share of everything that a full stick asks for.
     turning_rate : float
-        At full deflection, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
+        At a pulse of 1900 us, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
     climb_rate : float
-        At full deflection, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of
-        these vehicles reaches; 0.5 is a pilot's choice.
-    yaw_dead_zone : float
-        Share of the yaw stick's travel that does nothing. 0 is a link that takes ArduSub's dead
-        zone out; without that it is 0.1 (RC4_DZ, 40 of 400 µs, times gain).
-    down_dead_zone : float
-        Share of the travel at full deflection, so that it grows as gain shrinks; ArduSub's is 0.2
-        (THR_DZ, 100 of 500).
+        Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
+        reaches; 0.5 is a pilot's choice.
+    yaw_dead_zone : int
+        RC4_DZ, in microseconds; shrinks with the gain, as the next one.
+    throttle_dead_zone : int
+        THR_DZ, in thousandths of the throttle's travel.
+    trims : (int, int, int)
+        RC4_TRIM (yaw), RC5_TRIM (forward) and RC6_TRIM (right), in microseconds.
     """
 
     gain: float = 0.5
     turning_rate: float = math.radians(45.0) * 3.375
     climb_rate: float = 0.5
-    yaw_dead_zone: float = 0.0
-    down_dead_zone: float = 0.0
+    yaw_dead_zone: int = 40
+    throttle_dead_zone: int = 100
+    trims: tuple[int, int, int] = (1500, 1500, 1500)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.gain <= 1.0:
             raise OptionError(f"sticks: gain {self.gain:g}; choose more than 0, at most 1")
-        if not (0.0 <= self.yaw_dead_zone < 1.0 and 0.0 <= self.down_dead_zone < self.gain):
+        if not (0 <= self.yaw_dead_zone <= 200 and 0 <= self.throttle_dead_zone <= 300):
             raise OptionError(
-                f"sticks: dead zones {self.yaw_dead_zone:g} and {self.down_dead_zone:g}; choose 0 "
-                f"or more, below 1 for yaw and below the gain, {self.gain:g}, for down"
+                f"sticks: dead zones {self.yaw_dead_zone} us and {self.throttle_dead_zone}; choose "
+                "0 to 200 for yaw and 0 to 300 for the throttle"
             )
+        if not all(1400 <= trim <= 1600 for trim in self.trims):
+            raise OptionError(f"sticks: trims {self.trims} us; choose 1400 to 1600")
 
-    @property
-    def greatest_turning_rate(self) -> float:
-        """Turning rate that effort 1 asks for, in rad/s."""
-        dead = self.yaw_dead_zone * self.gain
-        return self.turning_rate * (self.gain - dead) / (1.0 - dead)
+    def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
+        """Return what stick positions ask for in depth hold.
 
-    @property
-    def greatest_climb_rate(self) -> float:
-        """Rate of climb or descent that effort 1 asks for, in m/s."""
-        dead = self.down_dead_zone
-        return self.climb_rate * (self.gain - dead) / (1.0 - dead)
+        Parameters
+        ----------
+        x, y, z, r : int
+            As MANUAL_CONTROL has them: z from 0 (down) over 500 to 1000 (up).
+
+        Returns
+        -------
+        forward, right, down, turn : float
+            Shares of the thrusters' motor input, of the greatest rate of descent and of the
+            greatest turning rate.
+        """
+        yaw_trim, *level = self.trims
+        forward, right = (
+            _thrust_input(_pulse(0.4 * self.gain, one), trim)
+            for one, trim in zip((x, y), level, strict=True)
+        )
+        return forward, right, -self._climb(z), self._turn(r, yaw_trim)
+
+    def _turn(self, r: int, trim: int) -> float:
+        """Return the share of the turning rate (`pwm_to_angle_dz_trim`, whole centidegrees)."""
+        beyond = _pulse(0.4 * self.gain, r) - trim
+        dead = int(self.yaw_dead_zone * self.gain)
+        if abs(beyond) <= dead:
+            return 0.0
+        travel = (_MOST_US - trim if beyond > 0 else trim - _LEAST_US) - dead
+        return math.copysign(int(4500 * (abs(beyond) - dead) / travel) / 4500, beyond)
+
+    def _climb(self, z: int) -> float:
+        """Return the share of the rate of climb (`get_pilot_desired_climb_rate`)."""
+        # The throttle is a range of 1000 from RC3_MIN + RC3_DZ on.
+        low = _LEAST_US + _THROTTLE_DEAD_US
+        control = int(1000 * max(_pulse(0.8 * self.gain, z - 500) - low, 0) / (_MOST_US - low))
+        middle = int(1000 * (0.5 * (_LEAST_US + _MOST_US) - low) / (_MOST_US - low))
+        dead = self.throttle_dead_zone * self.gain
+        if control < middle - dead:
+            return max((control - middle + dead) / (middle - dead), -1.0)
+        if control > middle + dead:
+            return min((control - middle - dead) / (1000.0 - middle - dead), 1.0)
+        return 0.0
+
+
+_LEAST_US, _MOST_US, _THROTTLE_DEAD_US = 1100, 1900, 30
+
+
+def _pulse(unit_us: float, units: int) -> int:
+    """Return the pulse of a stick in microseconds, cut to whole ones (`set_override`)."""
+    return min(max(int(1500 + unit_us * units), _LEAST_US), _MOST_US)
+
+
+def _thrust_input(pulse: int, trim: int) -> float:
+    """Return the share of the way from the trim to the end (`norm_input`)."""
+    return (pulse - trim) / (_MOST_US - trim if pulse > trim else trim - _LEAST_US)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,7 +21,7 @@ from aqualvs.app.batch.season import Season
 from aqualvs.app.batch.summary_page import SUMMARY_HTML, write_summary
 from aqualvs.app.batch.survey import size_of
 from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
-from aqualvs.app.disk import writing
+from aqualvs.app.disk import read_json, writing
 from aqualvs.app.net_request import NetRequest
 from aqualvs.app.overwriting import Claim
 from aqualvs.app.run import RunRequest
@@ -202,7 +202,7 @@ def _work(request: BatchRequest, dive: Dive, name: str, out: Path) -> DiveWork:
 def _known_names(out: Path) -> dict[str, str]:
     """Return source to name of all dives that this folder has ever had."""
     try:
-        found = json.loads((out / HOME / _NAMES).read_text(encoding="utf-8"))
+        found = read_json(out / HOME / _NAMES)
     except (OSError, ValueError):
         return {}
     return {str(key): str(value) for key, value in found.items()}

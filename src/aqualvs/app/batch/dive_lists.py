@@ -10,6 +10,7 @@ or the same as a list of mappings in YAML. Only `dive` is needed; paths are rela
 """
 
 import csv
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,7 +114,12 @@ def _water(row: Mapping[str, Any], path: Path, number: int) -> Water:
 
 
 def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float | None:
+    if key not in row:
+        return None
     try:
-        return float(row[key]) if key in row else None
+        value = float(row[key])
     except (TypeError, ValueError):
-        raise OptionError(f"{path}: row {number}: {key} is {row[key]!r}; give a number") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise OptionError(f"{path}: row {number}: {key} is {row[key]!r}; give a number")
+    return value

@@ -10,6 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.disk import read_json
+
 SEAL = "done.json"
 """Written last; says for what the content of a folder was made, and what it is."""
 
@@ -77,7 +79,7 @@ def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] 
 def read_seal(folder: Path) -> dict[str, Any] | None:
     """Return the content of a seal, None where there is none that can be read."""
     try:
-        content = json.loads((folder / SEAL).read_text(encoding="utf-8"))
+        content = read_json(folder / SEAL)
     except (OSError, ValueError):
         return None
     whole = isinstance(content, dict) and {"key", "files", "facts"} <= set(content)

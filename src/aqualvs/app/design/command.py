@@ -95,30 +95,29 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
     design = _asked_for(request)
     names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG)
     files = [(request.out or Path()) / name for name in names]
-    claim = Claim("design", files, overwrite=request.overwrite)
-    if request.turn:
-        turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
-        design = design.with_mounts(turned)
-    best = best_angles(design) if request.tilt else design
-    for line in summary(best):
-        _say(console, line)
-    console.print()
-    if request.rig is not None and request.tilt:
-        _tell_errors(console, design, "As it is: one sigma on a wall or net square ahead")
-        error, better = score(design).error, score(best).error
-        _say(console, f"Tilted best, its errors are {better / error:.0%} of that.\n")
-    _tell_errors(console, best, "Expected error: one sigma on a wall or net square ahead")
-    costs = offset_costs(best, best.rig.working_range)
-    if costs:
-        console.print(offset_table(costs, best.rig.working_range))
-        _say(console, centring_words(best, costs, best.rig.working_range))
+    with Claim("design", files, overwrite=request.overwrite):
+        if request.turn:
+            turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
+            design = design.with_mounts(turned)
+        best = best_angles(design) if request.tilt else design
+        for line in summary(best):
+            _say(console, line)
         console.print()
-    if request.try_changes:
-        console.print(change_table(changes(best)))
-        console.print()
-    if request.out is not None:
-        _write(best, request.out, console)
-        claim.settle()
+        if request.rig is not None and request.tilt:
+            _tell_errors(console, design, "As it is: one sigma on a wall or net square ahead")
+            error, better = score(design).error, score(best).error
+            _say(console, f"Tilted best, its errors are {better / error:.0%} of that.\n")
+        _tell_errors(console, best, "Expected error: one sigma on a wall or net square ahead")
+        costs = offset_costs(best, best.rig.working_range)
+        if costs:
+            console.print(offset_table(costs, best.rig.working_range))
+            _say(console, centring_words(best, costs, best.rig.working_range))
+            console.print()
+        if request.try_changes:
+            console.print(change_table(changes(best)))
+            console.print()
+        if request.out is not None:
+            _write(best, request.out, console)
 
 
 def _tell_errors(console: Console, design: Design, title: str) -> None:

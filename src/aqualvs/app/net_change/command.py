@@ -65,18 +65,17 @@ def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comp
     surveys, origins = _surveys(request)
     check_surveys(surveys)
     files = [request.out / name for name in NET_CHANGE_FILES]
-    claim = Claim("net-change", files, overwrite=request.overwrite)
-    for folder in request.runs:
-        for line in left_out(folder):
-            tell(line)
-    for one in surveys:
-        tell(f"{one.folder}: {one.date} ({origins[str(one.folder)]})")
-    result = compare(surveys, request.cell_m)
-    with writing(request.out):
-        write_tables(request.out, result, (NET_CHANGE_CSV, HOLES_CHANGE_CSV))
-        draw_change(result, request.out / NET_CHANGE_PNG)
-        write_page(request.out / NET_CHANGE_HTML, request.out / NET_CHANGE_PNG, result, origins)
-    claim.settle()
+    with Claim("net-change", files, overwrite=request.overwrite):
+        for folder in request.runs:
+            for line in left_out(folder):
+                tell(line)
+        for one in surveys:
+            tell(f"{one.folder}: {one.date} ({origins[str(one.folder)]})")
+        result = compare(surveys, request.cell_m)
+        with writing(request.out):
+            write_tables(request.out, result, (NET_CHANGE_CSV, HOLES_CHANGE_CSV))
+            draw_change(result, request.out / NET_CHANGE_PNG)
+            write_page(request.out / NET_CHANGE_HTML, request.out / NET_CHANGE_PNG, result, origins)
     for line in summary_lines(result):
         tell(line)
     tell(f"page: {request.out / NET_CHANGE_HTML}")

@@ -1,7 +1,6 @@
 """Runs of dives along a net, read again from the files that `aqualvs net` wrote."""
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -10,7 +9,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, POSTURE_CSV
+from aqualvs.app.disk import read_json
+from aqualvs.app.outputs import HOLES_CSV, NET_CSV, NET_GEOJSON, POSTURE_CSV, check_run_files
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 
@@ -157,6 +157,7 @@ def read_survey(folder: Path, day: date) -> Survey:
     SourceError
         If a file is missing or cannot be understood.
     """
+    check_run_files(folder)
     rows, holes = _rows(folder / NET_CSV), _rows(folder / HOLES_CSV)
     content = _json(folder / NET_GEOJSON)
     facts = content["aqualvs_net"]
@@ -265,7 +266,7 @@ def _rows(path: Path) -> list[Row]:
 
 def _json(path: Path) -> Mapping[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except (OSError, ValueError) as fault:
         raise _unreadable(path) from fault
     if not isinstance(content, dict) or not isinstance(content.get("aqualvs_net"), dict):

@@ -14,6 +14,7 @@ from aqualvs.live.logs.dataflash import (
 from aqualvs.live.logs.mavlink_frames import looks_like_frames
 from aqualvs.live.logs.tlog import read_tlog
 from aqualvs.live.logs.vehicle_log import VehicleLog
+from aqualvs.special_files import refuse_special
 
 _HEAD_BYTES = 65536
 _OTHERS = {
@@ -46,6 +47,7 @@ def read_vehicle_log(path: str | Path) -> VehicleLog:
         file, the value and the remedy.
     """
     source = Path(path)
+    refuse_special(source)
     head = _head(source)
     if not head:
         raise SourceError(f"{source}: is empty; give the log of the dive")

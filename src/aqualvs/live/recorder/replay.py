@@ -80,6 +80,8 @@ class DiveRecording:
         stored = next(self._file.messages([schemas.RIG.name]), None)
         if stored is not None:
             self._read_rig(stored.data)
+        elif next(self._file.messages([schemas.STRIPES.name]), None) is None:
+            raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
         self.n_frames = self._file.count(schemas.STRIPES.name)
         self.has_pictures = next(self._file.messages([schemas.PICTURE.name]), None) is not None
         self.fps = self._mean_rate()

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from aqualvs.live.sources.quiet import quiet_decoders
 from aqualvs.scanning.scan import ImagePlane, Planes, planes_of_image
 
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
@@ -100,13 +101,12 @@ def planes_of_message(message: ImageMessage) -> Planes | None:
 
 
 def _decompressed(data: bytes) -> Planes | None:
-    level = cv2.utils.logging.setLogLevel(0)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR) if data else None
+        with quiet_decoders():
+            pixels = np.frombuffer(data, np.uint8)
+            image = cv2.imdecode(pixels, cv2.IMREAD_ANYCOLOR) if data else None
     except cv2.error:
         image = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     return None if image is None else planes_of_image(cast("ImagePlane", image))
 
 

@@ -75,7 +75,10 @@ def image_of_json(content: bytes) -> ImageMessage:
     ValueError
         If fields are missing or wrong.
     """
-    found = json.loads(content)
+    try:
+        found = json.loads(content)
+    except RecursionError as fault:
+        raise ValueError("nested too deeply") from fault
     try:
         stamp = found["timestamp"]
         stamp_ns = int(stamp["sec"]) * 1_000_000_000 + int(stamp.get("nsec", 0))

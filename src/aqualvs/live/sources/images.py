@@ -9,6 +9,7 @@ from typing import Self, cast
 import cv2
 
 from aqualvs.errors import SourceError
+from aqualvs.live.sources.quiet import quiet_decoders
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 
 IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
@@ -119,10 +120,9 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
         None for pipes and devices too, and for images of more pixels than OpenCV is told to take
         (`aqualvs/__init__.py`).
     """
-    level = cv2.utils.logging.setLogLevel(0)
     try:
-        return cast("ImagePlane | None", cv2.imread(str(path), how) if path.is_file() else None)
+        with quiet_decoders():
+            image = cv2.imread(str(path), how) if path.is_file() else None
     except cv2.error:
         return None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    return cast("ImagePlane | None", image)

@@ -1,0 +1,156 @@
+"""Postures that do not answer: frozen ones, and a vehicle that moves unseen."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aqualvs.app.follow_fast_eye import Blind, Loss, SampledEye
+from aqualvs.app.follow_sim_case import SimCase, sea, vehicle_model
+from aqualvs.control.answer import AnswerLimits, AnswerWatch
+from aqualvs.control.autopilot import Decision
+from aqualvs.control.gains_file import load_gains
+from aqualvs.control.mission import HoldMission
+from aqualvs.control.safety import Reason
+from aqualvs.control.setpoint import Setpoint
+from aqualvs.control.vehicle import NEUTRAL, Effort
+from aqualvs.errors import OptionError
+from aqualvs.scanning.posture import Posture
+from control_cases import FRAME_S, posture_at, state_at
+
+GAINS = load_gains("bluerov2")
+HELD = Effort(forward=0.3)
+
+
+def noisy(rng: np.random.Generator, distance: float = 0.6, yaw: float = 0.0) -> Posture:
+    seen = posture_at(distance + 1e-3 * rng.normal(), yaw + 3e-3 * rng.normal())
+    return replace(seen, pitch=3e-3 * rng.normal())
+
+
+def watched(postures: list[Posture], effort: Effort = HELD) -> list[Reason | None]:
+    watch, found = AnswerWatch(GAINS.vehicle), []
+    for k, seen in enumerate(postures):
+        now_s = FRAME_S * k
+        found.append(watch.see(now_s, seen, state_at(now_s)))
+        watch.done(now_s, effort)
+    return found
+
+
+def test_noise_passes() -> None:
+    rng = np.random.default_rng(1)
+    assert set(watched([noisy(rng) for _ in range(3000)])) == {None}
+
+
+def test_a_posture_that_repeats_under_thrust_is_frozen_until_it_changes() -> None:
+    rng = np.random.default_rng(2)
+    found = watched([noisy(rng)] * 20 + [noisy(rng) for _ in range(5)])
+    first = found.index(Reason.FROZEN)
+    assert first * FRAME_S == pytest.approx(0.2, abs=FRAME_S)
+    assert set(found[first:20]) == {Reason.FROZEN}
+    assert found[20:] == [None] * 5
+
+
+def test_time_that_stands_still_changes_nothing() -> None:
+    """The very first step after engaging, and one after a pause, last no time."""
+    watch, rng = AnswerWatch(GAINS.vehicle), np.random.default_rng(5)
+    watch.done(0.0, HELD)
+    for now_s in (0.0, 0.0, 0.04, 0.04, 9.0, 8.0):
+        assert watch.see(now_s, noisy(rng), state_at(now_s)) is None
+        watch.done(now_s, HELD)
+
+
+def test_without_thrust_nothing_need_move() -> None:
+    assert set(watched([posture_at(0.6)] * 50, NEUTRAL)) == {None}
+
+
+def test_noise_that_vanishes_is_a_still_that_an_encoder_repeats() -> None:
+    rng = np.random.default_rng(3)
+    live = [noisy(rng) for _ in range(100)]
+    last = live[-1]
+    still = [
+        replace(
+            last,
+            range=last.range + 3e-5 * rng.normal(),
+            yaw=last.yaw + 1e-4 * rng.normal(),
+            pitch=last.pitch + 1e-4 * rng.normal(),
+        )
+        for _ in range(30)
+    ]
+    found = watched(live + still)
+    assert set(found[:100]) == {None}
+    # Eight postures tell it.
+    assert set(found[107:]) == {Reason.FROZEN}
+
+
+def test_a_yaw_that_does_not_follow_the_heading() -> None:
+    rng, watch = np.random.default_rng(4), AnswerWatch(GAINS.vehicle)
+    answering = []
+    for answers in (True, False):
+        watch.reset()
+        found = set()
+        for k in range(60):
+            now_s, turned = FRAME_S * k, math.radians(10.0) * FRAME_S * k
+            seen = noisy(rng, yaw=-turned if answers else 0.0)
+            found.add(watch.see(now_s, seen, state_at(now_s, heading=turned)))
+            watch.done(now_s, HELD)
+        answering.append(found)
+    assert answering == [{None}, {None, Reason.NO_ANSWER}]
+
+
+def frozen_hold(
+    name: str, loss: Loss, *, before: float = 0.6, seed: int = 1
+) -> tuple[float, float, list[Decision]]:
+    """Hold 0.6 m in calm water; sight freezes at 14 s, just before of which the setpoint came."""
+    freeze_s, mission = 14.0, HoldMission(Setpoint(before))
+    model = vehicle_model(name)
+    case = SimCase(
+        model=model,
+        gains=load_gains(model.name),
+        water=sea(current=0.0, waves=0.0, seed=seed),
+        start_range=before,
+        seed=seed,
+    )
+    eye = SampledEye(
+        case.net, np.random.default_rng(seed), blind=(Blind(freeze_s, math.inf, loss),)
+    )
+    loop, decisions = case.loop(eye, mission), []
+
+    def keep(now_s: float, *step: object) -> None:
+        if now_s > freeze_s:
+            assert isinstance(step[2], Decision)
+            decisions.append((now_s, step[2]))
+
+    def step(now_s: float) -> None:
+        if now_s >= freeze_s - 0.3:
+            mission.setpoint = Setpoint(0.6)
+
+    loop.on_step = keep
+    log = loop.run(freeze_s + 5.0, step)
+    neutral_s = next(at for at, one in decisions if one.effort == NEUTRAL) - freeze_s
+    after = log.column("time_s") >= freeze_s
+    return neutral_s, float(log.column("range")[after].min()), [one for _, one in decisions]
+
+
+@pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
+@pytest.mark.parametrize("before", [0.6, 0.75])
+def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) -> None:
+    neutral_s, nearest, decisions = frozen_hold(name, Loss.FROZEN, before=before)
+    assert neutral_s <= 0.5
+    assert nearest >= 0.45
+    assert decisions[-1].effort == NEUTRAL
+    assert decisions[-1].reason is Reason.FROZEN
+
+
+def test_a_vehicle_that_moves_unseen_is_given_back() -> None:
+    """The picture stands still, yet has noise: efforts alone tell."""
+    neutral_s, _, decisions = frozen_hold("bluerov2", Loss.STUCK, before=0.75)
+    assert neutral_s <= 2.5
+    assert decisions[-1].reason is Reason.NO_ANSWER
+    assert not decisions[-1].engaged
+    assert Reason.NO_ANSWER.takes_over
+
+
+def test_limits_that_cannot_work_are_refused() -> None:
+    with pytest.raises(OptionError, match="safety, repeats_s 0"):
+        AnswerLimits(repeats_s=0.0)

@@ -1,0 +1,98 @@
+"""Pictures that stand still while time runs on: when they are noticed, and what is none of them."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.errors import OptionError
+from aqualvs.live.frozen import FrozenOptions, FrozenPicture
+from aqualvs.scanning.scan import ImagePlane
+from live_cases import demo_frames
+
+FPS = 25.0
+
+
+def noisy(luma: ImagePlane, rng: np.random.Generator) -> ImagePlane:
+    """A picture with shot and read noise of a small camera."""
+    sigma = np.sqrt(0.1 * np.maximum(luma.astype(np.float32) - 16.0, 0.0) + 1.0)
+    return np.clip(luma + sigma * rng.normal(size=luma.shape), 0, 255).astype(np.uint8)
+
+
+def hovering(n: int, seed: int = 1) -> Iterator[ImagePlane]:
+    """A vehicle that all but stands still: it swings by half a pixel."""
+    rng, luma = np.random.default_rng(seed), np.ascontiguousarray(demo_frames(1)[0].luma)
+    for i in range(n):
+        move = np.float32([[1, 0, 0.6 * np.sin(i / 9.0)], [0, 1, 0.5 * np.sin(i / 7.0)]])
+        yield noisy(cv2.warpAffine(luma, move, luma.shape[::-1]), rng)
+
+
+def watched(pictures: Iterator[ImagePlane] | list[ImagePlane], fps: float = FPS) -> list[float]:
+    watch = FrozenPicture()
+    return [watch.update(i / fps, one) for i, one in enumerate(pictures)]
+
+
+def test_repeated_pictures_are_noticed_within_a_quarter_of_a_second_and_forgotten_again() -> None:
+    live = list(hovering(110))
+    found = watched(live[:60] + [live[59]] * 40 + live[60:])
+    assert not any(found[:60])
+    first = next(i for i, still_s in enumerate(found) if still_s > 0.0)
+    # Frame 59 was live; the quarter counts from it.
+    assert first - 59 <= 7
+    assert found[99] == pytest.approx(40 / FPS)
+    assert all(found[first:100])
+    # It is believed again half a second after the picture moves.
+    assert not any(found[100 + 14 :])
+
+
+def test_noise_alone_tells_a_live_picture() -> None:
+    """A vehicle on deck, or on a stand before a wall."""
+    rng, luma = np.random.default_rng(2), demo_frames(1)[0].luma
+    assert not any(watched([noisy(luma, rng) for _ in range(100)]))
+
+
+@pytest.mark.parametrize("each", [2, 4])
+def test_cameras_that_repeat_pictures_in_dim_light_are_live(each: int) -> None:
+    live = list(hovering(40))
+    repeated = [one for one in live for _ in range(each)]
+    assert not any(watched(repeated, fps=30.0))
+
+
+def test_what_an_encoder_improves_in_a_still_is_no_motion() -> None:
+    """Detail comes in within the cells; their means stay but for rounding."""
+    rng = np.random.default_rng(3)
+    live = list(hovering(60))
+    coarse = cv2.GaussianBlur(live[-1], (0, 0), 3.0)
+    still = [
+        cv2.addWeighted(coarse, 0.7**i, live[-1], 1.0 - 0.7**i, rng.uniform(-0.2, 0.2))
+        for i in range(20)
+    ]
+    found = watched(live + still)
+    assert not any(found[:60])
+    assert all(found[60 + 12 :])
+
+
+def test_another_size_and_a_stream_that_was_away_begin_anew() -> None:
+    luma = demo_frames(1)[0].luma
+    watch = FrozenPicture()
+    for i in range(20):
+        watch.update(i / FPS, luma)
+    assert watch.update(20 / FPS, luma) > 0.0
+    assert watch.update(21 / FPS, luma[:-40]) == 0.0
+    for i in range(22, 40):
+        watch.update(i / FPS, luma)
+    assert watch.update(40 / FPS, luma) > 0.0
+    assert watch.update(43.0, luma) == 0.0
+    # Time that jumps back is another stream.
+    assert watch.update(1.0, luma) == 0.0
+
+
+def test_pictures_smaller_than_a_cell_are_never_frozen() -> None:
+    tiny = np.zeros((4, 4), np.uint8)
+    assert not any(watched([tiny] * 30))
+
+
+def test_options_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(OptionError, match="span_s 0"):
+        FrozenOptions(span_s=0.0)

@@ -1,0 +1,205 @@
+"""Fit the weights with which pieces of stripes are judged (`aqualvs.scanning.stripe_pieces`).
+
+    python tools/fit_stripe_pieces.py ../shared/samples/real-laser-lines
+
+Pieces that lie on the lines of real_lines.csv, or on those that pairs with and without laser show,
+are lines; what lies beside them, and all that is found in pictures without laser and in the halves
+without line of tests/data/real-wall, is none. Every line is also shown once as paint: of the same
+shape, without colour. A picture's lines count as much as what else is in it, however many they are.
+
+Printed are what the weights find in pictures that they were not fitted to, leaving out one set
+after the other, and then the weights fitted to all.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+import real_lines
+from aqualvs.scanning import stripe_pieces
+from aqualvs.scanning.scan import Frame, planes_of_image
+from aqualvs.scanning.search import SearchAxis
+from aqualvs.scanning.stripe_pieces import ACROSS, ALONG, LENGTH, TOP
+from aqualvs.scanning.whole_picture import find_all_pieces
+
+Array = NDArray[np.float64]
+
+WALL = Path(__file__).parents[1] / "tests/data/real-wall"
+WITHOUT_LINE_PX = 700
+# A piece is a line, or none, if such a share of its points is, or is not, this near to a line; wide
+# lines are traced to a few pixels.
+LINE, OTHER, NEAR_PX, NEAR_WIDE_PX = 0.7, 0.3, 1.5, 4.0
+# Where lines of the dark pictures were traced: beyond, nobody says what is none (x, x, y in px).
+TRACED_DARK = (760.0, 1480.0, 180.0)
+# Paint's share of the weight of lines, and how its chroma for each level spreads about none.
+PAINT_WEIGHT, PAINT_SPREAD, WHITE = 0.1, (0.03, 0.05), 225.0
+# Samples that all weights together count as, and the ridge that keeps the weights small.
+N_EFFECTIVE, RIDGE, ROUNDS = 3000.0, 3.0, 40
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Pieces of one picture in one format: table, and 1 for lines, 0 for none, NaN if unknown."""
+
+    name: str
+    format: str
+    width_px: int
+    table: Array
+    is_line: Array
+    has_lines: bool
+
+    @property
+    def group(self) -> str:
+        """Name of the set."""
+        return self.name.split("/")[0]
+
+
+def samples(folder: Path, formats: list[str]) -> Iterator[Sample]:
+    """Find the pieces of all pictures and say which of them are lines."""
+    traced = real_lines.traced_lines()
+    paths = [*sorted(folder.glob("*/*")), *sorted(WALL.glob("*.jpg"))]
+    for path in (p for p in paths if p.suffix in (".png", ".jpg")):
+        name = f"{path.parent.name}/{path.name}"
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if path.parent == WALL:
+            image = np.ascontiguousarray(image[:, :WITHOUT_LINE_PX])
+        lines = None
+        if "-b-" in name:
+            row = real_lines.pair_line(cv2.imread(str(path).replace("-b-", "-a-")), image)
+            column = np.flatnonzero(np.isfinite(row))
+            lines = np.stack([column, row[column]], axis=-1)
+        elif name in traced:
+            lines = np.concatenate([real_lines.walk(polyline) for _, polyline in traced[name]])
+        own = real_lines.RED_NM if name.startswith("red") else real_lines.GREEN_NM
+        both = [real_lines.GREEN_NM, real_lines.RED_NM]
+        for fmt in formats:
+            given = real_lines.encoded(image, fmt)
+            for nm in both if lines is None else [own]:
+                yield _sample(name, fmt, given, nm, lines)
+
+
+def _sample(name: str, fmt: str, given: object, nm: float, lines: Array | None) -> Sample:
+    frame = given if isinstance(given, Frame) else Frame(0, 0.0, *planes_of_image(given))
+    found = find_all_pieces(frame, real_lines.options_for(nm))
+    table = np.concatenate([pieces.table for pieces in found], axis=1)
+    is_line = np.zeros(table.shape[1])
+    if lines is not None and len(is_line):
+        dark = name.startswith("green15-dark")
+        share, middle = [], []
+        for pieces in found:
+            line = pieces.search.line_px * (pieces.returns.line[pieces.order] + 0.5) - 0.5
+            points = np.stack([line, pieces.returns.position[pieces.order]], axis=-1)
+            if pieces.search.axis is SearchAxis.ALONG_X:
+                points = points[:, ::-1]
+            near = cKDTree(lines).query(points)[0] <= (NEAR_WIDE_PX if dark else NEAR_PX)
+            first, n = pieces.start[:-1], np.diff(pieces.start)
+            share.append(np.add.reduceat(near.astype(float), first) / n)
+            middle.append(np.add.reduceat(points, first) / n[:, None])
+        on, (x, y) = np.concatenate(share), np.concatenate(middle).T
+        is_line = np.where(on > LINE, 1.0, np.where(on < OTHER, 0.0, np.nan))
+        if dark:
+            beyond = (x < TRACED_DARK[0]) | (x > TRACED_DARK[1]) | (y < TRACED_DARK[2])
+            is_line[(is_line == 0.0) & beyond] = np.nan
+    return Sample(name, fmt, frame.luma.shape[1], table, is_line, lines is not None)
+
+
+def logistic(evidence: Array, is_line: Array, weight: Array) -> Array:
+    """Return the weights of a ridge logistic regression, for the evidence as it is."""
+    mean, spread = evidence.mean(axis=0), evidence.std(axis=0) + 1e-9
+    mean[0], spread[0] = 0.0, 1.0
+    scaled, found = (evidence - mean) / spread, np.zeros(evidence.shape[1])
+    weight = weight * N_EFFECTIVE / weight.sum()
+    for _ in range(ROUNDS):
+        expected = 1.0 / (1.0 + np.exp(-np.clip(scaled @ found, -30.0, 30.0)))
+        slope = scaled.T @ (weight * (is_line - expected)) - RIDGE * found
+        curved = (scaled.T * (weight * expected * (1.0 - expected))) @ scaled
+        curved += RIDGE * np.eye(len(found))
+        found += np.clip(np.linalg.solve(curved, slope), -2.0, 2.0)
+    found = found / spread
+    found[0] -= (found * mean)[1:].sum()
+    return found
+
+
+def _rows(sample: Sample, evidence: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+    """Return evidence, label and weight of a picture's pieces, paint among them."""
+    known = np.isfinite(sample.is_line)
+    table, is_line = sample.table[:, known], sample.is_line[known]
+    length = table[LENGTH]
+    of_lines, of_others = length[is_line > 0.0].sum(), length[is_line == 0.0].sum()
+    weight = np.where(is_line > 0.0, length / max(of_lines, 1.0), length / max(of_others, 1.0))
+    paint = table[:, (is_line > 0.0) & (table[TOP] < WHITE)].copy()
+    rng = np.random.default_rng(0)
+    for row, spread in zip((ALONG, ACROSS), PAINT_SPREAD, strict=True):
+        paint[row] = rng.normal(0.0, spread, paint.shape[1])
+    of_paint = PAINT_WEIGHT * paint[LENGTH] / max(of_lines, 1.0)
+    return (
+        np.concatenate([evidence(table), evidence(paint)]),
+        np.concatenate([is_line, np.zeros(paint.shape[1])]),
+        np.concatenate([weight, of_paint]),
+    )
+
+
+def fit(of: list[Sample]) -> tuple[Array, Array]:
+    """Return the weights of the general evidence and of what the pictures' own lines add."""
+
+    def general(sample: Sample) -> Callable[[Array], Array]:
+        return lambda table: stripe_pieces.general_evidence(table, sample.width_px, has_colour=True)
+
+    rows = [_rows(sample, general(sample)) for sample in of]
+    first = logistic(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+    rows = []
+    for sample in (sample for sample in of if sample.has_lines):
+        log_odds = general(sample)(sample.table) @ first
+        lines = stripe_pieces.learn_lines(sample.table, log_odds, has_colour=True)
+        if lines is not None:
+
+            def own(table: Array, sample: Sample = sample, lines=lines) -> Array:  # type: ignore[no-untyped-def]
+                return stripe_pieces.own_evidence(table, lines, sample.width_px, has_colour=True)
+
+            rows.append(_rows(sample, own))
+    return first, logistic(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def report(weights: tuple[Array, Array], of: list[Sample]) -> None:
+    """Print how much of the pieces on lines is found, and how much of others."""
+    stripe_pieces._GENERAL, stripe_pieces._OWN = weights
+    for group, fmt in dict.fromkeys((s.group, s.format) for s in of):
+        mine = [s for s in of if (s.group, s.format) == (group, fmt)]
+        odds = [stripe_pieces.line_log_odds(s.table, s.width_px, has_colour=True) for s in mine]
+        shares, clean = [], []
+        for s, one in zip(mine, odds, strict=True):
+            length, keep = s.table[LENGTH], one > 0.0
+            if s.has_lines:
+                shares.append(length[keep & (s.is_line > 0)].sum() / length[s.is_line > 0].sum())
+            else:
+                clean.append(not keep.any())
+        lines = f"lines {np.round(shares, 2)}" if shares else ""
+        print(f"  {group:14} {fmt:6} {lines} without laser: {sum(clean)} of {len(clean)} clean")
+
+
+def main() -> int:
+    """Leave out one set after the other, then fit to all."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("samples", type=Path, help="folder of the photographs")
+    parser.add_argument("--formats", default="png,jpg80,crf23", help="such as png,jpg80")
+    given = parser.parse_args()
+    found = list(samples(given.samples, given.formats.split(",")))
+    for group in dict.fromkeys(sample.group for sample in found):
+        print(f"fitted without {group}:")
+        weights = fit([s for s in found if s.group != group])
+        report(weights, [s for s in found if s.group == group])
+    weights = fit(found)
+    for name, values in zip(("_GENERAL", "_OWN"), weights, strict=True):
+        print(f"{name} = np.array([{', '.join(f'{value:.3g}' for value in values)}])")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
