@@ -703,6 +703,9 @@ class Bench:
                 name,
                 name.lower().lstrip("-").replace("-", "_"),
                 shown[:30] or name,
+                # Another option may be missing, or contradict it.
+                "--",
+                "No such option",
                 str(self.home),
                 *words,
             ),
@@ -788,6 +791,7 @@ def run_cases() -> int:
     print(
         f"{asked.cases} cases of seed {asked.seed} in {taken_s:.0f} s: {len(found)} failed", kinds
     )
+    print(f"{sum(taken for taken, _ in TIMES):.0f} s of the processor, of which most:")
     for taken, name in sorted(TIMES, reverse=True)[:8]:
         print(f"{taken:6.1f} s of the processor: {name}")
     if asked.keep is None and not found:

@@ -16,6 +16,7 @@ import numpy as np
 from fake_ardusub import PARAMETERS
 
 from aqualvs.control.autopilot import NetPilot
+from aqualvs.control.gains_file import load_gains
 from aqualvs.control.mission import HoldMission
 from aqualvs.control.safety import SafetyGate, SafetyLimits
 from aqualvs.control.setpoint import Setpoint, SetpointHolder
@@ -181,6 +182,8 @@ def sample(
 
 class PlainController:
     """Proportional, so that these tests rest on the rules and not on tuning."""
+
+    gains = load_gains("bluerov2")
 
     def update(
         self, _time_s: float, distance: float, yaw: float, *rest: Any, down: float = 0.0

@@ -71,7 +71,6 @@ def test_compression_moves_a_posture_little(measured, picture: str, fmt: str) ->
     assert abs(ours.pitch_error_deg - plain.pitch_error_deg) < 0.1
 
 
-@pytest.mark.xfail(reason="noise of JPEG passes as faint lines where no rig is known")
 @pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""
@@ -134,15 +133,12 @@ def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
         s for s in line_scores[fmt] if s.picture.startswith("green15-dark") and s.group == "line"
     ]
     assert (len(bright), len(dark)) == (4, 3)
-    least = {"png": 0.95, "jpg80": 0.8, "crf23": 0.75}[fmt]
-    assert {s.picture: s.found for s in bright if s.found < least} == {}
-    assert {s.picture: s.found for s in dark if s.found < 0.55} == {}
+    assert {s.picture: s.found for s in bright if s.found < 0.95} == {}
+    assert {s.picture: s.weakest for s in bright if s.weakest < 0.8} == {}
+    assert {s.picture: s.found for s in dark if s.found < 0.72} == {}
 
 
 @pytest.mark.samples
-@pytest.mark.xfail(
-    strict=True, reason="printed edges and coloured things pass as lines where no rig is known"
-)
 @pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
 def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
     off = [s for s in line_scores[fmt] if s.group.startswith("off")]

@@ -227,6 +227,13 @@ def surface(offset: float, support: float, is_mesh: bool, extent: float = 300.0)
     )
 
 
+def test_specks_that_reach_farther_than_an_unbroken_wall_has_gaps_are_no_net() -> None:
+    wall = surface(0.61, 1588, False, extent=0.0)
+    specks, net = surface(0.35, 130, True, extent=68.0), surface(0.35, 130, True, extent=1400.0)
+    assert choose([wall, specks], TargetKind.AUTO) is wall
+    assert choose([wall, net], TargetKind.AUTO) is net
+
+
 def test_which_of_several_is_the_target() -> None:
     net, far_net = surface(0.5, 200, True), surface(0.9, 400, True)
     wall, box = surface(0.9, 900, False), surface(0.4, 300, False)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from aqualvs.app.cli_options import (
+    MAX_WORKERS,
     Celsius,
     Detector,
     Fit,
@@ -45,7 +46,9 @@ def batch(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Processes on this machine; one per core by default.", show_default=False
+            max=MAX_WORKERS,
+            help="Processes on this machine; one per core by default.",
+            show_default=False,
         ),
     ] = None,
     scheduler: Annotated[

@@ -316,7 +316,7 @@ def board(
     width_mm: Annotated[float, typer.Option(help="Width of the box, inside.")] = 400.0,
     height_mm: Annotated[float, typer.Option(help="Height of the box, inside.")] = 380.0,
     depth_mm: Annotated[float, typer.Option(help="Depth of the box, inside.")] = 700.0,
-    first_id: Annotated[int, typer.Option(help="Number of the first marker.")] = 0,
+    first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
     position_mm: Annotated[
         tuple[float, float, float] | None,
         typer.Option(

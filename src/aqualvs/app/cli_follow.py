@@ -104,7 +104,7 @@ def follow(
         ),
     ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
-    seed: Annotated[int, typer.Option(help="Sim: of waves and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Sim: of waves and noise.")] = 0,
     freeze: Annotated[
         float | None,
         typer.Option(help="Sim: the picture stands still from this second on.", show_default=False),

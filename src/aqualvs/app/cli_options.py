@@ -6,6 +6,9 @@ from typing import Annotated, Literal
 
 import typer
 
+MAX_WORKERS = 1024
+"""Processes on one machine; more are a slip of the finger that would fill its memory."""
+
 OutFolder = Annotated[
     Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
 ]

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from aqualvs.app.cli_options import (
+    MAX_WORKERS,
     Celsius,
     Detector,
     Fit,
@@ -63,7 +64,10 @@ def run(
     workers: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Processes that measure; one per core by default.", show_default=False
+            min=1,
+            max=MAX_WORKERS,
+            help="Processes that measure; one per core by default.",
+            show_default=False,
         ),
     ] = None,
 ) -> None:

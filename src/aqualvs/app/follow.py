@@ -144,8 +144,12 @@ class SimRequest:
         OptionError
             Naming the value.
         """
-        if not self.seconds >= _LEAST_S:
-            raise OptionError(f"--seconds {self.seconds:g}: choose at least {_LEAST_S:g}")
+        if not _LEAST_S <= self.seconds <= _MOST_S:
+            raise OptionError(
+                f"--seconds {self.seconds:g}: choose at least {_LEAST_S:g}, at most {_MOST_S:g}"
+            )
+        if not _LEAST_FPS <= self.fps <= _MOST_FPS:
+            raise OptionError(f"--fps {self.fps:g}: choose {_LEAST_FPS:g} to {_MOST_FPS:g}")
         if self.camera is not None and not self.rendered:
             raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
         if self.cage_radius and not self.cage_radius >= _LEAST_RADIUS:
@@ -163,6 +167,8 @@ class SimRequest:
 
 
 _LEAST_S, _LEAST_RADIUS = 1.0, 2.0
+# A day; the slowest and fastest that cameras are.
+_MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
 
 
 def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:

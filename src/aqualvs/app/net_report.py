@@ -236,8 +236,11 @@ def _number(row: Row, name: str) -> float | None:
 
 
 def _rows(path: Path) -> list[Row]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return [row for row in csv.DictReader(file) if None not in row.values()]
+    try:
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            return [row for row in csv.DictReader(file) if None not in row.values()]
+    except csv.Error:
+        return []
 
 
 def _facts(path: Path) -> Mapping[str, Any]:

@@ -64,7 +64,7 @@ def lenient_output() -> Iterator[LenientStream | None]:
     before = sys.stdout, sys.stderr
     output = None if sys.stdout is None else _lenient(sys.stdout)
     errors = None if sys.stderr is None else _lenient(sys.stderr)
-    sys.stdout, sys.stderr = output, errors  # type: ignore[assignment]
+    sys.stdout, sys.stderr = output, errors
     try:
         yield output
     finally:

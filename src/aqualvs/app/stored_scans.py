@@ -95,6 +95,8 @@ def _posture_rows(path: Path) -> Iterator[dict[str, str]]:
             yield from (row for row in reader if row[last] is not None)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; give the folder of a run") from None
+    except csv.Error as fault:
+        raise SourceError(f"{path}: is damaged ({fault}); run the dive again") from None
     except OSError as fault:
         raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the disk") from fault
 

@@ -62,7 +62,12 @@ def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
     source = Path(path)
     text = read_text(source, "a poses.csv", CalibrationError)
     reader = csv.reader(io.StringIO(text))
-    rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    try:
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as fault:
+        raise CalibrationError(
+            f"{source}: line {reader.line_num} cannot be read ({fault}); mend that line"
+        ) from None
     if len(rows) < 2:
         raise CalibrationError(
             f"{source}: holds no rows; write a line 'file,distance_mm' and one for each picture"

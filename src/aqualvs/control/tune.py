@@ -48,6 +48,8 @@ _SWELL = 1.2
 _SLUGGISH = 4.0
 # Where the bisection of a gain begins and ends, in 1/s.
 _LEAST, _GREATEST = 0.05, 20.0
+# Delays and frames in seconds, and m/s: beyond them nothing is steered.
+_MOST_S, _MOST_CURRENT = 60.0, 10.0
 # Packaged gains have 0.40 to 0.55, half as much again 0.28 to 0.37, twice as much 0.13 to 0.19.
 _LEAST_USABLE_MODULUS = 0.25
 
@@ -95,21 +97,23 @@ class TuneOptions:
         OptionError
             Naming the value.
         """
-        if not 0.0 <= self.delay <= self.greatest_delay:
+        if not 0.0 <= self.delay <= self.greatest_delay <= _MOST_S:
             raise OptionError(
-                f"tune: delay {self.delay:g} s; choose 0 to the greatest, {self.greatest_delay:g} s"
+                f"tune: delay {self.delay:g} s; choose 0 to the greatest, "
+                f"{self.greatest_delay:g} s, and that up to {_MOST_S:g} s"
             )
-        if not (self.frame > 0.0 and min(self.mass_factor, self.drag_factor) >= 1.0):
+        if not (0.0 < self.frame <= _MOST_S and min(self.mass_factor, self.drag_factor) >= 1.0):
             raise OptionError(
                 f"tune: frame {self.frame:g} s, factors {self.mass_factor:g} and "
-                f"{self.drag_factor:g}; the first is positive, the others are at least 1"
+                f"{self.drag_factor:g}; the first is positive, up to {_MOST_S:g} s, the others are "
+                "at least 1"
             )
         moduli = (self.least_modulus, self.least_late_modulus, self.least_yaw_modulus)
-        if not (self.current >= 0.0 and 0.0 < min(moduli) <= max(moduli) < 1.0):
+        if not (0.0 <= self.current <= _MOST_CURRENT and 0.0 < min(moduli) <= max(moduli) < 1.0):
             raise OptionError(
                 f"tune: current {self.current:g} m/s, least moduli "
-                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 or more, the others "
-                "between 0 and 1"
+                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 to {_MOST_CURRENT:g}, "
+                "the others between 0 and 1"
             )
 
 

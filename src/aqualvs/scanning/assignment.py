@@ -142,6 +142,8 @@ class AssignmentTest:
                 others |= one.members
         plane = np.append(target.plane.normal, target.plane.offset)
         light = light_left(readings.source, readings.trust, chunk_index, target.members, others)
+        # A plane rests on two lasers: what one has beyond that does not speak for it.
+        light *= target.support / chunks.light[target.members].sum()
         most, faint = seen_of(plane, target.members, chunks.n_lines, chunks.laser, self._bands)
         small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not target.is_mesh)
         return small and faint > _MAY_BE_FAINT

@@ -8,12 +8,13 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
-    LineColour,
+    Paint,
     channel_image,
     element_at,
     expected_colour,
     laser_likelihood,
     learn_colour,
+    learn_paint,
     useful_height,
 )
 from aqualvs.scanning.scan import Frame
@@ -152,11 +153,11 @@ class FrameDetector:
         }
         # A sample of the search lines tells from which height on it pays to look.
         _, sample, _ = self._find(images, options.min_contrast, _SAMPLE_EVERY)
-        contrast, colours = self._survey(sample, frame.chroma is not None)
+        contrast, paint = self._survey(sample, frame.chroma is not None)
         line, table, ends = self._find(images, max(contrast, options.min_contrast))
         likelihood = np.ones(len(line))
         if frame.chroma is not None:
-            likelihood = self._likelihood(table, colours)
+            likelihood = self._likelihood(table, paint, self._n_possible)
         rows = select_returns(
             line, table, likelihood, ends, options.min_likelihood, options.min_share
         )
@@ -203,37 +204,34 @@ class FrameDetector:
             ends.append(ends[-1] + n)
         return self._line[: ends[-1]], self._table[:, : ends[-1]], np.array(ends)
 
-    def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, list[LineColour | None]]:
-        """Return the height from which on it pays to look, and what the lines' colours are.
+    def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, Paint | None]:
+        """Return the height from which on it pays to look, and paint.
 
         From that height on there are not many more peaks than the lasers can make.
         """
-        most = _MOST_PEAKS * self._n_possible / _SAMPLE_EVERY
+        n_possible = self._n_possible / _SAMPLE_EVERY
+        most = _MOST_PEAKS * n_possible
         heights = np.sort(sample[HEIGHT])[::-1]
         crowded = round(min(heights[int(most)], HIGHEST_USEFUL)) if len(heights) > most else 0
         if not has_colour:
-            return crowded, []
-        colours = [
-            learn_colour(sample, colour, self._n_possible / _SAMPLE_EVERY, is_sample=True)
-            for colour in self._colours
-        ]
-        useful = useful_height(sample[HEIGHT], self._likelihood(sample, colours))
-        return max(useful, crowded), colours
+            return crowded, None
+        paint = learn_paint(sample, n_possible)
+        likelihood = self._likelihood(sample, paint, n_possible)
+        return max(useful_height(sample[HEIGHT], likelihood), crowded), paint
 
-    def _likelihood(self, table: FloatArray, known: Sequence[LineColour | None]) -> FloatArray:
+    def _likelihood(self, table: FloatArray, paint: Paint | None, n_possible: float) -> FloatArray:
         """Return how likely each peak is laser light of any of the colours.
 
-        A colour that is not known is learned from the peaks, or that of a typical camera.
+        A colour that these peaks do not tell is that of a typical camera.
         """
         found = [
             laser_likelihood(
                 table,
-                line
-                or learn_colour(table, colour, self._n_possible)
-                or expected_colour(table, colour),
+                learn_colour(table, colour, paint) or expected_colour(table, colour, paint),
                 _WIDEST_WHITE * self._size_px[0],
+                n_possible,
             )
-            for line, colour in zip(known, self._colours, strict=True)
+            for colour in self._colours
         ]
         return np.asarray(np.max(found, axis=0), np.float64) if len(found) > 1 else found[0]
 

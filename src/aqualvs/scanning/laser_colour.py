@@ -36,11 +36,11 @@ _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.2
 _BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
 # So many peaks are enough to learn from.
 _ENOUGH = 2500
-# So tall peaks, so many times as many as the lasers can make, are mostly paint. Lines then lie so
-# many standard deviations off it, and it spreads by so much at least and at most, as chroma for
-# each level.
-_TALL, _CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 20.0, 2.0, 4.0, 1.4826
-_LEAST_SPREAD, _MOST_PAINT_SPREAD = 0.02, 0.07
+# So tall peaks near one colour, so many times as many as the lasers can make, are paint. It
+# spreads by so much at least, as chroma for each level, and by no more across the tint of its
+# light. Then how far off its middle, in standard deviations, other things and lines are.
+_TALL, _CROWD, _LEAST_SPREAD, _MOST_ACROSS = 20.0, 1.5, 0.02, 0.045
+_OF_CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 2.5, 4.0, 1.4826
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least and the most that is believed of a learned one, and how far paint
 # and glare spread about none. Lines of nine cameras show 0.15 to 0.7.
@@ -64,6 +64,9 @@ _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
 _FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
 # A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
 _WHITE = 225.0
+# Luma from which on a channel may be clipped, and full scale, where lines show the last share of
+# their chroma: measured on rendered stripes, whose middle or edge counts.
+_CLIPPED, _FULL, _LEFT_AT_FULL = 185.0, 235.0, 0.33
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
 # The largest of three normal numbers is so many standard deviations above their mean; up to so many
@@ -71,6 +74,9 @@ _QUARTER_OF_NORMAL = 0.3186
 _LARGEST_OF_THREE, _QUIET = 0.85, 1.4
 # Nothing is more certain than e to this power.
 _MAX_LOG_ODDS = 12.0
+
+# Spreads of 0: unknown.
+_NO_PAINT = (0.0, 0.0, 0.0, 0.0)
 
 HIGHEST_USEFUL = 32
 """Peaks of so many grey levels are always looked at."""
@@ -124,6 +130,23 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     return image
 
 
+class Paint(NamedTuple):
+    """What the paint of one frame shows, in levels of chroma for each grey level of height.
+
+    Attributes
+    ----------
+    u, v : float
+        Its middle.
+    spread_u, spread_v : float
+        Standard deviations, without noise.
+    """
+
+    u: float
+    v: float
+    spread_u: float
+    spread_v: float
+
+
 class LineColour(NamedTuple):
     """What the lines of one frame do to the chroma.
 
@@ -135,69 +158,81 @@ class LineColour(NamedTuple):
         Levels along it for each grey level of a line's height.
     sigma : float
         Standard deviation of a step that nothing but noise makes, in levels.
-    paint_u, paint_v : float
-        What the frame's paint shows for each grey level of height, where it was learned.
-    spread_u, spread_v : float
-        Standard deviations of that; 0 where it was not learned.
     along, across : float
         How lines spread about their mean, as shares of `ratio`, along their direction and across.
+    paint : Paint or None
+        What is no line, where most is of one colour.
     """
 
     u: float
     v: float
     ratio: float
     sigma: float
-    paint_u: float = 0.0
-    paint_v: float = 0.0
-    spread_u: float = 0.0
-    spread_v: float = 0.0
     along: float = _RATIO_SPREAD
     across: float = _ACROSS_SPREAD
+    paint: Paint | None = None
 
 
-def learn_colour(
-    table: FloatArray, colour: LaserColour, n_possible: float, *, is_sample: bool = False
-) -> LineColour | None:
+def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
+    """Learn the colour of what most tall peaks are, where the lasers cannot make so many.
+
+    Such as twine in the sun.
+
+    Parameters
+    ----------
+    table : array, shape (9, N)
+        Measures of a sample of peaks, rows as `stripe` names them.
+    n_possible : float
+        Peaks that the lasers can make in the sample.
+
+    Returns
+    -------
+    Paint or None
+        None where there are few tall peaks, or they are not of one colour.
+    """
+    tall = table[:, np.flatnonzero(table[HEIGHT] >= _TALL)]
+    if tall.shape[1] <= _CROWD * n_possible:
+        return None
+    *paint, across_tint, n_near = _learn_paint(tall, float(_noise(table)))
+    # Paint shows more or less of the light's tint; other differences are a mixture with lines.
+    return Paint(*paint) if across_tint < _MOST_ACROSS and n_near > _CROWD * n_possible else None
+
+
+def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour | None:
     """Learn from a frame's peaks what its lines do to the chroma.
-
-    Where there are many more tall peaks than the lasers can make, most are something else, such as
-    twine in the sun: then its colour is learned too, and lines are what differs from it.
 
     Parameters
     ----------
     table : array, shape (9, N)
         Measures of peaks, rows as `stripe` names them.
     colour : LaserColour
-    n_possible : float
-        Peaks that the lasers can make.
-    is_sample : bool
-        Whether there are more peaks to learn from.
+    paint : Paint or None
+        What most of the peaks are: then lines are what differs from it.
 
     Returns
     -------
     LineColour or None
         None where too few peaks are clearly of the laser's colour.
     """
-    every = 1 + table.shape[1] // _ENOUGH
-    table, n_possible = table[:, ::every], n_possible / every
-    tall = np.flatnonzero(table[HEIGHT] >= _TALL)
-    if len(tall) > _CROWD * n_possible:
-        crowded = LineColour(*_learn_from_crowd(table[:, tall], *colour.value))
-        # Peaks of one colour, and so no mixture of lines and noise. A sample may hold too few lines
-        # to find them in a crowd, where all peaks do not.
-        is_paint = crowded.spread_u * crowded.spread_v < _MOST_PAINT_SPREAD**2
-        if is_paint and (crowded.ratio > 0.0 or is_sample):
-            return crowded if crowded.ratio > 0.0 else None
-    found = LineColour(*_learn(np.ascontiguousarray(table), *colour.value))
+    if paint is None:
+        every = 1 + table.shape[1] // _ENOUGH
+        found = LineColour(*_learn(np.ascontiguousarray(table[:, ::every]), *colour.value))
+    else:
+        tall = np.flatnonzero(table[HEIGHT] >= _TALL)
+        sigma = float(_noise(table))
+        learned = _learn_beside_paint(table[:, tall], *colour.value, sigma, *paint)
+        found = LineColour(*learned[:3], sigma, *learned[3:], paint)
     return found if found.ratio > 0.0 else None
 
 
-def expected_colour(table: FloatArray, colour: LaserColour) -> LineColour:
+def expected_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour:
     """Return what lines do to the chroma of a typical camera, with the noise of these peaks."""
-    return LineColour(*colour.value, _RATIO_EXPECTED, float(_noise(table)))
+    return LineColour(*colour.value, _RATIO_EXPECTED, float(_noise(table)), paint=paint)
 
 
-def laser_likelihood(table: FloatArray, line: LineColour, widest_white_px: float) -> FloatArray:
+def laser_likelihood(
+    table: FloatArray, line: LineColour, widest_white_px: float, n_possible: float = np.inf
+) -> FloatArray:
     """Return how likely each peak of a frame is laser light, and not something else that is bright.
 
     Compares two explanations of a chroma step: a line moves the chroma in proportion to its height,
@@ -215,6 +250,8 @@ def laser_likelihood(table: FloatArray, line: LineColour, widest_white_px: float
     widest_white_px : float
         Overexposed peaks up to this width may be a line's white core, whatever their colour; wider
         ones are paper or a window.
+    n_possible : float
+        Peaks that the lasers can make.
 
     Returns
     -------
@@ -222,7 +259,8 @@ def laser_likelihood(table: FloatArray, line: LineColour, widest_white_px: float
         0 to 1; 0.5 where colour says nothing.
     """
     likelihood = np.empty(table.shape[1])
-    _weigh(table, *line, widest_white_px, likelihood)
+    paint = line.paint or _NO_PAINT
+    _weigh(table, *line[:6], *paint, widest_white_px, n_possible, likelihood)
     return likelihood
 
 
@@ -287,7 +325,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
         best = _best_stripes(table, u, v, sigma, tint_share)
         if best.shape[0] < _MIN_LEARNED:
             continue
-        height = table[HEIGHT][best]
+        height = _coloured_height(table[:, best])
         of_u, of_v = table[STEP_U][best] / height, table[STEP_V][best] / height
         line_u, line_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
         size = math.hypot(line_u, line_v)
@@ -300,35 +338,83 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
 
 
 @kernel
-def _learn_from_crowd(
-    table: FloatArray, u: float, v: float
-) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """Return the fields of a `LineColour` where most peaks are paint; a ratio of 0 if unknown."""
-    sigma = _noise(table)
+def _learn_paint(table: FloatArray, sigma: float) -> tuple[float, float, float, float, float, int]:
+    """Return the fields of a `Paint`, its spread across the flanks' tint, and how many are near."""
     height = table[HEIGHT]
     of_u, of_v = table[STEP_U] / height, table[STEP_V] / height
-    paint_u, paint_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
-    spread_u = max(_MAD_TO_SIGMA * element_at(np.abs(of_u - paint_u), 0.5), _LEAST_SPREAD)
-    spread_v = max(_MAD_TO_SIGMA * element_at(np.abs(of_v - paint_v), 0.5), _LEAST_SPREAD)
+    noise = sigma / element_at(height, 0.5)
+    u, v, spread_u, spread_v = 0.0, 0.0, 0.0, 0.0
+    near = np.ones(height.shape[0], np.bool_)
+    for _ in range(_ROUNDS):
+        some_u, some_v = of_u[near], of_v[near]
+        u, v = element_at(some_u, 0.5), element_at(some_v, 0.5)
+        seen_u = _MAD_TO_SIGMA * element_at(np.abs(some_u - u), 0.5)
+        seen_v = _MAD_TO_SIGMA * element_at(np.abs(some_v - v), 0.5)
+        spread_u = math.sqrt(max(seen_u**2 - noise**2, _LEAST_SPREAD**2))
+        spread_v = math.sqrt(max(seen_v**2 - noise**2, _LEAST_SPREAD**2))
+        off_u, off_v = (
+            (of_u - u) / math.hypot(spread_u, noise),
+            (of_v - v) / math.hypot(spread_v, noise),
+        )
+        near = np.hypot(off_u, off_v) < _OF_CROWD
+    tint_u, tint_v = element_at(table[TINT_U], 0.5), element_at(table[TINT_V], 0.5)
+    size = math.hypot(tint_u, tint_v)
+    across = math.hypot(spread_u, spread_v)
+    if size > _LEAST_SPREAD:
+        across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
+    return u, v, spread_u, spread_v, across, int(np.sum(near))
+
+
+@kernel
+def _learn_beside_paint(
+    table: FloatArray,
+    u: float,
+    v: float,
+    sigma: float,
+    paint_u: float,
+    paint_v: float,
+    spread_u: float,
+    spread_v: float,
+) -> tuple[float, float, float, float, float]:
+    """Return direction, ratio and spreads of what is no paint; a ratio of 0 if unknown."""
+    height = table[HEIGHT]
+    of_u, of_v = table[STEP_U] / height, table[STEP_V] / height
     off_u = (of_u - paint_u) / np.hypot(spread_u, sigma / height)
     off_v = (of_v - paint_v) / np.hypot(spread_v, sigma / height)
     is_near = u * of_u + v * of_v > _LEAST_COSINE * np.hypot(of_u, of_v)
     best = np.flatnonzero(is_near & (np.hypot(off_u, off_v) > _CLEAR_OF_PAINT))
-    nothing = (u, v, 0.0, sigma, paint_u, paint_v, spread_u, spread_v, 1.0, 1.0)
+    nothing = (u, v, 0.0, 1.0, 1.0)
     if best.shape[0] < _MIN_LEARNED:
         return nothing
-    line_u, line_v = element_at(of_u[best], 0.5), element_at(of_v[best], 0.5)
+    height = _coloured_height(table[:, best])
+    of_u, of_v = table[STEP_U][best] / height, table[STEP_V][best] / height
+    line_u, line_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
     size = math.hypot(line_u, line_v)
-    if element_at(np.hypot(of_u[best] - line_u, of_v[best] - line_v), 0.5) > _MOST_SCATTER * size:
-        return nothing
     if size > _RATIO_MOST:
         return nothing
+    if element_at(np.hypot(of_u - line_u, of_v - line_v), 0.5) > _MOST_SCATTER * size:
+        return nothing
     line_u, line_v, ratio = line_u / size, line_v / size, max(size, _RATIO_LEAST)
-    off_along = np.abs(line_u * of_u[best] + line_v * of_v[best] - size)
-    off_across = np.abs(line_v * of_u[best] - line_u * of_v[best])
+    off_along = np.abs(line_u * of_u + line_v * of_v - size)
+    off_across = np.abs(line_v * of_u - line_u * of_v)
     along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _LEAST_SCATTER)
     across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _LEAST_SCATTER)
-    return line_u, line_v, ratio, sigma, paint_u, paint_v, spread_u, spread_v, along, across
+    return line_u, line_v, ratio, along, across
+
+
+@inline_kernel
+def _colour_left(top: float) -> float:
+    """Return the share of its chroma that an overexposed line of this luma shows."""
+    return 1.0 - (1.0 - _LEFT_AT_FULL) * min(max((top - _CLIPPED) / (_FULL - _CLIPPED), 0.0), 1.0)
+
+
+@kernel
+def _coloured_height(table: FloatArray) -> FloatArray:
+    """Return the heights of peaks, as far as they show their colour."""
+    height: FloatArray = table[HEIGHT].copy()
+    for i in range(height.shape[0]):
+        height[i] *= _colour_left(table[TOP, i])
+    return height
 
 
 @kernel
@@ -347,7 +433,7 @@ def _best_stripes(
         near = u * step_u + v * step_v > _LEAST_COSINE * math.hypot(step_u, step_v)
         is_clear = size > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
         if near and is_clear and table[HEIGHT, i] >= _MIN_HEIGHT:
-            share[i] = size / table[HEIGHT, i]
+            share[i] = size / (table[HEIGHT, i] * _colour_left(table[TOP, i]))
     return np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
 
 
@@ -373,13 +459,14 @@ def _weigh(
     v: float,
     ratio: float,
     sigma: float,
+    along_spread: float,
+    across_spread: float,
     paint_u: float,
     paint_v: float,
     spread_u: float,
     spread_v: float,
-    along_spread: float,
-    across_spread: float,
     widest_white_px: float,
+    n_possible: float,
     likelihood: FloatArray,
 ) -> None:
     """Write the likelihood of each peak, given what a line shows for each level of height."""
@@ -387,7 +474,8 @@ def _weigh(
     odds, kind = np.empty(n), np.empty(n, np.int64)
     for i in range(n):
         height = table[HEIGHT, i]
-        line = ratio * height
+        full = ratio * height
+        line = full * _colour_left(table[TOP, i])
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         size = math.sqrt(step_u**2 + step_v**2)
         # A step is the largest of three, so that noise alone has one.
@@ -400,12 +488,14 @@ def _weigh(
         along, across = u * step_u + v * step_v, v * step_u - u * step_v
         # More of the colour than expected is no evidence against a line.
         off_line = min(along - line, 0.0)
-        var_along = sigma**2 + (along_spread * line) ** 2
-        var_across = sigma**2 + (across_spread * line) ** 2
+        var_along = sigma**2 + (along_spread * full) ** 2
+        var_across = sigma**2 + (across_spread * full) ** 2
         if spread_u > 0.0:
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
-            off_paint = off_u**2 / (sigma**2 + (spread_u * height) ** 2)
-            off_paint += off_v**2 / (sigma**2 + (spread_v * height) ** 2)
+            var_u, var_v = sigma**2 + (spread_u * height) ** 2, sigma**2 + (spread_v * height) ** 2
+            # The narrower of two explanations says more where both hold.
+            off_paint = off_u**2 / var_u + off_v**2 / var_v
+            off_paint -= math.log(var_along * var_across / (var_u * var_v))
         else:
             beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
             off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
@@ -423,7 +513,8 @@ def _weigh(
             likelihood[i] = prior * odds[i] / (prior * odds[i] + 1.0 - prior)
             lines[kind[i]] += likelihood[i]
             peaks[kind[i]] += 1.0
-        share = lines / peaks
+        # The lasers make no more than they can.
+        share = lines / peaks * min(n_possible / np.sum(lines), 1.0)
     for i in range(n):
         if table[TOP, i] >= _WHITE and table[WIDTH, i] <= widest_white_px:
             likelihood[i] = max(likelihood[i], 0.5)

@@ -64,7 +64,7 @@ class StripeOptions:
 
     min_contrast: int = 6
     reach_share: float = 0.045
-    min_likelihood: float = 0.3
+    min_likelihood: float = 0.1
     min_share: float = 0.25
     max_returns: int = 16384
 

@@ -205,18 +205,12 @@ def find_pieces(frame: Frame, search: StripeSearch) -> Pieces:
 def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     n_lines, length = light.shape
     reach_px = max(_LEAST_REACH, round(_REACH_SHARE * width_px))
-    finder = PeakFinder(
-        length,
-        search.lowest,
-        search.highest,
-        reach_px,
-        np.array([search.colour.value]),
-    )
+    directions = np.array([search.colour.value])
+    finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
-    levels = np.rint(light).astype(np.uint8)
+    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px)
     most = _PEAKS_PER_LINE * n_lines
     line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
-    image = SearchImage(levels, grey, grey, search.line_px)
     n = finder.find(image, _MIN_CONTRAST, 1, line, table)
     line, table = line[:n], table[:, :n]
     position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]
@@ -451,11 +445,15 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
 
 def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
     """Return the length (P,) of each piece with all pieces that go on where another ends."""
+    if table.shape[1] == 0:
+        return np.zeros(0)
     ends = _ends(table)
-    linked = np.array([_goes_on(one, ends, width_px) for one in ends]).reshape(len(ends), -1)
+    linked = np.zeros((len(ends), len(ends)), bool)
+    for k, one in enumerate(ends):
+        linked[k] = _goes_on(one, ends, width_px)
     linked |= linked.T | np.eye(len(ends), dtype=bool)
     _, row = connected_components(csr_array(linked), directed=False)
-    return np.bincount(row, table[LENGTH], len(ends)).astype(np.float64)[row]
+    return np.asarray(np.bincount(row, table[LENGTH])[row], np.float64)
 
 
 def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:

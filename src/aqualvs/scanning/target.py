@@ -57,7 +57,8 @@ def choose_target(
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.voice for surface in surfaces), default=0.0)
     lines = max((surface.n_lines for surface in surfaces), default=0)
-    reach = max((surface.extent for surface in surfaces), default=0.0)
+    # Unbroken stripes have no extent, but reach over as many search lines as they have.
+    reach = max((max(surface.extent, surface.n_lines) for surface in surfaces), default=0.0)
     meshes = [
         one
         for one in surfaces

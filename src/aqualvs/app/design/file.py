@@ -49,8 +49,12 @@ _N_AIR = 1.0003
 _MM = 1e-3
 
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
-_Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
-_Pixels = Annotated[int, Field(gt=0)]
+# A hundred metres, and the pictures of the largest cameras: beyond them numbers are slips.
+_MOST_MM, _MOST_PX = 1e5, 32_768
+_Place = Annotated[float, Field(ge=-_MOST_MM, le=_MOST_MM, allow_inf_nan=False)]
+_Length = Annotated[float, Field(gt=0.0, le=_MOST_MM, allow_inf_nan=False)]
+_Triple = Annotated[list[_Place], Field(min_length=3, max_length=3)]
+_Pixels = Annotated[int, Field(gt=0, le=_MOST_PX)]
 _Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
 _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
 
@@ -68,8 +72,8 @@ class CameraPart(Part):
 class DomePart(Part):
     """`dome`."""
 
-    inner_radius_mm: Positive
-    thickness_mm: NotNegative
+    inner_radius_mm: _Length
+    thickness_mm: Annotated[float, Field(ge=0.0, le=_MOST_MM, allow_inf_nan=False)]
     n_acrylic: _Index = 1.49
 
 
@@ -92,8 +96,8 @@ class LasersPart(Part):
     """`lasers`: evenly round the dome."""
 
     count: Annotated[int, Field(ge=1, le=8)] = 3
-    baseline_mm: Positive
-    back_mm: Number = 0.0
+    baseline_mm: _Length
+    back_mm: _Place = 0.0
     fan_deg: _Fan = FAN_DEG
     turn_stripes: bool = False
 
@@ -111,8 +115,8 @@ class MountPart(Part):
 class NetPart(Part):
     """`net`."""
 
-    bar_mm: Positive = 15.0
-    twine_mm: Positive = 2.5
+    bar_mm: _Length = 15.0
+    twine_mm: _Length = 2.5
 
 
 class NoisePart(Part):
@@ -156,7 +160,7 @@ class DesignFile(Part):
     water: WaterPart = WaterPart(n=1.3345)
     lasers: LasersPart | None = None
     mounts: Annotated[list[MountPart], Field(min_length=1)] | None = None
-    working_range_mm: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    working_range_mm: Annotated[list[_Length], Field(min_length=2, max_length=2)]
     net: NetPart = NetPart()
     noise: NoisePart = NoisePart()
     tolerances: TolerancesPart = TolerancesPart()

@@ -9,6 +9,7 @@ from pathlib import Path
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.datagrams import UdpAddress
 from aqualvs.live.sources.h264 import START_CODE
+from aqualvs.special_files import refuse_special
 
 _MAX_BYTES = 64 << 10
 
@@ -46,6 +47,7 @@ def read_sdp(path: Path) -> SdpVideo:
     SourceError
         If the file cannot be read or announces no video over RTP and UDP.
     """
+    refuse_special(path)
     try:
         text = path.read_bytes()[:_MAX_BYTES].decode("utf-8", "replace")
     except OSError as fault:

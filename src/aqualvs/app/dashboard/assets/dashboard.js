@@ -138,7 +138,7 @@ function numbers(stale) {
   $("sigma-pitch").textContent = valid ? `± ${Number(posture.sigma_pitch_total_deg).toFixed(2)}°` : "";
   const words = stale ? "no news from the system" : state.detail || posture.reason;
   $("reason").textContent = valid ? "" : `No posture: ${words}`;
-  const dead = stale || posture.reason === "no_frames";
+  const dead = stale || posture.reason === "no_frames" || posture.reason === "frozen";
   document.body.dataset.dead = dead ? "1" : "0";
   $("veil").hidden = !dead;
   $("veil").textContent = dead ? words : "";
