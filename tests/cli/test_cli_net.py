@@ -252,7 +252,7 @@ def test_an_older_or_broken_run_is_told_in_one_line(run_folder, tmp_path, refuse
     out = tmp_path / "out"
     assert "holds no rig" in refused("net", run_folder, "-o", out)
     (run_folder / "run.yaml").unlink()
-    assert "run.yaml: cannot be read" in refused("net", run_folder, "-o", out)
+    assert "run.yaml: no such file" in refused("net", run_folder, "-o", out)
     path = run_folder / "points.parquet"
     table = parquet.read_table(path)
     parquet.write_table(table.drop_columns(["intensity", "width_px"]), path)

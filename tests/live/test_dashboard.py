@@ -420,8 +420,7 @@ def test_one_address_holds_few_connections_without_a_greeting(bench: Bench) -> N
         with contextlib.suppress(ConnectionResetError):
             assert first.recv(1) == b""
         # Whoever has greeted stays.
-        bench.play()
-        assert state_of(page)["posture"]["valid"] == "1"
+        assert bench.shown(page)["posture"]["valid"] == "1"
 
 
 def test_who_never_asks_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -486,5 +485,4 @@ def test_a_page_with_the_token_takes_the_place_of_one_without(bench: Bench) -> N
             receive_until_closed(pages[0])
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.reason == "a page with the token took this place"
-        bench.play()
-        assert state_of(pages[1])["posture"]["valid"] == "1"
+        assert bench.shown(pages[1])["posture"]["valid"] == "1"

@@ -118,6 +118,12 @@ def samples():
     return demo_samples(8)
 
 
+def is_watched(output, n):
+    """Whether so many viewers have subscribed, each to every topic."""
+    n_subscriptions = sum(output._viewers._watched.values())
+    return f"{n} watching" in output.health().detail and n_subscriptions == n * len(TOPICS)
+
+
 def answer(process):
     text, _ = process.communicate(timeout=PATIENCE_S)
     return json.loads(text)
@@ -131,7 +137,7 @@ def test_a_viewer_sees_what_was_sent(output, watch, samples):
         output.send(sample)
     assert "nobody watches" in output.health().detail
     viewer = watch(output.port, 6)
-    until(lambda: "1 watching" in output.health().detail)
+    until(lambda: is_watched(output, 1), "a viewer of every topic")
     for sample in samples[2:]:
         output.send(sample)
     told = answer(viewer)
@@ -173,7 +179,7 @@ def test_a_refusal_is_shown_too(output, watch, samples):
     silent = Refusal(Reason.NO_FRAMES, "no picture for 0.2 s")
     scan = replace(samples[0].scan, posture=silent, points=ScanPoints.none())
     viewer = watch(output.port, 1)
-    until(lambda: "1 watching" in output.health().detail)
+    until(lambda: is_watched(output, 1), "a viewer of every topic")
     output.send(replace(samples[0], scan=scan, returns={}, frame=None))
     told = answer(viewer)
     assert not told["found"]["posture"]["valid"]
@@ -183,7 +189,7 @@ def test_a_refusal_is_shown_too(output, watch, samples):
 
 def test_a_viewer_that_vanishes_disturbs_nobody(output, watch, samples):
     gone, stays = watch(output.port, 1000), watch(output.port, 8)
-    until(lambda: "2 watching" in output.health().detail)
+    until(lambda: is_watched(output, 2), "two viewers of every topic")
     gone.kill()
     for sample in samples:
         output.send(sample)

@@ -25,9 +25,11 @@ _BALANCE_S, _BALANCED_S = 4.0, 10.0
 _SLOPE_S = 0.3
 # Means over parts of the window do not differ by more where a posture stands still: as share of the
 # range, in radians; and how many parts there are.
-_STILL_RANGE, _STILL_YAW, _N_MEANS = 0.01, math.radians(0.6), 6
+_STILL_RANGE, _STILL_YAW, _N_MEANS = 0.006, math.radians(0.6), 6
 # Efforts towards the target must have lasted so long, in seconds.
 _PUSHED_S = 0.5
+# The range must lie so far beyond the one asked for, in metres.
+_OFF = 0.05
 # Between two reports of a heading; more is a compass that was set anew.
 _GREATEST_TURN = math.radians(20.0)
 
@@ -48,7 +50,7 @@ class AnswerLimits:
         Efforts and motion are compared over so many seconds.
     promised : float
         Way towards the target by the efforts, in metres, that a posture which stands still must
-        answer to. Standing still is 1 % of the range and 0.6 degrees: waters that take so much
+        answer to. Standing still is 0.6 % of the range and 0.6 degrees: waters that take so much
         from the efforts move the vehicle by more.
     turned : float
         Turn of the heading within `window_s` that a yaw which stands still must answer to, in
@@ -59,7 +61,7 @@ class AnswerLimits:
     repeats_s: float = 0.2
     quiet: float = 0.1
     window_s: float = 1.7
-    promised: float = 0.4
+    promised: float = 0.45
     turned: float = math.radians(8.0)
 
     def __post_init__(self) -> None:
@@ -125,12 +127,13 @@ class AnswerWatch:
         self._now_s = math.nan
         self._effort = NEUTRAL
         self._balance, self._thrust_s = 0.0, 0.0
-        self._backed_s = -math.inf
+        self._backed_s, self._wanted = -math.inf, math.inf
         self._speed = self._way = 0.0
         self._heading, self._told = 0.0, math.nan
 
-    def done(self, now_s: float, effort: Effort) -> None:
-        """Take in which effort was sent."""
+    def done(self, now_s: float, effort: Effort, wanted: float | None = None) -> None:
+        """Take in which effort was sent, and for which range in metres."""
+        self._wanted = math.inf if wanted is None else wanted
         if effort != NEUTRAL:
             self._pushed_s = now_s
         self._effort = effort
@@ -174,8 +177,9 @@ class AnswerWatch:
             self._moments.clear()
             self._told = math.nan
             step = 0.0
-        forward, right = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
-        push = (forward * math.cos(yaw) + right * math.sin(yaw)) / self._vehicle.mass
+        # Thrust to the side is for the drag of a way along the target, and promises nothing.
+        forward, _ = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
+        push = forward * math.cos(yaw) / self._vehicle.mass
         if push <= 0.0:
             self._backed_s = now_s
         if self._effort != NEUTRAL and step > 0.0:
@@ -201,6 +205,8 @@ class AnswerWatch:
         promised = last.way - begin.way + (before - begin.speed) * span
         turned = abs(last.heading - begin.heading)
         pushed = last.time_s - self._backed_s > _PUSHED_S and self._thrust_s > _BALANCED_S
+        # Near its setpoint the vehicle leans on the water as that changes.
+        pushed = pushed and last.range - self._wanted > _OFF
         promises = promised > self.limits.promised and pushed
         if not promises and turned < self.limits.turned:
             return False

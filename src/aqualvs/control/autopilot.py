@@ -145,7 +145,8 @@ class NetPilot:
             range_rate=None if filtered is None else filtered.range_rate,
             doubt=self._doubt,
         )
-        self._watch.done(now_s, effort)
+        wanted = None if guidance.setpoint is None else guidance.setpoint.range
+        self._watch.done(now_s, effort, wanted)
         self._settle(asked, effort, reason)
         reason = self._end(guidance) or reason or _mission_says(guidance)
         return Decision(effort, reason, guidance, self.engaged)

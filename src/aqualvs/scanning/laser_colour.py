@@ -250,6 +250,8 @@ def laser_likelihood(
     widest_white_px : float
         Overexposed peaks up to this width may be a line's white core, whatever their colour; wider
         ones are paper or a window.
+    n_possible : float
+        Peaks that the lasers can make.
 
     Returns
     -------
@@ -257,8 +259,8 @@ def laser_likelihood(
         0 to 1; 0.5 where colour says nothing.
     """
     likelihood = np.empty(table.shape[1])
-    *about_lines, paint = line
-    _weigh(table, *about_lines, *(paint or _NO_PAINT), widest_white_px, n_possible, likelihood)
+    paint = line.paint or _NO_PAINT
+    _weigh(table, *line[:6], *paint, widest_white_px, n_possible, likelihood)
     return likelihood
 
 
@@ -360,7 +362,7 @@ def _learn_paint(table: FloatArray, sigma: float) -> tuple[float, float, float, 
     across = math.hypot(spread_u, spread_v)
     if size > _LEAST_SPREAD:
         across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
-    return u, v, spread_u, spread_v, across, np.count_nonzero(near)
+    return u, v, spread_u, spread_v, across, int(np.sum(near))
 
 
 @kernel
@@ -409,7 +411,7 @@ def _colour_left(top: float) -> float:
 @kernel
 def _coloured_height(table: FloatArray) -> FloatArray:
     """Return the heights of peaks, as far as they show their colour."""
-    height = table[HEIGHT].copy()
+    height: FloatArray = table[HEIGHT].copy()
     for i in range(height.shape[0]):
         height[i] *= _colour_left(table[TOP, i])
     return height
