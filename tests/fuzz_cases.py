@@ -97,6 +97,9 @@ def _run_and_leave(case: Case, folder: Path, out: Path, err: Path) -> None:
         os.setsid()
         os.chdir(folder)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        # As in the program; a test runner makes errors of warnings.
+        warnings.resetwarnings()
+        warnings.simplefilter("ignore", DeprecationWarning)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
         resource.setrlimit(resource.RLIMIT_AS, (_ADDRESSES_BYTES, _ADDRESSES_BYTES))
