@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from aqualvs.app.overwriting import RECORD, Claim
 from aqualvs.app.progress import hidden_progress, progress
 from aqualvs.app.reproduce import catalogue, records
 from aqualvs.app.reproduce.command import ReproduceRequest, reproduce
@@ -115,15 +116,26 @@ def test_later_run_keeps_other_results_of_the_same_version_only(tmp_path, monkey
     content = results(tmp_path)
     content["sources"] = "another version"
     (tmp_path / "results.json").write_text(json.dumps(content))
+    # Versions before this one kept no record of what they wrote.
+    (tmp_path / RECORD).unlink()
     run(tmp_path, "rig")
     assert named(tmp_path) == ["rig"]
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"sources": 3}', "\x00"])
 def test_results_that_cannot_be_read_are_written_anew(tmp_path, content):
+    # As a run leaves it that is killed while it writes.
+    Claim("reproduce", [tmp_path / "results.json"], overwrite=True)
     (tmp_path / "results.json").write_text(content)
     assert run(tmp_path, "rig")[0] == 0
     assert named(tmp_path) == ["rig"]
+
+
+def test_results_of_something_else_are_left_alone(tmp_path):
+    (tmp_path / "results.json").write_text("mine")
+    with pytest.raises(OutputError, match="did not write it"):
+        run(tmp_path, "rig")
+    assert (tmp_path / "results.json").read_text() == "mine"
 
 
 def test_missed_bar_is_said_and_counted(tmp_path):

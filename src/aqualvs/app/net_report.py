@@ -236,11 +236,12 @@ def _number(row: Row, name: str) -> float | None:
 
 
 def _rows(path: Path) -> list[Row]:
-    try:
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            return [row for row in csv.DictReader(file) if None not in row.values()]
-    except csv.Error:
-        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    # A damaged table may have lost a hole: better no table than one of fewer holes.
+    if any(None in row or None in row.values() for row in rows):
+        raise csv.Error("rows differ in length")
+    return rows
 
 
 def _facts(path: Path) -> Mapping[str, Any]:
