@@ -13,7 +13,9 @@ from aqualvs.app.follow_fast_eye import Blind, Loss, PostureNoise, SampledEye
 from aqualvs.app.follow_sim import SimulatedLoop, Timing
 from aqualvs.app.follow_sim_case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.app.follow_sim_log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
+from aqualvs.control.answer import AnswerLimits
 from aqualvs.control.mission import HoldMission
+from aqualvs.control.safety import Reason as GateReason
 from aqualvs.control.setpoint import Setpoint
 from aqualvs.control.vehicle import Effort
 from aqualvs.errors import OptionError
@@ -64,14 +66,15 @@ def test_eye_loses_target_and_stream_when_told_to() -> None:
 
 
 def test_no_effort_comes_before_the_first_frame_has_arrived() -> None:
-    case = replace(ROUGH, timing=Timing(delay=0.15))
+    # Too far away by so much that the dead band is crossed at once.
+    case = replace(ROUGH, timing=Timing(delay=0.15), start_range=0.7)
     log = loop_of(case).run(1.0)
     thrust = [row.time_s for row in log.rows if row.forward != 0.0]
     # The first frame is exposed at 0; the effort shows in the first row after 0.15 s.
     assert 0.15 <= thrust[0] <= 0.15 + 2.0 / 25.0
 
 
-@pytest.mark.parametrize("loss", list(Loss))
+@pytest.mark.parametrize("loss", [Loss.TARGET, Loss.STREAM])
 def test_thrust_ends_in_time_when_sight_is_lost(loss: Loss) -> None:
     blind = (Blind(6.0, 7.0, loss), Blind(9.0, 9.5, loss))
     log = loop_of(ROUGH, blind).run(12.0)
@@ -84,6 +87,24 @@ def test_thrust_ends_in_time_when_sight_is_lost(loss: Loss) -> None:
         assert dark
         assert all(row.forward == row.right == row.turn == 0.0 for row in dark)
     # It comes back by itself.
+    assert log.rows[-1].forward != 0.0
+
+
+def test_thrust_ends_in_time_when_the_picture_stands_still() -> None:
+    """Its postures are valid to the scanner: the log counts no stretch without one."""
+    blind = (Blind(6.0, 7.0, Loss.FROZEN), Blind(9.0, 9.5, Loss.FROZEN))
+    log = loop_of(ROUGH, blind).run(12.0)
+    assert log.n_blind == 0
+    delay, frame = ROUGH.timing.delay, 1.0 / ROUGH.timing.fps
+    for start, end in ((6.0, 7.0), (9.0, 9.5)):
+        # The first that repeats is of the frame before; the effort shows in the next row.
+        late = start - frame + delay + AnswerLimits().repeats_s + 2.0 * frame
+        dark = [row for row in log.rows if late <= row.time_s < end + delay]
+        assert dark
+        assert all(row.forward == row.right == row.turn == 0.0 for row in dark)
+        assert {row.reason for row in dark if row.time_s < end} == {GateReason.FROZEN.value}
+        # There was thrust to end.
+        assert any(row.forward != 0.0 for row in log.rows if start <= row.time_s < late)
     assert log.rows[-1].forward != 0.0
 
 
