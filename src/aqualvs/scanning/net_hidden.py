@@ -15,6 +15,10 @@ from aqualvs.scanning.scan import Label, ScanPoints
 # Labels of things, at the net's plane or before it; clutter at the plane may be the net's own. A
 # point that several lasers could have made may be none.
 _THINGS = (Label.SOLID, Label.FISH, Label.BUBBLE)
+# Light of less quality (the root of its height, as a share of the frame's best, and its likelihood)
+# is too likely no laser's to hide the net: in a hole nothing else lights up, and it would keep the
+# hole from being looked at. Half as high as the best, that is a likelihood of 0.18.
+_LEAST_QUALITY = 0.3
 # Pieces of light are on one thing where no more than so many search lines are between them, and
 # no more than so many pixels along these, and as many more for each. One with this much light is no
 # bubble or speck.
@@ -95,6 +99,7 @@ def hidden_lines(
     hidden = np.zeros(lines.along.shape, np.bool_)
     before = (points.label == Label.CLUTTER) & (in_net[:, 2] > off)
     before |= np.isin(points.label, _THINGS) & (in_net[:, 2] > -off)
+    before &= points.quality >= _LEAST_QUALITY
     index = np.flatnonzero(before)
     index = index[np.lexsort((row[index], points.laser[index]))]
     laser = points.laser[index].astype(np.int64)
