@@ -237,7 +237,7 @@ def _number(row: Row, name: str) -> float | None:
 
 def _rows(path: Path) -> list[Row]:
     with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        rows: list[Row] = list(csv.DictReader(file))
     # A damaged table may have lost a hole: better no table than one of fewer holes.
     if any(None in row or None in row.values() for row in rows):
         raise csv.Error("rows differ in length")
