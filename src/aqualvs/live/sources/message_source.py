@@ -15,6 +15,9 @@ from aqualvs.live.sources.packets import packet_with
 from aqualvs.live.sources.planes import planes_of
 from aqualvs.scanning.scan import Frame, Planes
 
+MAX_BYTES = 1 << 27
+"""Size of a chunk or message when unpacked; an RGB picture of 40 megapixels takes 120 MB."""
+
 Logged: TypeAlias = tuple[int, ImageMessage | None]
 """Time of the log in nanoseconds, and the image; None for a message that cannot be read."""
 

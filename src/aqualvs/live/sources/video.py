@@ -187,6 +187,8 @@ def _open(where: str) -> InputContainer:
         raise SourceError(f"{where}: no such file; check the path") from fault
     except (av.error.InvalidDataError, av.error.EOFError) as fault:
         raise SourceError(_not_a_video(where)) from fault
+    except av.error.ExitError as fault:
+        raise SourceError(f"{where}: nothing came in {_STALL_S:g} s; is the sender on?") from fault
     except (av.error.FFmpegError, OSError) as fault:
         raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
 
