@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import json
+import os
 import struct
 from fractions import Fraction
 
@@ -232,6 +233,24 @@ def test_images_of_a_bag_of_ros_2(tmp_path, plugin):
     check(open_source(folder))
     file = next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
     check(open_source(file))
+
+
+def test_a_bag_whose_metadata_count_nothing_is_refused_in_one_line(tmp_path):
+    folder = bag2(tmp_path / "dive", rosbag2.StoragePlugin.SQLITE3)
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 6", "message_count: null"))
+    with pytest.raises(SourceError, match="count of a topic") as fault:
+        open_source(folder)
+    assert str(folder) in str(fault.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_pipe_in_the_place_of_a_bags_file_is_not_waited_for(tmp_path):
+    folder = bag2(tmp_path / "dive", rosbag2.StoragePlugin.SQLITE3)
+    (folder / "dive.db3").unlink()
+    os.mkfifo(folder / "dive.db3")
+    with pytest.raises(SourceError, match="is a pipe"):
+        open_source(folder)
 
 
 SQLITE, MCAP = rosbag2.StoragePlugin.SQLITE3, rosbag2.StoragePlugin.MCAP

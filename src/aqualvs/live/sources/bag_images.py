@@ -20,9 +20,11 @@ from aqualvs.live.sources.message_source import (
     Topic,
     choose_topic,
 )
+from aqualvs.special_files import refuse_special
 
 # Room that is left on the disk where bags are unpacked that are packed as whole files.
 _FREE_BYTES = 1 << 30
+_REMEDY = "check it with ros2 bag info or rosbag reindex"
 
 
 def open_bag(path: Path, topic: str | None = None) -> MessageSource:
@@ -58,6 +60,8 @@ def open_bag(path: Path, topic: str | None = None) -> MessageSource:
             f"{path}: its metadata.yaml is missing; make it with ros2 bag reindex, "
             "and give the folder"
         )
+    for one in folder.iterdir() if folder.is_dir() else ():
+        refuse_special(one)
     chosen = choose_topic(str(path), _image_topics(folder), topic)
 
     def messages() -> Iterator[Logged]:
@@ -105,11 +109,14 @@ def _opened(path: Path) -> Iterator[Any]:
         reader = AnyReader([path], default_typestore=store)
         reader.open()
     except Exception as fault:
-        raise SourceError(
-            f"{path}: no ROS bag, or damaged ({_words(fault)}); check it with ros2 bag info "
-            "or rosbag reindex"
-        ) from fault
+        raise SourceError(f"{path}: no ROS bag, or damaged ({_words(fault)}); {_REMEDY}") from fault
     with contextlib.closing(reader):
+        # Metadata are passed on as they are.
+        if not all(
+            isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int)
+            for c in reader.connections
+        ):
+            raise SourceError(f"{path}: damaged (no name, type or count of a topic); {_REMEDY}")
         yield reader
 
 
