@@ -198,7 +198,7 @@ def run(
         comparison=folder.comparison(request),
         fault=fault,
     )
-    claim.settle()
+    claim.close()
     return result
 
 
