@@ -52,6 +52,10 @@ def test_a_missing_file_and_another_size_are_told(tmp_path: Path) -> None:
     assert "none.mp4" in told(DoctorRequest(source=str(tmp_path / "none.mp4")), fault="none.mp4")
 
 
+def test_a_rig_is_read_also_where_nothing_is_to_fit_it(tmp_path: Path) -> None:
+    told(DoctorRequest(rig=tmp_path / "none.yaml"), fault="none.yaml: no such file")
+
+
 def test_a_package_that_is_missing_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_installed", lambda name: name != "cyclonedds")
     text = told(DoctorRequest())

@@ -73,6 +73,8 @@ def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
     console = console or Console()
     console.print(f"aqualvs {__version__}", style="bold", highlight=False)
     looks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
+    if request.rig is not None:
+        looks.append(lambda: _rig_file(Path(str(request.rig))))
     if request.source is not None:
         looks.append(lambda: _stream(str(request.source), request.rig))
     if request.mavlink is not None:
@@ -156,6 +158,12 @@ def _speed(rig: Rig, frames: list[Frame]) -> Finding:
     if middle > 0.5 / _FRAME_RATE:
         return Finding(Severity.WARN, f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
     return Finding(Severity.OK, words)
+
+
+def _rig_file(path: Path) -> Iterator[Finding]:
+    rig = load_rig(path)
+    size = "x".join(map(str, rig.size_px))
+    yield Finding(Severity.OK, f"rig {rig.name!r}: {size} px, lasers: {len(rig.lasers)}")
 
 
 def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
