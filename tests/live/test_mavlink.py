@@ -6,7 +6,6 @@ import json
 import os
 import queue
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -26,6 +25,7 @@ from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from live_cases import first_sample
+from ports import free_port
 from waiting import PATIENCE_S, until
 
 pytest.importorskip("pymavlink")
@@ -153,12 +153,6 @@ def stream(output: MavlinkOutput, condition: Callable[[], object], what: str) ->
 
     until(sent, what)
     return took
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_the_autopilot_gets_what_was_measured(lab: Lab) -> None:

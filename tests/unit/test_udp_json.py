@@ -28,6 +28,7 @@ from aqualvs.live.sample import LiveSample
 from aqualvs.live.time_filter import FilteredPosture
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from live_cases import first_sample
+from ports import free_port
 from waiting import PATIENCE_S, until
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "json.md"
@@ -287,9 +288,7 @@ def test_the_documented_receiver_works(tmp_path: Path) -> None:
     example = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert example is not None
     assert len(example[1].strip().splitlines()) == 6
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     script = tmp_path / "receive.py"
     assert "14660" in example[1]
     script.write_text(example[1].replace("14660", str(port)))
