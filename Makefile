@@ -22,6 +22,7 @@ demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
 # what xdist would go by, files of few and long tests would be left to the end.
 test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one folder (PART=cli)
 	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
+	  --durations=30 --durations-min=5 \
 	  $(if $(PART),tests/$(PART))
 
 fuzz: $(STAMP) ## Try 2,000 malformed files and options (SEED=1 CASES=2000); lists what is not refused
