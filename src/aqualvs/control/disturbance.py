@@ -30,6 +30,11 @@ class SwellFilter:
         """Forget everything."""
         self._output = self._sum = 0.0
 
+    def fade(self, kept: float) -> None:
+        """Forget all but a share of what swings."""
+        self._output *= kept
+        self._sum *= kept
+
     def update(self, step: float, value: float) -> float:
         """Return what of `value` swings; unchanged if `step` seconds are not positive.
 
