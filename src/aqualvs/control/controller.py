@@ -218,7 +218,7 @@ class RangeYawController:
         ahead = (mending - ramp.rate - aside) / c
         asked, found = (mending - ramp.seen_rate) / c, -rate / c
         turns = self._turns(step)
-        swing = self._swell.update(0.0 if turns else step, asked - found)
+        swing = self._swell.update(step, asked - found) * (not turns)
         push, schedule = self._against_drag(ahead)
         push += schedule[0] * self._swing_gain * swing - ramp.change / c
         force = vehicle.mass * self._speed.update(
@@ -231,18 +231,17 @@ class RangeYawController:
         return force, vehicle.right_drag.force(side)
 
     def _turns(self, step: float) -> bool:
-        """Return whether thrust goes to and fro about nothing; then integral and swell fade.
+        """Return whether thrust goes to and fro about nothing; then the integral fades.
 
         In the dead band's hysteresis the loop's gain is low, and with an integral a loop is stable
-        above some gain only: it would swing by itself for ever. Where thrust changes its side no
-        force is needed that an integral had to know.
+        above some gain only: it would swing by itself for ever. Where thrust changes its side, and
+        no swell is met, no force is needed that an integral had to know.
         """
-        small = abs(self._speed.integral) < self._least
+        swell = self._swing_gain * self._swell.amplitude
+        small = max(abs(self._speed.integral), swell) < self._least
         if not (small and all(pair.turns for pair in self._pairs)):
             return False
-        kept = math.exp(-max(step, 0.0) / _FORGETS_S)
-        self._speed.fade(kept)
-        self._swell.fade(kept)
+        self._speed.fade(math.exp(-max(step, 0.0) / _FORGETS_S))
         return True
 
     def _mending(self, range: float) -> float:

@@ -30,10 +30,10 @@ class SwellFilter:
         """Forget everything."""
         self._output = self._sum = 0.0
 
-    def fade(self, kept: float) -> None:
-        """Forget all but a share of what swings."""
-        self._output *= kept
-        self._sum *= kept
+    @property
+    def amplitude(self) -> float:
+        """Of what swings now."""
+        return math.hypot(self._output, self._sum)
 
     def update(self, step: float, value: float) -> float:
         """Return what of `value` swings; unchanged if `step` seconds are not positive.
