@@ -45,21 +45,6 @@ def test_search_lines_are_those_of_plain_numpy(
 
 
 @pytest.mark.parametrize("axis", list(SearchAxis))
-@pytest.mark.parametrize("size", [(64, 48), (33, 31)])
-def test_chroma_is_turned_as_the_search_lines_are(axis: SearchAxis, size: tuple[int, int]) -> None:
-    width, height = size
-    rng = np.random.default_rng(1)
-    # As planar and as semi-planar decoders deliver it.
-    uv = rng.integers(0, 256, (-(-height // 2), -(-width // 2), 2), dtype=np.uint8)
-    lines = SearchLines(size, axis, 1)
-    for u, v in ((uv[..., 0], uv[..., 1]), (uv[..., 0].copy(), uv[..., 1].copy())):
-        found = lines.chroma_of((u, v))
-        for plane, turned in zip((u, v), found, strict=True):
-            np.testing.assert_array_equal(turned, plane if axis is SearchAxis.ALONG_X else plane.T)
-    assert all(plane.size == 0 for plane in lines.chroma_of(None))
-
-
-@pytest.mark.parametrize("axis", list(SearchAxis))
 def test_a_border_is_as_bright_as_its_neighbour(axis: SearchAxis) -> None:
     flat = np.full((40, 60), 201, np.uint8)
     found = SearchLines((60, 40), axis, 2).of(flat)

@@ -8,8 +8,6 @@ from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import U8Array
 
-_NO_CHROMA = np.empty((0, 0), np.uint8)
-
 
 class SearchLines:
     """Makes the search lines of pictures of one size, as rows; allocates once.
@@ -34,8 +32,6 @@ class SearchLines:
         self._pairs = np.empty(shape, np.uint8)
         self._turned = np.empty(shape[::-1], np.uint8)
         self._totals = np.empty((3, shape[1]), np.uint16)
-        half = -(-height // 2), -(-width // 2)
-        self._chroma = np.empty((2, *(half if self._along_x else half[::-1])), np.uint8)
 
     def of(self, luma: U8Array) -> U8Array:
         """Return the search lines of a picture.
@@ -55,39 +51,6 @@ class SearchLines:
             lines = self._pairs
             (_pair_rows if self._along_x else _pair_columns)(luma, self._totals, lines)
         return lines if self._along_x else np.asarray(cv2.transpose(lines, self._turned), np.uint8)
-
-    def chroma_of(self, chroma: tuple[U8Array, U8Array] | None) -> tuple[U8Array, U8Array]:
-        """Return U and V turned as the search lines are, at their own resolution.
-
-        Parameters
-        ----------
-        chroma : (uint8 array, uint8 array) or None
-            As in `Frame`.
-
-        Returns
-        -------
-        u, v : uint8 array, shape (ceil(n_lines * line_px / 2), ceil(length / 2))
-            Overwritten by the next call; the planes themselves where those are the same; of shape
-            (0, 0) for a grey source.
-        """
-        if chroma is None:
-            return _NO_CHROMA, _NO_CHROMA
-        u, v = (self._turn(plane, out) for plane, out in zip(chroma, self._chroma, strict=True))
-        return u, v
-
-    def _turn(self, plane: U8Array, out: U8Array) -> U8Array:
-        if not self._along_x:
-            cv2.transpose(plane, out)
-        elif is_plain(plane):
-            return plane
-        else:
-            np.copyto(out, plane)
-        return out
-
-
-def is_plain(plane: U8Array) -> bool:
-    """Tell whether kernels take a plane as it is: they are compiled for one layout in memory."""
-    return plane.flags.carray
 
 
 @kernel

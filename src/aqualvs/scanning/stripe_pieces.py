@@ -208,7 +208,7 @@ def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     directions = np.array([search.colour.value])
     finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
-    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px)
+    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px, along_x=False)
     most = _PEAKS_PER_LINE * n_lines
     line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
     n = finder.find(image, _MIN_CONTRAST, 1, line, table)
