@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
@@ -45,7 +46,7 @@ _OF_CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 2.5, 4.0, 1.4826
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least and the most that is believed of a learned one, and how far paint
 # and glare spread about none. Lines of nine cameras show 0.15 to 0.7.
-_RATIO_EXPECTED, _RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
+RATIO_EXPECTED, RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
 # One frame's lines spread about their ratio by this share, and by the second one across their
 # direction: overexposed ones show less and differ in hue, faint ones more.
 _RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
@@ -64,7 +65,7 @@ _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
 # looked at.
 _FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
 # A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
-_WHITE = 225.0
+WHITE = 225.0
 # Luma from which on a channel may be clipped, and full scale, where lines show the last share of
 # their chroma: measured on rendered stripes, whose middle or edge counts.
 _CLIPPED, _FULL, _LEFT_AT_FULL = 185.0, 235.0, 0.33
@@ -122,13 +123,20 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     """
     if colour is LaserColour.GREEN or frame.chroma is None:
         return frame.luma
-    height, width = frame.luma.shape
-    half = frame.chroma[1 if colour is LaserColour.RED else 0].astype(np.float32)
-    full = cv2.resize(half, (2 * half.shape[1], 2 * half.shape[0]), interpolation=cv2.INTER_LINEAR)
-    weight = _RED_OF_V if colour is LaserColour.RED else _BLUE_OF_U
-    mixed = frame.luma + weight * (full[:height, :width] - 128.0)
+    chroma, weight = (
+        (frame.chroma[1], _RED_OF_V) if colour is LaserColour.RED else (frame.chroma[0], _BLUE_OF_U)
+    )
+    mixed = frame.luma + weight * (full_size(chroma.astype(np.float32), frame) - 128.0)
     image: ImagePlane = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
     return image
+
+
+def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
+    """Return what has the size of a frame's chroma at the size of its luma, interpolated."""
+    size = 2 * half.shape[1], 2 * half.shape[0]
+    full = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)
+    height, width = frame.luma.shape
+    return np.asarray(full[:height, :width], np.float32)
 
 
 class Paint(NamedTuple):
@@ -222,7 +230,7 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
 
 def expected_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour:
     """Return what lines do to the chroma of a typical camera, with the noise of these peaks."""
-    return LineColour(*colour.value, _RATIO_EXPECTED, float(_noise(table)), paint=paint)
+    return LineColour(*colour.value, RATIO_EXPECTED, float(_noise(table)), paint=paint)
 
 
 def laser_likelihood(
@@ -318,7 +326,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
             size = math.hypot(line_u, line_v)
             line_u, line_v = line_u / size, line_v / size
             ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
-            return line_u, line_v, max(ratio, _RATIO_LEAST), sigma
+            return line_u, line_v, max(ratio, RATIO_LEAST), sigma
     return u, v, 0.0, sigma
 
 
@@ -406,7 +414,7 @@ def _learn_beside_paint(
     off_across = np.abs(line_v * of_u - line_u * of_v)
     along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _LEAST_SCATTER)
     across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _LEAST_SCATTER)
-    return line_u, line_v, max(size, _RATIO_LEAST), sigma, along, across
+    return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
 
 
 @inline_kernel
@@ -519,5 +527,5 @@ def _weigh(
         # The lasers make no more than they can.
         share = lines / peaks * min(n_possible / np.sum(lines), 1.0)
     for i in range(n):
-        if table[TOP, i] >= _WHITE and table[WIDTH, i] <= widest_white_px:
+        if table[TOP, i] >= WHITE and table[WIDTH, i] <= widest_white_px:
             likelihood[i] = max(likelihood[i], 0.5)
