@@ -17,15 +17,17 @@ U8 = NDArray[np.uint8]
 
 
 def plain(luma: U8, axis: SearchAxis, line_px: int) -> U8:
-    """Search lines as rows; pairs are averaged, and smoothed along themselves by (1, 2, 1) / 4."""
+    """Search lines as rows; pairs are averaged, and smoothed along themselves by (1, 2, 1) / 4.
+
+    Every mean of two is rounded up.
+    """
     lines = (luma if axis is SearchAxis.ALONG_X else luma.T).astype(int)
     if line_px == 1:
         return lines.astype(np.uint8)
     even = lines[: len(lines) // 2 * 2]
-    pairs = even[::2] + even[1::2]
+    pairs = (even[::2] + even[1::2] + 1) // 2
     wide = np.pad(pairs, ((0, 0), (1, 1)), mode="edge")
-    # Halves are rounded up.
-    smooth = (wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:] + 4) // 8
+    smooth = ((wide[:, :-2] + wide[:, 2:] + 1) // 2 + pairs + 1) // 2
     return smooth.astype(np.uint8)
 
 
