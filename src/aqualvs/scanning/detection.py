@@ -37,7 +37,7 @@ DetectorOptions = StripeOptions | ThresholdOptions
 
 # One search line of so many is looked at first. So many times as many peaks as the lasers can make
 # are looked at, if they are not high.
-_SAMPLE_EVERY, _MOST_PEAKS = 48, 3.0
+_SAMPLE_EVERY, _MOST_PEAKS = 48, 2.0
 # What the frame's bright returns are as high as.
 _BRIGHT_QUANTILE = 0.9
 _CACHE_LINE = 8  # numbers of 64 bits
