@@ -23,10 +23,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import real_lines
-from aqualvs.scanning import stripe_pieces
+from aqualvs.scanning.laser_colour import WHITE
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.search import SearchAxis
-from aqualvs.scanning.stripe_pieces import ACROSS, ALONG, LENGTH, TOP
+from aqualvs.scanning.stripe_pieces import (
+    ACROSS,
+    ALONG,
+    LENGTH,
+    TOP,
+    Weights,
+    general_evidence,
+    learn_lines,
+    line_log_odds,
+    own_evidence,
+)
 from aqualvs.scanning.whole_picture import find_all_pieces
 
 Array = NDArray[np.float64]
@@ -39,7 +49,7 @@ LINE, OTHER, NEAR_PX, NEAR_WIDE_PX = 0.7, 0.3, 1.5, 4.0
 # Where lines of the dark pictures were traced: beyond, nobody says what is none (x, x, y in px).
 TRACED_DARK = (760.0, 1480.0, 180.0)
 # Paint's share of the weight of lines, and how its chroma for each level spreads about none.
-PAINT_WEIGHT, PAINT_SPREAD, WHITE = 0.1, (0.03, 0.05), 225.0
+PAINT_WEIGHT, PAINT_SPREAD = 0.1, (0.03, 0.05)
 # Samples that all weights together count as, and the ridge that keeps the weights small.
 N_EFFECTIVE, RIDGE, ROUNDS = 3000.0, 3.0, 40
 
@@ -146,33 +156,33 @@ def _rows(sample: Sample, evidence: Callable[[Array], Array]) -> tuple[Array, Ar
     )
 
 
-def fit(of: list[Sample]) -> tuple[Array, Array]:
+def fit(of: list[Sample]) -> Weights:
     """Return the weights of the general evidence and of what the pictures' own lines add."""
 
     def general(sample: Sample) -> Callable[[Array], Array]:
-        return lambda table: stripe_pieces.general_evidence(table, sample.width_px, has_colour=True)
+        return lambda table: general_evidence(table, sample.width_px, has_colour=True)
 
     rows = [_rows(sample, general(sample)) for sample in of]
     first = logistic(*(np.concatenate(column) for column in zip(*rows, strict=True)))
     rows = []
     for sample in (sample for sample in of if sample.has_lines):
         log_odds = general(sample)(sample.table) @ first
-        lines = stripe_pieces.learn_lines(sample.table, log_odds, has_colour=True)
+        lines = learn_lines(sample.table, log_odds, has_colour=True)
         if lines is not None:
 
             def own(table: Array, sample: Sample = sample, lines=lines) -> Array:  # type: ignore[no-untyped-def]
-                return stripe_pieces.own_evidence(table, lines, sample.width_px, has_colour=True)
+                return own_evidence(table, lines, sample.width_px, has_colour=True)
 
             rows.append(_rows(sample, own))
-    return first, logistic(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+    own_rows = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return Weights(first, logistic(*own_rows))
 
 
-def report(weights: tuple[Array, Array], of: list[Sample]) -> None:
+def report(weights: Weights, of: list[Sample]) -> None:
     """Print how much of the pieces on lines is found, and how much of others."""
-    stripe_pieces._GENERAL, stripe_pieces._OWN = weights
     for group, fmt in dict.fromkeys((s.group, s.format) for s in of):
         mine = [s for s in of if (s.group, s.format) == (group, fmt)]
-        odds = [stripe_pieces.line_log_odds(s.table, s.width_px, has_colour=True) for s in mine]
+        odds = [line_log_odds(s.table, s.width_px, has_colour=True, weights=weights) for s in mine]
         shares, clean = [], []
         for s, one in zip(mine, odds, strict=True):
             length, keep = s.table[LENGTH], one > 0.0
@@ -196,8 +206,8 @@ def main() -> int:
         weights = fit([s for s in found if s.group != group])
         report(weights, [s for s in found if s.group == group])
     weights = fit(found)
-    for name, values in zip(("_GENERAL", "_OWN"), weights, strict=True):
-        print(f"{name} = np.array([{', '.join(f'{value:.3g}' for value in values)}])")
+    for name, values in zip(weights._fields, weights, strict=True):
+        print(f"{name}: np.array([{', '.join(f'{value:.3g}' for value in values)}])")
     return 0
 
 

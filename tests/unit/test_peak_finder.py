@@ -15,6 +15,7 @@ from aqualvs.scanning.stripe import (
     POSITION,
     STEP_U,
     STEP_V,
+    TINT_U,
     TOP,
     WIDTH,
     PeakFinder,
@@ -161,7 +162,7 @@ def test_peaks_are_those_of_the_reference(
     lines = picture(rng, (n_lines, length), kind)
     # Bands of all kinds, empty ones among them.
     low, high = rng.integers(0, length, (2, n_lines))
-    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1, False)
     found = find(image, (low, high), reach, contrast, every=every)
     expected = [
         peak
@@ -179,7 +180,7 @@ def test_the_background_is_the_higher_of_the_two_sliding_minima() -> None:
     row[30:] = 90
     row[28:31] = [120, 150, 120]
     whole = np.array([0]), np.array([59])
-    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, 1)
+    image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, 1, False)
     _, table = find(image, whole, 10, 6)
     # A stripe on the edge of a box counts from the brighter side.
     np.testing.assert_array_equal(table[HEIGHT], [60.0])
@@ -193,7 +194,7 @@ def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
     rng = np.random.default_rng(4)
     lines = picture(rng, (20, 400), "noise")
     low, high = np.zeros(20, np.int64), np.full(20, 399)
-    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1)
+    image = SearchImage(lines, NO_CHROMA, NO_CHROMA, 1, False)
     sizes = {
         contrast: len(find(image, (low, high), 12, contrast)[0]) for contrast in (10, 20, 40, 80)
     }
@@ -211,19 +212,25 @@ def test_more_peaks_than_there_is_room_for_double_the_contrast() -> None:
 
 
 @pytest.mark.parametrize("line_px", [1, 2])
-def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(line_px: int) -> None:
+@pytest.mark.parametrize("along_x", [True, False])
+def test_a_chroma_step_is_that_from_the_flanks_to_the_peak(line_px: int, along_x: bool) -> None:
     length, n_lines = 80, 24
     lines = np.full((n_lines, length), 60, np.uint8)
     lines[:, 38:43] = [80, 120, 160, 120, 80]
     half_lines = n_lines * line_px // 2
-    u, v = (
-        np.full((half_lines, length // 2), 118, np.uint8),
-        np.full((half_lines, 40), 124, np.uint8),
-    )
+    u = np.full((half_lines, length // 2), 118, np.uint8)
+    v = np.full((half_lines, 40), 124, np.uint8)
     u[:, 18:23], v[:, 18:23] = 108, 94
+    # One line of U is an outlier: the mean is taken over it and its two neighbours, or over it
+    # twice and one neighbour at the border.
+    u[0] += 30
+    u, v = (plane if along_x else np.ascontiguousarray(plane.T) for plane in (u, v))
     low, high = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    image = SearchImage(lines, u, v, line_px)
+    image = SearchImage(lines, u, v, line_px, along_x)
     line, table = find(image, (low, high), 12, 6)
     np.testing.assert_array_equal(line, np.arange(n_lines))
     np.testing.assert_allclose(table[STEP_U], -10.0)
     np.testing.assert_allclose(table[STEP_V], -30.0)
+    # As levels of chroma for each of luma, of which the flanks have 60.
+    raised = np.array([20.0, 10.0, 0.0])[np.minimum(line * line_px // 2, 2)]
+    np.testing.assert_allclose(table[TINT_U], (118.0 + raised - 128.0) / 60.0)

@@ -10,16 +10,16 @@ from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
     Paint,
     channel_image,
-    element_at,
     expected_colour,
     laser_likelihood,
     learn_colour,
     learn_paint,
     useful_height,
 )
+from aqualvs.scanning.quantile import element_at
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.search import SearchAxis, StripeSearch
-from aqualvs.scanning.search_image import SearchLines, is_plain
+from aqualvs.scanning.search_image import SearchLines
 from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
     HEIGHT,
@@ -37,12 +37,13 @@ DetectorOptions = StripeOptions | ThresholdOptions
 
 # One search line of so many is looked at first. So many times as many peaks as the lasers can make
 # are looked at, if they are not high.
-_SAMPLE_EVERY, _MOST_PEAKS = 48, 3.0
+_SAMPLE_EVERY, _MOST_PEAKS = 48, 2.0
 # What the frame's bright returns are as high as.
 _BRIGHT_QUANTILE = 0.9
 _CACHE_LINE = 8  # numbers of 64 bits
 # An overexposed line is no wider than this share of the picture.
 _WIDEST_WHITE = 0.02
+_NO_CHROMA = np.empty((0, 0), np.uint8)
 
 
 class FrameDetector:
@@ -56,8 +57,6 @@ class FrameDetector:
         One for each laser.
     options : StripeOptions or ThresholdOptions
         Which detector, and how.
-    are_lasers : bool
-        Whether each search is that of one laser; else it may hold any number of them.
     """
 
     def __init__(
@@ -65,16 +64,13 @@ class FrameDetector:
         size_px: tuple[int, int],
         searches: Sequence[StripeSearch],
         options: DetectorOptions,
-        *,
-        are_lasers: bool = True,
     ) -> None:
         self._size_px = size_px
         self._options = options
         seen = [search for search in searches if search.visible]
         self._colours = sorted({one.colour for one in seen}, key=lambda colour: colour.name)
-        # Each laser shows about once on a search line; in a whole picture nobody knows how many do.
-        lines = sum(np.count_nonzero(one.lowest <= one.highest) for one in seen)
-        self._n_possible = float(lines) if are_lasers else np.inf
+        # Each laser shows about once on a search line.
+        self._n_possible = float(sum(np.count_nonzero(one.lowest <= one.highest) for one in seen))
         self._line_px = max((one.line_px for one in seen), default=1)
         self._bands = {
             axis: _band([one for one in seen if one.axis is axis])
@@ -102,6 +98,7 @@ class FrameDetector:
         width, height = size_px
         self._lines = {axis: SearchLines(size_px, axis, self._line_px) for axis in self._bands}
         self._luma = np.empty((height, width), np.uint8)
+        self._chroma = np.empty((2, -(-height // 2), -(-width // 2)), np.uint8)
 
     def _finder(self, axis: SearchAxis, options: StripeOptions) -> PeakFinder:
         width, height = self._size_px
@@ -147,8 +144,10 @@ class FrameDetector:
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, Returns]:
         luma = self._brightest(frame)
+        chroma = frame.chroma or (_NO_CHROMA, _NO_CHROMA)
+        u, v = (_plain(plane, out) for plane, out in zip(chroma, self._chroma, strict=True))
         images = {
-            axis: SearchImage(lines.of(luma), *lines.chroma_of(frame.chroma), self._line_px)
+            axis: SearchImage(lines.of(luma), u, v, self._line_px, axis is SearchAxis.ALONG_X)
             for axis, lines in self._lines.items()
         }
         # A sample of the search lines tells from which height on it pays to look.
@@ -181,8 +180,8 @@ class FrameDetector:
         Overwritten by the next call; the frame's luma itself where that is the same.
         """
         first, *others = (channel_image(frame, colour) for colour in self._colours)
-        if not others and is_plain(first):
-            return first
+        if not others:
+            return _plain(first, self._luma)
         np.copyto(self._luma, first)
         for image in others:
             np.maximum(self._luma, image, out=self._luma)
@@ -268,6 +267,14 @@ def select_returns(
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
     return np.flatnonzero(keep)
+
+
+def _plain(plane: U8Array, copy: U8Array) -> U8Array:
+    """Return a plane in the layout in memory that kernels are compiled for, or a copy in it."""
+    if plane.flags.carray:
+        return plane
+    np.copyto(copy, plane)
+    return copy
 
 
 def _band(searches: Sequence[StripeSearch]) -> tuple[IntArray, IntArray]:

@@ -8,7 +8,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.scanning.light_cells import lit_cells, number_cells
 from aqualvs.scanning.net_labels import recruit
 from aqualvs.scanning.patch_kernels import height_over
-from aqualvs.scanning.reading_kernels import value_at
+from aqualvs.scanning.quantile import element_at
 from aqualvs.scanning.scan import Label
 from aqualvs.scanning.stretch_shape import StretchShapes, is_bent, is_round, is_straight
 
@@ -198,7 +198,7 @@ def label_loose(
         if readings_of[source[i]] == 1:
             label[i] = _kind_of(points, i, is_straight(shapes, s), target, working_range)
         if is_round(shapes, s, 0.0) and bright != bright:
-            bright = value_at(height, height[:0], _BRIGHT_SHARE)
+            bright = element_at(height, _BRIGHT_SHARE)
         if is_round(shapes, s, bright):
             label[i] = _BUBBLE
         elif is_bent(shapes, s):

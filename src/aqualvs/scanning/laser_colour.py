@@ -16,9 +16,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.scanning.quantile import element_at
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
@@ -44,7 +46,7 @@ _OF_CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 2.5, 4.0, 1.4826
 # Chroma levels for each grey level of height: what a line is expected to show where none is clear
 # enough to learn from, the least and the most that is believed of a learned one, and how far paint
 # and glare spread about none. Lines of nine cameras show 0.15 to 0.7.
-_RATIO_EXPECTED, _RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
+RATIO_EXPECTED, RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
 # One frame's lines spread about their ratio by this share, and by the second one across their
 # direction: overexposed ones show less and differ in hue, faint ones more.
 _RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
@@ -63,7 +65,7 @@ _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
 # looked at.
 _FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
 # A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
-_WHITE = 225.0
+WHITE = 225.0
 # Luma from which on a channel may be clipped, and full scale, where lines show the last share of
 # their chroma: measured on rendered stripes, whose middle or edge counts.
 _CLIPPED, _FULL, _LEFT_AT_FULL = 185.0, 235.0, 0.33
@@ -121,13 +123,20 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     """
     if colour is LaserColour.GREEN or frame.chroma is None:
         return frame.luma
-    height, width = frame.luma.shape
-    half = frame.chroma[1 if colour is LaserColour.RED else 0].astype(np.float32)
-    full = cv2.resize(half, (2 * half.shape[1], 2 * half.shape[0]), interpolation=cv2.INTER_LINEAR)
-    weight = _RED_OF_V if colour is LaserColour.RED else _BLUE_OF_U
-    mixed = frame.luma + weight * (full[:height, :width] - 128.0)
+    chroma, weight = (
+        (frame.chroma[1], _RED_OF_V) if colour is LaserColour.RED else (frame.chroma[0], _BLUE_OF_U)
+    )
+    mixed = frame.luma + weight * (full_size(chroma.astype(np.float32), frame) - 128.0)
     image: ImagePlane = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
     return image
+
+
+def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
+    """Return what has the size of a frame's chroma at the size of its luma, interpolated."""
+    size = 2 * half.shape[1], 2 * half.shape[0]
+    full = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)
+    height, width = frame.luma.shape
+    return np.asarray(full[:height, :width], np.float32)
 
 
 class Paint(NamedTuple):
@@ -190,10 +199,7 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
     Paint or None
         None where there are few tall peaks, or they are not of one colour.
     """
-    tall = table[:, np.flatnonzero(table[HEIGHT] >= _TALL)]
-    if tall.shape[1] <= _CROWD * n_possible:
-        return None
-    *paint, across_tint, n_near = _learn_paint(tall, float(_noise(table)))
+    *paint, across_tint, n_near = _learn_paint(table, _CROWD * n_possible)
     # Paint shows more or less of the light's tint; other differences are a mixture with lines.
     return Paint(*paint) if across_tint < _MOST_ACROSS and n_near > _CROWD * n_possible else None
 
@@ -216,18 +222,15 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
     """
     if paint is None:
         every = 1 + table.shape[1] // _ENOUGH
-        found = LineColour(*_learn(np.ascontiguousarray(table[:, ::every]), *colour.value))
+        found = LineColour(*_learn(table[:, ::every], *colour.value))
     else:
-        tall = np.flatnonzero(table[HEIGHT] >= _TALL)
-        sigma = float(_noise(table))
-        learned = _learn_beside_paint(table[:, tall], *colour.value, sigma, *paint)
-        found = LineColour(*learned[:3], sigma, *learned[3:], paint)
+        found = LineColour(*_learn_beside_paint(table, *colour.value, *paint), paint)
     return found if found.ratio > 0.0 else None
 
 
 def expected_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour:
     """Return what lines do to the chroma of a typical camera, with the noise of these peaks."""
-    return LineColour(*colour.value, _RATIO_EXPECTED, float(_noise(table)), paint=paint)
+    return LineColour(*colour.value, RATIO_EXPECTED, float(_noise(table)), paint=paint)
 
 
 def laser_likelihood(
@@ -250,8 +253,8 @@ def laser_likelihood(
     widest_white_px : float
         Overexposed peaks up to this width may be a line's white core, whatever their colour; wider
         ones are paper or a window.
-    n_possible : float
-        Peaks that the lasers can make.
+    n_possible : float, optional
+        Peaks that the lasers can make; any number if left out.
 
     Returns
     -------
@@ -273,14 +276,6 @@ def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
         Of a sample of peaks.
     """
     return int(_useful_height(height, likelihood))
-
-
-@kernel
-def element_at(values: FloatArray, share: float) -> float:
-    """Return the value that a share of the values exceeds no more: one of them; 0 of none."""
-    n = values.shape[0]
-    rank = int(share * (n - 1))
-    return float(np.partition(values, rank)[rank]) if n else 0.0
 
 
 @inline_kernel
@@ -325,24 +320,49 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
         best = _best_stripes(table, u, v, sigma, tint_share)
         if best.shape[0] < _MIN_LEARNED:
             continue
-        height = _coloured_height(table[:, best])
-        of_u, of_v = table[STEP_U][best] / height, table[STEP_V][best] / height
-        line_u, line_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
-        size = math.hypot(line_u, line_v)
-        if element_at(np.hypot(of_u - line_u, of_v - line_v), 0.5) > _MOST_SCATTER * size:
-            continue
-        line_u, line_v = line_u / size, line_v / size
-        ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
-        return line_u, line_v, max(ratio, _RATIO_LEAST), sigma
+        of_u, of_v = _shown(table, best)
+        line_u, line_v, is_one_colour = _middle(of_u, of_v)
+        if is_one_colour:
+            size = math.hypot(line_u, line_v)
+            line_u, line_v = line_u / size, line_v / size
+            ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
+            return line_u, line_v, max(ratio, RATIO_LEAST), sigma
     return u, v, 0.0, sigma
 
 
 @kernel
-def _learn_paint(table: FloatArray, sigma: float) -> tuple[float, float, float, float, float, int]:
-    """Return the fields of a `Paint`, its spread across the flanks' tint, and how many are near."""
-    height = table[HEIGHT]
-    of_u, of_v = table[STEP_U] / height, table[STEP_V] / height
-    noise = sigma / element_at(height, 0.5)
+def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of peaks in U and V, for each level of height that shows its colour."""
+    of_u, of_v = np.empty(rows.shape[0]), np.empty(rows.shape[0])
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        height = table[HEIGHT, i] * _colour_left(table[TOP, i])
+        of_u[k], of_v[k] = table[STEP_U, i] / height, table[STEP_V, i] / height
+    return of_u, of_v
+
+
+@kernel
+def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
+    """Return the median of steps, and whether at least half of them are near it."""
+    u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+    squared = element_at((of_u - u) ** 2 + (of_v - v) ** 2, 0.5)
+    return u, v, squared <= _MOST_SCATTER**2 * (u**2 + v**2)
+
+
+@kernel
+def _learn_paint(
+    table: FloatArray, n_least: float
+) -> tuple[float, float, float, float, float, int]:
+    """Return the fields of a `Paint`, its spread across the flanks' tint, and how many are near.
+
+    None are where no more than `n_least` peaks are tall.
+    """
+    tall = np.flatnonzero(table[HEIGHT] >= _TALL)
+    if tall.shape[0] <= n_least:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    height = table[HEIGHT][tall]
+    of_u, of_v = table[STEP_U][tall] / height, table[STEP_V][tall] / height
+    noise = _noise(table) / element_at(height, 0.5)
     u, v, spread_u, spread_v = 0.0, 0.0, 0.0, 0.0
     near = np.ones(height.shape[0], np.bool_)
     for _ in range(_ROUNDS):
@@ -352,12 +372,9 @@ def _learn_paint(table: FloatArray, sigma: float) -> tuple[float, float, float, 
         seen_v = _MAD_TO_SIGMA * element_at(np.abs(some_v - v), 0.5)
         spread_u = math.sqrt(max(seen_u**2 - noise**2, _LEAST_SPREAD**2))
         spread_v = math.sqrt(max(seen_v**2 - noise**2, _LEAST_SPREAD**2))
-        off_u, off_v = (
-            (of_u - u) / math.hypot(spread_u, noise),
-            (of_v - v) / math.hypot(spread_v, noise),
-        )
-        near = np.hypot(off_u, off_v) < _OF_CROWD
-    tint_u, tint_v = element_at(table[TINT_U], 0.5), element_at(table[TINT_V], 0.5)
+        var_u, var_v = spread_u**2 + noise**2, spread_v**2 + noise**2
+        near = (of_u - u) ** 2 / var_u + (of_v - v) ** 2 / var_v < _OF_CROWD**2
+    tint_u, tint_v = element_at(table[TINT_U][tall], 0.5), element_at(table[TINT_V][tall], 0.5)
     size = math.hypot(tint_u, tint_v)
     across = math.hypot(spread_u, spread_v)
     if size > _LEAST_SPREAD:
@@ -370,51 +387,47 @@ def _learn_beside_paint(
     table: FloatArray,
     u: float,
     v: float,
-    sigma: float,
     paint_u: float,
     paint_v: float,
     spread_u: float,
     spread_v: float,
-) -> tuple[float, float, float, float, float]:
-    """Return direction, ratio and spreads of what is no paint; a ratio of 0 if unknown."""
-    height = table[HEIGHT]
-    of_u, of_v = table[STEP_U] / height, table[STEP_V] / height
-    off_u = (of_u - paint_u) / np.hypot(spread_u, sigma / height)
-    off_v = (of_v - paint_v) / np.hypot(spread_v, sigma / height)
-    is_near = u * of_u + v * of_v > _LEAST_COSINE * np.hypot(of_u, of_v)
-    best = np.flatnonzero(is_near & (np.hypot(off_u, off_v) > _CLEAR_OF_PAINT))
-    nothing = (u, v, 0.0, 1.0, 1.0)
+) -> tuple[float, float, float, float, float, float]:
+    """Return direction, ratio, noise and spreads of what is no paint; a ratio of 0 if unknown."""
+    sigma = _noise(table)
+    is_clear = np.zeros(table.shape[1], np.bool_)
+    for i in range(table.shape[1]):
+        height, step_u, step_v = table[HEIGHT, i], table[STEP_U, i], table[STEP_V, i]
+        if height >= _TALL and _is_near(step_u, step_v, u, v):
+            off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
+            var_u, var_v = (spread_u * height) ** 2 + sigma**2, (spread_v * height) ** 2 + sigma**2
+            is_clear[i] = off_u**2 / var_u + off_v**2 / var_v > _CLEAR_OF_PAINT**2
+    best = np.flatnonzero(is_clear)
     if best.shape[0] < _MIN_LEARNED:
-        return nothing
-    height = _coloured_height(table[:, best])
-    of_u, of_v = table[STEP_U][best] / height, table[STEP_V][best] / height
-    line_u, line_v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+        return u, v, 0.0, sigma, 1.0, 1.0
+    of_u, of_v = _shown(table, best)
+    line_u, line_v, is_one_colour = _middle(of_u, of_v)
     size = math.hypot(line_u, line_v)
-    if size > _RATIO_MOST:
-        return nothing
-    if element_at(np.hypot(of_u - line_u, of_v - line_v), 0.5) > _MOST_SCATTER * size:
-        return nothing
-    line_u, line_v, ratio = line_u / size, line_v / size, max(size, _RATIO_LEAST)
+    if size > _RATIO_MOST or not is_one_colour:
+        return u, v, 0.0, sigma, 1.0, 1.0
+    line_u, line_v = line_u / size, line_v / size
     off_along = np.abs(line_u * of_u + line_v * of_v - size)
     off_across = np.abs(line_v * of_u - line_u * of_v)
     along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _LEAST_SCATTER)
     across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _LEAST_SCATTER)
-    return line_u, line_v, ratio, along, across
+    return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
+
+
+@inline_kernel
+def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
+    """Tell whether a chroma step is within the widest angle of a direction."""
+    along = u * step_u + v * step_v
+    return along > 0.0 and along**2 > _LEAST_COSINE**2 * (step_u**2 + step_v**2)
 
 
 @inline_kernel
 def _colour_left(top: float) -> float:
     """Return the share of its chroma that an overexposed line of this luma shows."""
     return 1.0 - (1.0 - _LEFT_AT_FULL) * min(max((top - _CLIPPED) / (_FULL - _CLIPPED), 0.0), 1.0)
-
-
-@kernel
-def _coloured_height(table: FloatArray) -> FloatArray:
-    """Return the heights of peaks, as far as they show their colour."""
-    height: FloatArray = table[HEIGHT].copy()
-    for i in range(height.shape[0]):
-        height[i] *= _colour_left(table[TOP, i])
-    return height
 
 
 @kernel
@@ -425,15 +438,13 @@ def _best_stripes(
 
     The highest peaks may be paper.
     """
-    share = np.zeros(table.shape[1])
+    share, least = np.zeros(table.shape[1]), max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
     for i in range(table.shape[1]):
-        beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
-        size = math.hypot(beyond_u, beyond_v)
-        step_u, step_v = table[STEP_U, i], table[STEP_V, i]
-        near = u * step_u + v * step_v > _LEAST_COSINE * math.hypot(step_u, step_v)
-        is_clear = size > max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
-        if near and is_clear and table[HEIGHT, i] >= _MIN_HEIGHT:
-            share[i] = size / (table[HEIGHT, i] * _colour_left(table[TOP, i]))
+        height = table[HEIGHT, i]
+        if height >= _MIN_HEIGHT and _is_near(table[STEP_U, i], table[STEP_V, i], u, v):
+            beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
+            size = math.sqrt(beyond_u**2 + beyond_v**2)
+            share[i] = size / (height * _colour_left(table[TOP, i])) if size > least else 0.0
     return np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
 
 
@@ -516,5 +527,5 @@ def _weigh(
         # The lasers make no more than they can.
         share = lines / peaks * min(n_possible / np.sum(lines), 1.0)
     for i in range(n):
-        if table[TOP, i] >= _WHITE and table[WIDTH, i] <= widest_white_px:
+        if table[TOP, i] >= WHITE and table[WIDTH, i] <= widest_white_px:
             likelihood[i] = max(likelihood[i], 0.5)

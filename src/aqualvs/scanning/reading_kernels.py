@@ -3,7 +3,7 @@
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.segments import segment_returns
 
 SOURCE, LASER, LINE, STRETCH, CHUNK, ALONG_X = range(6)
@@ -17,44 +17,6 @@ N_MEASURES = 4
 # the two flanks of a stripe of given width and height.
 _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
-# Bins to a grey level, and grey levels, when values are counted to find a quantile.
-_BINS, _LEVELS = 2, 256
-
-
-@kernel
-def value_at(one: FloatArray, other: FloatArray, share: float) -> float:
-    """Return the value below which a share of those in two arrays lie, NaN counting as highest.
-
-    An element, never a mean of two; 1 where there is none.
-    """
-    n = one.shape[0] + other.shape[0]
-    if n == 0:
-        return 1.0
-    rank = int(share * (n - 1))
-    count = np.zeros(_BINS * _LEVELS + 1, np.int64)
-    for values in (one, other):
-        for i in range(values.shape[0]):
-            count[_bin_of(values[i])] += 1
-    # The bin that holds it; how many values lie in lower ones.
-    which, below = 0, 0
-    while below + count[which] <= rank:
-        below += count[which]
-        which += 1
-    found, n_found = np.empty(count[which]), 0
-    for values in (one, other):
-        for i in range(values.shape[0]):
-            if _bin_of(values[i]) == which:
-                found[n_found] = values[i]
-                n_found += 1
-    found.sort()
-    return float(found[rank - below])
-
-
-@inline_borrowing_kernel
-def _bin_of(value: float) -> int:
-    if not value < _LEVELS:
-        return _BINS * _LEVELS
-    return int(_BINS * max(value, 0.0))
 
 
 @kernel

@@ -8,7 +8,8 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.scanning.chunk_kernels import chunk_readings, count_chunks, summarise
 from aqualvs.scanning.chunks import Chunks
-from aqualvs.scanning.reading_kernels import N_MEASURES, N_NUMBERS, read_laser, value_at
+from aqualvs.scanning.quantile import element_at
+from aqualvs.scanning.reading_kernels import N_MEASURES, N_NUMBERS, read_laser
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.stretch_shape import StretchShapes, stretch_shapes
 from aqualvs.scanning.stripe import Returns
@@ -207,7 +208,7 @@ def read_returns(
     capacity = sum(map(len, by_search))
     numbers, measures = np.empty((N_NUMBERS, capacity), np.int64), np.empty((N_MEASURES, capacity))
     pixels = np.empty((capacity, 2))
-    best_height = value_at(along_x.height, along_y.height, _BEST_SHARE)
+    best_height = element_at(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
     n = 0
     for i, (search, found) in enumerate(zip(searches, by_search, strict=True)):
         n = read_laser(

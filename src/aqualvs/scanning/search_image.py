@@ -2,13 +2,10 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import U8Array
-
-_NO_CHROMA = np.empty((0, 0), np.uint8)
 
 
 class SearchLines:
@@ -16,6 +13,7 @@ class SearchLines:
 
     In wide pictures a search line is the mean of two rows or columns, smoothed along itself by
     (1, 2, 1) / 4: a stripe can be a pixel or two thin there, its centre then locked to the pixels.
+    All means are of two bytes and rounded up, for which processors have an instruction.
 
     Parameters
     ----------
@@ -33,9 +31,7 @@ class SearchLines:
         shape = (height // line_px, width) if self._along_x else (height, width // line_px)
         self._pairs = np.empty(shape, np.uint8)
         self._turned = np.empty(shape[::-1], np.uint8)
-        self._totals = np.empty((3, shape[1]), np.uint16)
-        half = -(-height // 2), -(-width // 2)
-        self._chroma = np.empty((2, *(half if self._along_x else half[::-1])), np.uint8)
+        self._means = np.empty((3, shape[1]), np.uint8)
 
     def of(self, luma: U8Array) -> U8Array:
         """Return the search lines of a picture.
@@ -53,74 +49,47 @@ class SearchLines:
         lines = luma
         if self._paired:
             lines = self._pairs
-            (_pair_rows if self._along_x else _pair_columns)(luma, self._totals, lines)
+            (_pair_rows if self._along_x else _pair_columns)(luma, self._means, lines)
         return lines if self._along_x else np.asarray(cv2.transpose(lines, self._turned), np.uint8)
 
-    def chroma_of(self, chroma: tuple[U8Array, U8Array] | None) -> tuple[U8Array, U8Array]:
-        """Return U and V turned as the search lines are, at their own resolution.
 
-        Parameters
-        ----------
-        chroma : (uint8 array, uint8 array) or None
-            As in `Frame`.
-
-        Returns
-        -------
-        u, v : uint8 array, shape (ceil(n_lines * line_px / 2), ceil(length / 2))
-            Overwritten by the next call; the planes themselves where those are the same; of shape
-            (0, 0) for a grey source.
-        """
-        if chroma is None:
-            return _NO_CHROMA, _NO_CHROMA
-        u, v = (self._turn(plane, out) for plane, out in zip(chroma, self._chroma, strict=True))
-        return u, v
-
-    def _turn(self, plane: U8Array, out: U8Array) -> U8Array:
-        if not self._along_x:
-            cv2.transpose(plane, out)
-        elif is_plain(plane):
-            return plane
-        else:
-            np.copyto(out, plane)
-        return out
-
-
-def is_plain(plane: U8Array) -> bool:
-    """Tell whether kernels take a plane as it is: they are compiled for one layout in memory."""
-    return plane.flags.carray
+@inline_kernel
+def _mean(one: np.uint8, other: np.uint8) -> np.uint8:
+    return np.uint8((np.uint16(one) + np.uint16(other) + np.uint16(1)) >> np.uint16(1))
 
 
 @kernel
-def _pair_rows(luma: U8Array, totals: NDArray[np.uint16], lines: U8Array) -> None:
-    """Write the means of two rows each, smoothed along them; `totals` is scratch."""
-    last, total = luma.shape[1] - 1, totals[0]
+def _pair_rows(luma: U8Array, means: U8Array, lines: U8Array) -> None:
+    """Write the means of two rows each, smoothed along them; `means` is scratch."""
+    mean = means[0]
+    last = mean.shape[0] - 1
+    before, middle, after = mean[:-2], mean[1:-1], mean[2:]
     for k in range(lines.shape[0]):
         one, other, out = luma[2 * k], luma[2 * k + 1], lines[k]
-        for x in range(total.shape[0]):
-            total[x] = np.uint16(one[x]) + np.uint16(other[x])
-        before, after, inner = total[:-2], total[2:], out[1:-1]
-        middle = total[1:-1]
+        for x in range(mean.shape[0]):
+            mean[x] = _mean(one[x], other[x])
+        inner = out[1:-1]
         for x in range(inner.shape[0]):
-            inner[x] = np.uint8((before[x] + np.uint16(2) * middle[x] + after[x] + 4) >> 3)
-        out[0] = np.uint8((3 * total[0] + total[1] + 4) >> 3)
-        out[last] = np.uint8((3 * total[last] + total[last - 1] + 4) >> 3)
+            inner[x] = _mean(_mean(before[x], after[x]), middle[x])
+        out[0] = _mean(_mean(mean[0], mean[1]), mean[0])
+        out[last] = _mean(_mean(mean[last - 1], mean[last]), mean[last])
 
 
 @kernel
-def _pair_columns(luma: U8Array, totals: NDArray[np.uint16], columns: U8Array) -> None:
-    """Write the means of two columns each, smoothed along them; `totals` is scratch."""
+def _pair_columns(luma: U8Array, means: U8Array, columns: U8Array) -> None:
+    """Write the means of two columns each, smoothed along them; `means` is scratch."""
     height = luma.shape[0]
-    _add_pairs(luma[0], totals[0])
-    _add_pairs(luma[0], totals[1])
+    _pair_pixels(luma[0], means[0])
+    _pair_pixels(luma[0], means[1])
     for y in range(height):
-        before, middle, after = totals[y % 3], totals[(y + 1) % 3], totals[(y + 2) % 3]
-        _add_pairs(luma[min(y + 1, height - 1)], after)
+        before, middle, after = means[y % 3], means[(y + 1) % 3], means[(y + 2) % 3]
+        _pair_pixels(luma[min(y + 1, height - 1)], after)
         out = columns[y]
         for x in range(out.shape[0]):
-            out[x] = np.uint8((before[x] + np.uint16(2) * middle[x] + after[x] + 4) >> 3)
+            out[x] = _mean(_mean(before[x], after[x]), middle[x])
 
 
 @kernel
-def _add_pairs(row: U8Array, total: NDArray[np.uint16]) -> None:
-    for x in range(total.shape[0]):
-        total[x] = np.uint16(row[2 * x]) + np.uint16(row[2 * x + 1])
+def _pair_pixels(row: U8Array, mean: U8Array) -> None:
+    for x in range(mean.shape[0]):
+        mean[x] = _mean(row[2 * x], row[2 * x + 1])

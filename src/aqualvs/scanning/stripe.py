@@ -116,23 +116,23 @@ class SearchImage(NamedTuple):
     ----------
     lines : uint8 array, shape (n_lines, length)
         Search lines as rows.
-    u, v : uint8 array, shape (ceil(n_lines * line_px / 2), ceil(length / 2))
-        Chroma, turned as the lines are; of shape (0, 0) for a grey source.
+    u, v : uint8 array, shape (ceil(height / 2), ceil(width / 2))
+        Chroma of the frame as it is, not turned; of shape (0, 0) for a grey source.
     line_px : int
         Pixels across one search line.
+    along_x : bool
+        Whether search lines are rows of the frame; else they are columns.
     """
 
     lines: U8Array
     u: U8Array
     v: U8Array
     line_px: int
+    along_x: bool
 
 
 class _Scratch(NamedTuple):
-    """Buffers of one search line.
-
-    Its pixels with margins, sliding minima, what stands out, and its chroma in thirds of a level.
-    """
+    """Buffers of one search line: its pixels with margins, sliding minima, what stands out."""
 
     padded: U8Array
     minima: U8Array
@@ -140,8 +140,6 @@ class _Scratch(NamedTuple):
     background: U8Array
     above: U8Array
     words: NDArray[np.uint64]
-    u: NDArray[np.uint16]
-    v: NDArray[np.uint16]
 
 
 class PeakFinder:
@@ -173,8 +171,7 @@ class PeakFinder:
         # With room for a gap and a mark after the last pixel.
         background, above = np.zeros((2, (length // _WORD + 3) * _WORD), np.uint8)
         words = above.view(np.uint64)
-        u, v = np.empty((2, -(-length // 2)), np.uint16)
-        self._scratch = _Scratch(padded, minima, spare, background, above, words, u, v)
+        self._scratch = _Scratch(padded, minima, spare, background, above, words)
 
     def find(
         self,
@@ -232,7 +229,7 @@ def _find_peaks(
     table: FloatArray,
 ) -> int:
     """Write the search line and the measures of each peak; return how many."""
-    n, chroma_line = 0, -1
+    n = 0
     for x in range(0, lowest.shape[0], every):
         if lowest[x] > highest[x]:
             continue
@@ -242,10 +239,6 @@ def _find_peaks(
         end = min(highest[x] + reach_px + 1, row.shape[0])
         _mark_above(row, first, end, min_contrast, reach_px, scratch)
         start = _next_with(_MARKED, scratch.words, 0)
-        if start < end - first and chroma_line != (x * image.line_px) >> 1:
-            chroma_line = (x * image.line_px) >> 1
-            _sum_neighbours(image.u, chroma_line, scratch.u)
-            _sum_neighbours(image.v, chroma_line, scratch.v)
         while start < end - first:
             stop = _next_with(_UNMARKED, scratch.words, start)
             if first + start <= highest[x] and first + stop > lowest[x]:
@@ -356,7 +349,7 @@ def _measure_run(
         table[HEIGHT, n] = 2 * np.int64(row[peak]) - level
         table[WIDTH, n], table[TOP, n] = width, row[peak]
         if image.u.shape[0] > 0:
-            _measure_chroma(row, scratch, peak, width, directions, table[:, n])
+            _measure_chroma(image, x, peak, width, directions, table[:, n])
         n += 1
     return n
 
@@ -428,22 +421,23 @@ def _centroid(row: U8Array, a: int, b: int, level: np.int64) -> float:
 
 @inline_borrowing_kernel
 def _measure_chroma(
-    row: U8Array,
-    scratch: _Scratch,
+    image: SearchImage,
+    x: int,
     peak: int,
     width: float,
     directions: FloatArray,
     measures: FloatArray,
 ) -> None:
-    """Write how the peak's chroma differs from that of its flanks.
+    """Write how the chroma of a peak of search line `x` differs from that of its flanks.
 
     The peak's is that of its middle or of an edge, whichever is more of the laser's colour: a
     saturated core is white.
     """
+    row, chroma_line = image.lines[x], (x * image.line_px) >> 1
     edge, flank = int(0.5 * width) + 1, int(width) + 4
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
-    u_before, v_before = _chroma(scratch, before)
-    u_after, v_after = _chroma(scratch, after)
+    u_before, v_before = _chroma(image, chroma_line, before)
+    u_after, v_after = _chroma(image, chroma_line, after)
     # Where one flank is much brighter, another stripe lies there.
     difference = np.int64(row[before]) - np.int64(row[after])
     weight = 0.5
@@ -453,11 +447,11 @@ def _measure_chroma(
     v_flank = weight * v_before + (1.0 - weight) * v_after
     luma = weight * row[before] + (1.0 - weight) * row[after]
     best = -np.inf
-    for k in range(directions.shape[0]):
-        along_u, along_v = directions[k, 0], directions[k, 1]
-        for offset in (0, -edge, edge):
-            u, v = _chroma(scratch, peak + offset)
-            u, v = u - u_flank, v - v_flank
+    for offset in (0, -edge, edge):
+        u, v = _chroma(image, chroma_line, peak + offset)
+        u, v = u - u_flank, v - v_flank
+        for k in range(directions.shape[0]):
+            along_u, along_v = directions[k, 0], directions[k, 1]
             along = along_u * u + along_v * v
             if along > best:
                 best = along
@@ -474,18 +468,15 @@ def _measure_chroma(
 
 
 @inline_borrowing_kernel
-def _chroma(scratch: _Scratch, position: int) -> tuple[float, float]:
+def _chroma(image: SearchImage, chroma_line: int, position: int) -> tuple[float, float]:
     """Return U and V at a position of a search line, the mean over neighbours along the stripe."""
-    p = min(max(position, 0) >> 1, scratch.u.shape[0] - 1)
-    return scratch.u[p] * _THIRD, scratch.v[p] * _THIRD
-
-
-@inline_borrowing_kernel
-def _sum_neighbours(plane: U8Array, line: int, total: NDArray[np.uint16]) -> None:
-    """Write the sum of a line of chroma and its two neighbours; nothing of a grey source."""
-    last = plane.shape[0] - 1
-    if last < 0:
-        return
-    one, two, three = plane[max(line - 1, 0)], plane[min(line, last)], plane[min(line + 1, last)]
-    for p in range(two.shape[0]):
-        total[p] = np.uint16(one[p]) + np.uint16(two[p]) + np.uint16(three[p])
+    u, v = image.u, image.v
+    n_lines, length = u.shape if image.along_x else (u.shape[1], u.shape[0])
+    p = min(max(position >> 1, 0), length - 1)
+    total_u, total_v = np.int64(0), np.int64(0)
+    for offset in range(-1, 2):
+        line = min(max(chroma_line + offset, 0), n_lines - 1)
+        y, x = (line, p) if image.along_x else (p, line)
+        total_u += np.int64(u[y, x])
+        total_v += np.int64(v[y, x])
+    return total_u * _THIRD, total_v * _THIRD

@@ -19,7 +19,14 @@ from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.laser_colour import LaserColour, channel_image
+from aqualvs.scanning.laser_colour import (
+    RATIO_EXPECTED,
+    RATIO_LEAST,
+    WHITE,
+    LaserColour,
+    channel_image,
+    full_size,
+)
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import link_segments
@@ -47,37 +54,11 @@ _FLANK_PX = 2
 # Ratios of chroma to light, and differences in height of the flanks for each level, are believed
 # within these bounds.
 _MOST_RATIO, _LEAST_RATIO, _MOST_ACROSS, _MOST_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
-# Levels of chroma that noise makes, and chroma for each level that grey pictures count as having.
-_CHROMA_NOISE, _EXPECTED_ALONG = 2.0, 0.25
-# A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
-_WHITE = 225.0
-# Weights of the evidence, in the order of `_evidence`, and of what the picture's own lines add to
-# it. Fitted by tools/fit_stripe_pieces.py.
-_GENERAL = np.array(
-    [-4.62, -0.196, 0.709, 0.613, -0.316, -1.27, -0.829, 29.9, 1.02, -4.89, -3.89, 0.358]
-)
-_OWN = np.array(
-    [
-        -4.1,
-        0.0586,
-        0.566,
-        0.342,
-        -0.48,
-        -0.795,
-        -0.49,
-        33.4,
-        0.814,
-        -4.7,
-        -1.59,
-        0.345,
-        -0.157,
-        -0.87,
-        2.77,
-    ]
-)
+# Levels of chroma that noise makes.
+_CHROMA_NOISE = 2.0
 # Pieces of more than these log odds, by what is known of lines in general, are certain; but none
 # that shows less chroma for each level than any camera's lines do, such as a highlight on steel.
-_CERTAIN, _LEAST_ALONG = 2.3, 0.1
+_CERTAIN = 2.3
 # What the picture's lines differ by in colour: chroma for each level, and as a share of theirs.
 _ACROSS_SPREAD, _SHARE_SPREAD = 0.08, 0.3
 _MOST_OWN = 9.0
@@ -89,6 +70,33 @@ _HELP, _MOST_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
 # due by its slope over so many returns, as high as this share of its height at least, and with
 # fewer than so many search lines missed.
 _MOST_FOLLOWING, _FOLLOW_PX, _SLOPE_RETURNS, _LEAST_HEIGHT_SHARE, _MOST_MISSED = 8, 1.2, 6, 0.3, 4
+
+
+class Weights(NamedTuple):
+    """What the evidence counts, as log odds.
+
+    Attributes
+    ----------
+    general : array, shape (12,)
+        Weights of what `general_evidence` returns.
+    own : array, shape (15,)
+        Weights of what `own_evidence` returns.
+    """
+
+    general: FloatArray
+    own: FloatArray
+
+
+WEIGHTS = Weights(
+    np.array([-4.62, -0.196, 0.709, 0.613, -0.316, -1.27, -0.829, 29.9, 1.02, -4.89, -3.89, 0.358]),
+    np.concatenate(
+        [
+            [-4.1, 0.0586, 0.566, 0.342, -0.48, -0.795, -0.49, 33.4, 0.814, -4.7, -1.59, 0.345],
+            [-0.157, -0.87, 2.77],
+        ]
+    ),
+)
+"""Fitted by tools/fit_stripe_pieces.py."""
 
 
 class Pieces(NamedTuple):
@@ -154,14 +162,8 @@ def picture_rows(frame: Frame, search: StripeSearch, colour: LaserColour) -> Pic
         return PictureRows(light, none, none)
     u, v = (plane.astype(np.float32) - 128.0 for plane in frame.chroma)
     to_u, to_v = colour.value
-    height, width = frame.luma.shape
-
-    def full(half: Rows) -> Rows:
-        size = 2 * half.shape[1], 2 * half.shape[0]
-        both = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-        return _rows(both, search)
-
-    return PictureRows(light, full(to_u * u + to_v * v), full(to_u * v - to_v * u))
+    off = (to_u * u + to_v * v, to_u * v - to_v * u)
+    return PictureRows(light, *(_rows(full_size(one, frame), search) for one in off))
 
 
 def _rows(image: ImagePlane | Rows, search: StripeSearch) -> Rows:
@@ -208,7 +210,7 @@ def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     directions = np.array([search.colour.value])
     finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
-    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px)
+    image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px, along_x=False)
     most = _PEAKS_PER_LINE * n_lines
     line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
     n = finder.find(image, _MIN_CONTRAST, 1, line, table)
@@ -321,7 +323,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     height = np.log(np.maximum(table[HEIGHT], _MIN_CONTRAST) / 20.0)
     width = np.log(200.0 * table[WIDTH] / width_px + 0.1)
     n = table.shape[1]
-    along = _believed_along(table) if has_colour else np.full(n, _EXPECTED_ALONG)
+    along = _believed_along(table) if has_colour else np.full(n, RATIO_EXPECTED)
     across = table[ACROSS] if has_colour else np.zeros(n)
     return np.stack(
         [
@@ -332,7 +334,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             height**2,
             width,
             np.minimum(table[ONE_SIDED], _MOST_ONE_SIDED),
-            np.clip(along, 0.0, _LEAST_ALONG),
+            np.clip(along, 0.0, RATIO_LEAST),
             np.log1p(np.maximum(along, 0.0) * table[HEIGHT] / _CHROMA_NOISE),
             np.clip(along, _LEAST_RATIO, 0.0),
             np.minimum(np.abs(across), _MOST_ACROSS),
@@ -345,7 +347,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 def _believed_along(table: FloatArray) -> FloatArray:
     """Return chroma along the laser's colour for each level (P,); a white core says nothing."""
     along = np.minimum(table[ALONG], _MOST_RATIO)
-    believed: FloatArray = np.where(table[TOP] >= _WHITE, np.maximum(along, _LEAST_ALONG), along)
+    believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(along, RATIO_LEAST), along)
     return believed
 
 
@@ -376,7 +378,7 @@ def learn_lines(table: FloatArray, log_odds: FloatArray, *, has_colour: bool) ->
         None where no piece is certain.
     """
     certain = np.flatnonzero(
-        (log_odds > _CERTAIN) & ((table[ALONG] >= _LEAST_ALONG) | (not has_colour))
+        (log_odds > _CERTAIN) & ((table[ALONG] >= RATIO_LEAST) | (not has_colour))
     )
     if len(certain) == 0:
         return None
@@ -413,7 +415,9 @@ def own_evidence(
     return np.concatenate([general, own], axis=1)
 
 
-def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
+def line_log_odds(
+    table: FloatArray, width_px: int, *, has_colour: bool, weights: Weights = WEIGHTS
+) -> FloatArray:
     """Return the log odds that each piece is a laser's line.
 
     Parameters
@@ -424,22 +428,24 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
         Of the picture.
     has_colour : bool
         Whether the picture has chroma.
+    weights : Weights, optional
+        Of the evidence.
 
     Returns
     -------
     array, shape (P,)
         Minus infinity for all where none is certain.
     """
-    log_odds = general_evidence(table, width_px, has_colour=has_colour) @ _GENERAL
+    log_odds = general_evidence(table, width_px, has_colour=has_colour) @ weights.general
     # Dashes in a row are as long as all of them together.
     likely = np.flatnonzero(log_odds > 0.0)
     in_a_row = table[:, likely]
     in_a_row[LENGTH] = _length_in_a_row(in_a_row, width_px)
-    log_odds[likely] = general_evidence(in_a_row, width_px, has_colour=has_colour) @ _GENERAL
+    log_odds[likely] = general_evidence(in_a_row, width_px, has_colour=has_colour) @ weights.general
     lines = learn_lines(table, log_odds, has_colour=has_colour)
     if lines is None:
         return np.full(table.shape[1], -np.inf)
-    found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ _OWN
+    found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ weights.own
     return found
 
 

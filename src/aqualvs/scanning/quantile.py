@@ -1,0 +1,46 @@
+"""Quantiles of measures, the same in every kernel."""
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel, kernel
+
+_N_BINS = 256
+
+
+@kernel
+def element_at(values: FloatArray, share: float) -> float:
+    """Return the value below which a share of the values lie: one of them; 0 of none.
+
+    NaN counts as highest. The values are counted in bins, of which only one is sorted: a partition
+    takes longer, because its branches cannot be foreseen.
+    """
+    n = values.shape[0]
+    if n == 0:
+        return 0.0
+    low, high = np.inf, -np.inf
+    for i in range(n):
+        low = values[i] if values[i] < low else low
+        high = values[i] if values[i] > high else high
+    per_level = _N_BINS / (high - low) if low < high else 0.0
+    count, rank = np.zeros(_N_BINS + 1, np.int64), int(share * (n - 1))
+    for i in range(n):
+        count[_bin_of(values[i], low, per_level)] += 1
+    # The bin that holds it; how many values lie in lower ones.
+    which, below = 0, 0
+    while below + count[which] <= rank:
+        below += count[which]
+        which += 1
+    found, n_found = np.empty(count[which]), 0
+    for i in range(n):
+        if _bin_of(values[i], low, per_level) == which:
+            found[n_found] = values[i]
+            n_found += 1
+    found.sort()
+    return float(found[rank - below])
+
+
+@inline_borrowing_kernel
+def _bin_of(value: float, low: float, per_level: float) -> int:
+    place = (value - low) * per_level
+    return int(place) if place < _N_BINS else _N_BINS
