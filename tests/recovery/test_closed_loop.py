@@ -56,8 +56,13 @@ def test_holds_and_turns_in_calm_water(name: str) -> None:
     """Through the dead zones of the vehicle's sticks, which the link takes out, and thrusters."""
     model = vehicle_model(name)
     for seed in SEEDS:
-        begin = {"start_range": RANGE + 0.03, "start_yaw": math.radians(3.0)}
-        case = SimCase(model=model, gains=load_gains(model.name), seed=seed, **begin)
+        case = SimCase(
+            model=model,
+            gains=load_gains(model.name),
+            start_range=RANGE + 0.03,
+            start_yaw=math.radians(3.0),
+            seed=seed,
+        )
         mission = HoldMission(Setpoint(RANGE))
 
         def step(now_s: float, mission: HoldMission = mission) -> None:
