@@ -27,7 +27,7 @@ from aqualvs.app.batch.season import Season, Steps
 from aqualvs.app.batch.survey import Survey
 from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
 from aqualvs.app.demo import bundled_dive
-from aqualvs.app.run import RunRequest
+from aqualvs.app.run_inputs import RunRequest
 from aqualvs.live.sources.spans import Span, SpanKind
 
 _SHORT, _FRAMES, _PIECE = 100, 300, 100

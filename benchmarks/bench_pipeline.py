@@ -21,8 +21,8 @@ import av
 from benchmarks.dive_files import Dive, small_dive, wide_dive
 from benchmarks.history import machine
 
-from aqualvs.app.run import RunRequest
 from aqualvs.app.run import run as run_dive
+from aqualvs.app.run_inputs import RunRequest
 from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner

@@ -16,8 +16,8 @@ from importlib.resources import files
 import pytest
 import yaml
 
-from aqualvs.app.run import RunRequest, run_and_tell
-from aqualvs.app.run_inputs import FrameWindow
+from aqualvs.app.run import run_and_tell
+from aqualvs.app.run_inputs import FrameWindow, RunRequest
 from aqualvs.calibration.target_files import load_board, load_box
 from aqualvs.control.plan import load_plan
 from aqualvs.live.vehicle_file import load_vehicle

@@ -25,8 +25,8 @@ from aqualvs.app.crew_messages import Ended
 from aqualvs.app.crew_plan import crew_work
 from aqualvs.app.crew_post import Receiver, Sender, SharedMemory
 from aqualvs.app.measuring import Measured, Meter
-from aqualvs.app.run import RunRequest, run
-from aqualvs.app.run_inputs import FrameWindow
+from aqualvs.app.run import run
+from aqualvs.app.run_inputs import FrameWindow, RunRequest
 from aqualvs.errors import SourceError
 from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.run import RunRequest, run
+from aqualvs.app.run import run
+from aqualvs.app.run_inputs import RunRequest
 from aqualvs.errors import SourceError
 from aqualvs.live.recorder import DiveRecording, Recorder, RecorderOptions, Recording, is_recording
 from aqualvs.live.recorder.reader import McapFile

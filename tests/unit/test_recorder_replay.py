@@ -12,8 +12,8 @@ import yaml
 from pyarrow import parquet
 
 from aqualvs.app.cli import main
-from aqualvs.app.run import RunRequest, run
-from aqualvs.app.run_inputs import FrameWindow, Water
+from aqualvs.app.run import run
+from aqualvs.app.run_inputs import FrameWindow, RunRequest, Water
 from aqualvs.errors import OptionError, OutputError, SourceError
 from aqualvs.live.recorder import (
     DiveRecording,

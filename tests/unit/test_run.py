@@ -12,8 +12,8 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.run import RunRequest, run, summary_lines
-from aqualvs.app.run_inputs import FrameWindow, Water, prepared_rig, scanner_options
+from aqualvs.app.run import run, summary_lines
+from aqualvs.app.run_inputs import FrameWindow, RunRequest, Water, prepared_rig, scanner_options
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.truth import compare_with_truth
 from aqualvs.errors import AqualvsError, OptionError, OutputError, SourceError

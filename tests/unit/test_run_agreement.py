@@ -9,8 +9,9 @@ import yaml
 from agreement_cases import Diver, Target
 from aqualvs.app.outputs import RunOutputs, prepare_folder
 from aqualvs.app.report import write_report
-from aqualvs.app.run import RunRequest, run, summary_lines
+from aqualvs.app.run import run, summary_lines
 from aqualvs.app.run_agreement import agreement_of
+from aqualvs.app.run_inputs import RunRequest
 from aqualvs.app.tally import Tally
 from aqualvs.errors import RigError
 from aqualvs.optics.rig import Rig

@@ -21,8 +21,8 @@ import pytest
 
 import aqualvs
 from aqualvs.app.demo import bundled_dive
-from aqualvs.app.run import RunRequest, run
-from aqualvs.app.run_inputs import FrameWindow
+from aqualvs.app.run import run
+from aqualvs.app.run_inputs import FrameWindow, RunRequest
 from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner

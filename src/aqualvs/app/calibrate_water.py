@@ -1,6 +1,5 @@
 """`aqualvs calibrate water`: the index of the water, from a target fixed on the vehicle."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from aqualvs.app.report_findings import Card
 from aqualvs.app.run_inputs import check_fits
 from aqualvs.calibration.detection import detect_markers
 from aqualvs.calibration.index_prior import IndexPrior
-from aqualvs.calibration.index_reading import IndexOptions, IndexStep
+from aqualvs.calibration.index_reading import IndexOptions
 from aqualvs.calibration.pose_files import picture_paths
 from aqualvs.calibration.target_files import load_target
 from aqualvs.calibration.targets import MarkerSet
@@ -36,8 +35,6 @@ from aqualvs.optics.solved import (
 )
 
 _FPS = 25.0
-# Fresh water and sea water are 0.008 apart: an index known half as well still says which.
-_LARGEST_SIGMA = 4e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,12 +79,12 @@ def calibrate_water(request: WaterRequest, tell: Tell) -> None:
         [time_s for time_s, _ in shots],
         uncertainty=rig_uncertainty(rig),
         prior=prior,
-        options=index_options(request.place_sigma_mm, request.turn_sigma_deg),
+        options=IndexOptions.of_target(request.place_sigma_mm, request.turn_sigma_deg),
     )
     _check(result)
     solved = _noted(rig, result)
     tell(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(shots)} pictures")
-    for line in (*result.remarks, *map(step_words, result.steps)):
+    for line in (*result.remarks, *(step.text() for step in result.steps)):
         tell(line)
     finish(
         solved,
@@ -96,25 +93,6 @@ def calibrate_water(request: WaterRequest, tell: Tell) -> None:
         "water",
         tell,
         comments_of=request.rig,
-    )
-
-
-def index_options(place_sigma_mm: float, turn_sigma_deg: float) -> IndexOptions:
-    """Return what is assumed of a target whose place is known so well."""
-    return IndexOptions(
-        sigma_place=place_sigma_mm / 1e3,
-        sigma_turn=math.radians(turn_sigma_deg),
-        largest_sigma=_LARGEST_SIGMA,
-    )
-
-
-def step_words(step: IndexStep) -> str:
-    """Return an alarm as one line for people."""
-    if not step.by_medium:
-        return f"at {step.time:.1f} s the target or the lens has moved; fix and measure it again"
-    return (
-        f"at {step.time:.1f} s the index stepped by {step.size:+.4f} ± {step.sigma:.4f}: other "
-        "water, a leak or a pollutant"
     )
 
 
@@ -180,7 +158,7 @@ def _page(
             Card("changes seen", f"{result.sigma_random:.1e}", "what more pictures would lessen"),
             Card("pictures", str(len(counted)), f"{result.rms_px:.3f} px rms"),
         ),
-        warnings=tuple(map(step_words, result.steps)),
+        warnings=tuple(step.text() for step in result.steps),
         words=result.remarks,
         expectations=expectations(rig),
         series=(

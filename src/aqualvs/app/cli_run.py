@@ -76,9 +76,9 @@ def run(
         from aqualvs.app import run as body
         from aqualvs.app.crew_start import n_cores
         from aqualvs.app.net_request import NetRequest
-        from aqualvs.app.run_inputs import FrameWindow, Water, scanner_options
+        from aqualvs.app.run_inputs import FrameWindow, RunRequest, Water, scanner_options
 
-    request = body.RunRequest(
+    request = RunRequest(
         source=source,
         rig=rig,
         out=out,

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from aqualvs.app.run import RunRequest, run_and_tell
+from aqualvs.app.run import run_and_tell
+from aqualvs.app.run_inputs import RunRequest
 from aqualvs.errors import SourceError
 
 _FILES = ("dive.mp4", "rig.yaml", "truth.csv")

@@ -18,8 +18,8 @@ from aqualvs.app.outputs import (
 )
 from aqualvs.app.progress import progress
 from aqualvs.app.report import write_report
-from aqualvs.app.run import RunRequest, run_and_tell
-from aqualvs.app.run_inputs import scanner_options
+from aqualvs.app.run import run_and_tell
+from aqualvs.app.run_inputs import RunRequest, scanner_options
 from aqualvs.app.runfile import read_run_yaml
 from aqualvs.app.stopping import StopSignals
 from aqualvs.app.stored_scans import check_stored, stored_scans

@@ -9,9 +9,8 @@ from aqualvs.app.outputs import POSTURE_CSV, RunOutputs, prepare_folder
 from aqualvs.app.overwriting import Claim
 from aqualvs.app.progress import Tick
 from aqualvs.app.report import write_report
-from aqualvs.app.run import RunRequest
 from aqualvs.app.run_bare_lens import RunBareLens
-from aqualvs.app.run_inputs import source_facts
+from aqualvs.app.run_inputs import RunRequest, source_facts
 from aqualvs.app.run_mcap import RunMcap, check_source_stays
 from aqualvs.app.run_net import RunNet
 from aqualvs.app.run_overlay import RunOverlay

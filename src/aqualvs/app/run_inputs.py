@@ -1,9 +1,10 @@
 """What `aqualvs run` is asked to do, checked before anything is written."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from aqualvs.app.net_request import NetRequest
 from aqualvs.app.target_file import target_facts
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.sources import FrameSource
@@ -86,6 +87,76 @@ class FrameWindow:
         """Return how many frames of a source of `n_source` lie in the window, if known."""
         ends = [end for end in (self.stop, n_source) if end is not None]
         return max(0, min(ends) - self.first) if ends else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunRequest:
+    """What to run.
+
+    Attributes
+    ----------
+    source : str
+        Path or address, as `open_source` takes it, or a recording.
+    rig : Path or None
+        None takes that of a recording; other sources need one.
+    out : Path
+        Folder to write.
+    overwrite : bool
+        Whether a run that is already there may be replaced.
+    water : Water
+    no_dome : bool
+        Leave refraction at the dome out, for comparison.
+    frames : FrameWindow
+    fps : float or None
+        Frame rate of image folders.
+    scanner : ScannerOptions
+    chosen : frozenset of str or None
+        Fields of `scanner` that count for a recording, whose own options stand for the others.
+        None: all of them.
+    mcap : bool
+        Whether to write `dive.mcap`.
+    overlay, report : bool
+        Whether to write `overlay.mp4` and `report.html`.
+    truth : Path or None
+        Truth to compare with.
+    index_target : Path or None
+        Markers on the vehicle that tell the water's index, followed frame by frame.
+    net : NetRequest or None
+        What to find out about the net on the way, if anything.
+    target : str
+        As the command line has it: a file may say what the net is, which is then checked.
+    n_processes : int
+        Processes that measure, where the dive can be shared; what is found is the same. A program
+        that asks for several must be safe to import, as `multiprocessing` wants it.
+    """
+
+    source: str
+    rig: Path | None
+    out: Path
+    overwrite: bool = False
+    water: Water = field(default_factory=Water)
+    no_dome: bool = False
+    frames: FrameWindow = field(default_factory=FrameWindow)
+    fps: float | None = None
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    chosen: frozenset[str] | None = None
+    mcap: bool = False
+    overlay: bool = False
+    report: bool = True
+    truth: Path | None = None
+    index_target: Path | None = None
+    net: NetRequest | None = None
+    target: str = "auto"
+    n_processes: int = 1
+
+    def facts(self) -> dict[str, Any]:
+        """Return the options as `run.yaml` holds them."""
+        rig_file = None if self.rig is None else str(self.rig)
+        found: dict[str, Any] = {"rig_file": rig_file, "no_dome": self.no_dome}
+        found |= asdict(self.water)
+        found |= {"first_frame": self.frames.first, "stop_frame": self.frames.stop}
+        found["index_target"] = None if self.index_target is None else str(self.index_target)
+        return found | {"scanner": scanner_facts(self.scanner)}
 
 
 def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> ScannerOptions:

@@ -52,8 +52,8 @@ class WaterFollowingScanner:
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
-        from aqualvs.app.calibrate_water import index_options
         from aqualvs.calibration.index_estimator import IndexEstimator
+        from aqualvs.calibration.index_reading import IndexOptions
         from aqualvs.calibration.target_files import load_target
 
         self._rig, self._options, self._target = rig, options, target
@@ -63,7 +63,7 @@ class WaterFollowingScanner:
             rig,
             uncertainty=rig_uncertainty(rig),
             prior=_prior(water, rig),
-            options=index_options(_PLACE_MM, _TURN_DEG),
+            options=IndexOptions.of_target(_PLACE_MM, _TURN_DEG),
         )
         self._next_s = -np.inf
         self._n_read = 0
@@ -82,8 +82,6 @@ class WaterFollowingScanner:
 
     def lines(self) -> list[str]:
         """Return what the run's summary says of the water."""
-        from aqualvs.app.calibrate_water import step_words
-
         last = self._last
         if last is None:
             return [
@@ -93,7 +91,7 @@ class WaterFollowingScanner:
         found = [f"water index {last.n:.5f} ± {last.sigma:.5f} from {self._n_read} frames"]
         if not last.observable:
             found.append("the pictures alone cannot tell the index; see aqualvs check")
-        return found + [step_words(step) for step in self._estimator.steps]
+        return found + [step.text() for step in self._estimator.steps]
 
     def is_due(self, frame: Frame) -> bool:
         """Return whether the target should be read in this frame."""

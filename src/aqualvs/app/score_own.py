@@ -8,8 +8,8 @@ from pathlib import Path
 from aqualvs.app.disk import writing
 from aqualvs.app.outputs import POSTURE_BARE_CSV
 from aqualvs.app.overwriting import Claim
-from aqualvs.app.run import RunRequest, run
-from aqualvs.app.run_inputs import scanner_options
+from aqualvs.app.run import run
+from aqualvs.app.run_inputs import RunRequest, scanner_options
 from aqualvs.app.score_set import TARGET_FILE, BenchmarkSet
 from aqualvs.app.target_file import target_facts
 from aqualvs.scanning.target import TargetKind

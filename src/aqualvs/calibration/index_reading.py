@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -15,6 +16,8 @@ _MOVED = 4.0
 _LOST_FRAMES = 10
 # Corners that are off by so many times what was expected of them.
 _CROOKED = 2.0
+# Fresh water and sea water are 0.008 apart: an index known half as well still says which.
+_LARGEST_SIGMA = 4e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +58,18 @@ class IndexOptions:
             if not (math.isfinite(value) and value >= 0.0):
                 raise OptionError(f"{name} is {value:g}; give a number that is not negative")
 
+    @classmethod
+    def of_target(cls, place_sigma_mm: float, turn_sigma_deg: float) -> Self:
+        """Return the options for a target whose place on the vehicle is known so well.
+
+        An index counts as observable where it still tells fresh water from sea water.
+        """
+        return cls(
+            sigma_place=place_sigma_mm / 1e3,
+            sigma_turn=math.radians(turn_sigma_deg),
+            largest_sigma=_LARGEST_SIGMA,
+        )
+
     @property
     def pose_sigmas(self) -> FloatArray:
         """Turn and shift of the target, shape (6,)."""
@@ -80,6 +95,17 @@ class IndexStep:
     size: float
     sigma: float
     by_medium: bool
+
+    def text(self) -> str:
+        """Return the alarm as one line."""
+        if not self.by_medium:
+            return (
+                f"at {self.time:.1f} s the target or the lens has moved; fix and measure it again"
+            )
+        return (
+            f"at {self.time:.1f} s the index stepped by {self.size:+.4f} ± {self.sigma:.4f}: "
+            "other water, a leak or a pollutant"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,8 +24,7 @@ from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
 from aqualvs.app.disk import read_json, writing
 from aqualvs.app.net_request import NetRequest
 from aqualvs.app.overwriting import Claim
-from aqualvs.app.run import RunRequest
-from aqualvs.app.run_inputs import Water
+from aqualvs.app.run_inputs import RunRequest, Water
 from aqualvs.app.stopping import StopSignals
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.scanning.pipeline import ScannerOptions

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from aqualvs.app.measuring import ScansFrames
-from aqualvs.app.run import RunRequest, following_for
-from aqualvs.app.run_inputs import check_fits, prepared_rig
+from aqualvs.app.run import following_for
+from aqualvs.app.run_inputs import RunRequest, check_fits, prepared_rig
 from aqualvs.app.run_replay import Replay, ReplayRequest, replay_of
 from aqualvs.app.runfile import versions
 from aqualvs.app.target_file import target_facts
