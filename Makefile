@@ -17,9 +17,13 @@ setup: $(STAMP) ## Make .venv with the package and the tools of developers
 demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
 	$(BIN)/aqualvs demo -o out/demo --overwrite
 
-test: $(STAMP) ## Run all tests: those that watch a clock one by one, the others two at a time
-	$(BIN)/python -m pytest --ignore=tests/live --numprocesses=2 --dist=loadfile
-	$(BIN)/python -m pytest tests/live
+# Three files at a time: on two cores, one that works while others wait. In the order of the folders,
+# since the longest files are those of cli, docs and recovery; by their number of tests, which is
+# what xdist would go by, files of few and long tests would be left to the end.
+test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one folder (PART=cli)
+	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
+	  --durations=30 --durations-min=5 \
+	  $(if $(PART),tests/$(PART))
 
 fuzz: $(STAMP) ## Try 2,000 malformed files and options (SEED=1 CASES=2000); lists what is not refused
 	PYTHONPATH=tests $(BIN)/python tests/fuzz_cases.py --seed $(or $(SEED),1) --cases $(or $(CASES),2000)

@@ -5,7 +5,10 @@
 
 import argparse
 import contextlib
+import importlib
+import io
 import os
+import pkgutil
 import random
 import re
 import resource
@@ -20,15 +23,17 @@ import typing
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import typer
 
+import aqualvs
 from aqualvs.app import cli
 from aqualvs.app.cli import main
+from aqualvs.errors import SourceError
 
 CPU_S = 20
 WALL_S = 60
@@ -40,6 +45,9 @@ _FILE_BYTES = 1 << 30
 
 TIMES: list[tuple[float, str]] = []
 """Time of the processor that each case took, in seconds."""
+PROCESSES: Counter[bool] = Counter()
+"""Cases in copies of this process (False), and in processes of their own (True)."""
+_WHOLE_EVERY = 50
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,8 @@ class Case:
     arguments: Sequence[object] | Callable[[], object]
     names: tuple[str, ...]
     refused: bool = False
+    whole: bool = False
+    """Whether the program is started anew; else a copy of this process, which has loaded all."""
 
 
 def fault_of(case: Case, folder: Path) -> str:
@@ -75,6 +85,7 @@ def fault_of(case: Case, folder: Path) -> str:
         child = os.fork()
     if child == 0:
         _run_and_leave(case, folder, out, err)
+    PROCESSES[case.whole] += 1
     deadline = time.monotonic() + WALL_S
     while True:
         done, status, used = os.wait4(child, os.WNOHANG)
@@ -108,6 +119,10 @@ def _run_and_leave(case: Case, folder: Path, out: Path, err: Path) -> None:
         os.dup2(nowhere, 0)
         for number, path in ((1, out), (2, err)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+        if case.whole and not callable(case.arguments):
+            words = [os.fsencode(str(one)) for one in case.arguments]
+            os.environ["PYTHONPATH"] = str(Path(aqualvs.__file__).parents[1])
+            os.execv(sys.executable, [sys.executable, "-m", "aqualvs", *words])
         sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
         sys.stderr = os.fdopen(2, "w", encoding="utf-8", closefd=False)
         code = _exit_code(case)
@@ -294,6 +309,27 @@ class Format:
     binary: bool = False
     optional: bool = False
     inside: Path | None = None
+
+
+def look_at(path: Path) -> None:
+    """Look at a source as `aqualvs doctor` does, without looking at the machine each time."""
+    from aqualvs.app import doctor
+
+    broken = [
+        one.sentence for one in doctor._stream(str(path), None) if one.severity.value == "bad"
+    ]
+    if broken:
+        raise SourceError(f"not ready: {broken[0]}")
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _below(path: Path, name: str) -> Path:
+    """Return the folder of a name that a path lies in."""
+    return next(one for one in path.parents if one.name == name)
 
 
 @dataclass
@@ -502,7 +538,18 @@ class Bench:
                 [lambda p: lambda: read_sdp(p)],
             )
         )
-        add(Format("dive.mp4", dive.read_bytes(), [measure], binary=True))
+        add(
+            Format(
+                "dive.mp4",
+                dive.read_bytes(),
+                [
+                    measure,
+                    lambda p: ["live", p, "--rig", rig, "--fast"],
+                    lambda p: lambda: look_at(p),
+                ],
+                binary=True,
+            )
+        )
         add(
             Format(
                 "dive.mcap",
@@ -594,8 +641,97 @@ class Bench:
                     inside=run,
                 )
             )
-        self._make_foreign()
         self.run, self.rig, self.dive, self.small = run, rig, dive, small_pictures
+        self._make_foreign()
+        self._make_settings()
+        self._load_all()
+
+    def _make_settings(self) -> None:
+        """Add files that say who is there, what was before, and what is true."""
+        from aqualvs.app.mavlink_options import vehicle_setup
+        from aqualvs.live.mavlink_signing import load_key
+
+        vehicle = (
+            b"aqualvs_vehicle: 1\nsystem: 2\nground_station: 250\nstation_timeout_s: 3.5\n"
+            b"command: guided\nmodes: [ALT_HOLD]\nspeed_m_s: 0.3\npeers: [192.168.2.2]\n"
+            b"key: secret.key\n"
+        )
+        key = b"7" * 64 + b"\n"
+        copies, marks = self.home / "copies", self.home / "set"
+        for folder in (copies, marks / "a"):
+            folder.mkdir(parents=True)
+        (copies / "rig.yaml").write_bytes(self.rig.read_bytes())
+        (copies / "rig.2026-01-01T000000.yaml").write_bytes(self.rig.read_bytes())
+        named = b"aqualvs_benchmark: 1\nname: x\nchecksum: '0'\nwhole: true\n"
+        (marks / "benchmark.yaml").write_bytes(named + b"dives: {a: {level: easy}}\n")
+        rows = "".join(f"{i},{0.5 + 0.01 * i},1,2,300\n" for i in range(3))
+        (marks / "a" / "truth.csv").write_text(f"frame,range_m,pitch_deg,yaw_deg,n_visible\n{rows}")
+        answers = self.home / "answers.csv"
+        answers.write_text(
+            "dive,frame,range_m,pitch_deg,yaw_deg,sigma_range_m\n"
+            + "".join(f"a,{i},{0.5 + 0.01 * i},1,2,0.001\n" for i in range(3))
+        )
+        secret = self.home / "secret.key"
+        secret.write_bytes(key)
+        secret.chmod(0o600)
+
+        def setup(path: Path) -> Callable[[], object]:
+            return lambda: vehicle_setup(path, ["192.168.2.0/24"], secret)
+
+        def score(path: Path) -> list[object]:
+            return ["score", f"mine={path}", "--truth", marks, "-o", "out"]
+
+        def against_last(path: Path) -> list[object]:
+            return ["check", path.parent / "rig.yaml", "--against", "last"]
+
+        add = self.formats.append
+        add(Format("vehicle.yaml", vehicle, [setup]))
+        add(Format("secret.key", key, [lambda p: lambda: load_key(p)], optional=True))
+        for name in ("rig.yaml", "rig.2026-01-01T000000.yaml"):
+            base = self.rig.read_bytes()
+            add(Format(name, base, [against_last], inside=copies, optional=True))
+        add(Format("answers.csv", answers.read_bytes(), [score]))
+        for name in ("benchmark.yaml", "a/truth.csv"):
+            add(
+                Format(
+                    name,
+                    (marks / name).read_bytes(),
+                    [lambda p: ["score", f"mine={answers}", "--truth", _below(p, "odd")]],
+                    inside=marks,
+                )
+            )
+        for name in (".aqualvs.json", "points.ply", "net_map.svg"):
+            calls = [
+                lambda p: ["report", p.parent],
+                lambda p: ["net", p.parent, "--overwrite"],
+            ]
+            path = self.run / name
+            add(Format(name, path.read_bytes(), calls, binary=True, optional=True, inside=self.run))
+
+    def _load_all(self) -> None:
+        """Load every module and the compiled functions, so that no copy has to."""
+        for found in pkgutil.walk_packages(aqualvs.__path__, "aqualvs."):
+            if not found.name.endswith("__main__"):
+                importlib.import_module(found.name)
+        work = self.home / "loading"
+        work.mkdir()
+        said = io.StringIO()
+        with (
+            contextlib.chdir(work),
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
+        ):
+            for name in ("rig.yaml", "board.yaml", "charuco.yaml", "gains.yaml", "truth.csv"):
+                kind = next(one for one in self.formats if one.name == name)
+                path = work / name
+                path.write_bytes(kind.base)
+                call = kind.calls[0](path)
+                assert not callable(call)
+                main([str(one) for one in call])
+            main(["doctor"])
+            dates = ["--date", "2026-01-01", "--date", "2026-02-01"]
+            again = shutil.copytree(self.run, work / "run")
+            main(["net-change", str(self.run), str(again), *dates, "-o", "change"])
 
     def _make_foreign(self) -> None:
         """Add logs and recordings that other programs write, as their own tests make them."""
@@ -619,9 +755,16 @@ class Bench:
             self.formats.append(Format(name, data, call, binary=name != "dive.log"))
         foreign = messages.write_mcap(self.home / "foreign.mcap", [messages.compressed_image()])
         video = messages.write_mcap(self.home / "video.mcap", [messages.compressed_video()])
-        for path in (foreign, video, messages.bag1(self.home / "foreign.bag")):
-            call = [lambda p: lambda: list(open_source(p))]
+        call = [lambda p: lambda: list(open_source(p))]
+        bags = {kind: make(_made(self.home / kind)) for kind, make in messages.PACKED.items()}
+        lone = (foreign, video, messages.bag1(self.home / "foreign.bag"))
+        for path in (*lone, *(one for one in bags.values() if one.is_file())):
             self.formats.append(Format(path.name, path.read_bytes(), call, binary=True))
+        read = [lambda p: lambda: list(open_source(p.parent))]
+        for bag in (one for one in bags.values() if one.is_dir()):
+            for path in sorted(bag.iterdir()):
+                form = Format(path.name, path.read_bytes(), read, inside=bag, optional=True)
+                self.formats.append(replace(form, binary=path.suffix != ".yaml"))
 
     def file_cases(self, rng: random.Random, n: int, folder: Path) -> Iterator[Case]:
         """Yield cases of malformed files, each written to a folder of its own."""
@@ -645,7 +788,7 @@ class Bench:
         call = rng.choice(kind.calls)(path)
         # A CSV of a run without rows, or garbage beside sound files, is told as a warning.
         given = () if callable(call) else (one.name for one in call if isinstance(one, Path))
-        names = ("odd", "RUN", "--out", *given)
+        names = ("odd", "answers.csv", "RUN", "--out", *given)
         return Case(
             f"file {kind.name} in {folder.name}", call, names, certain and not kind.optional
         )
@@ -676,6 +819,8 @@ class Bench:
             "source": self.small,
             "images": self.small,
             "board": self.home / "charuco.yaml",
+            "truth": self.home / "set",
+            "results": self.home / "answers.csv",
             "target": self.home / "plate.yaml",
             "folder": self.run,
             "runs": self.run,
@@ -710,10 +855,14 @@ class Bench:
                 name,
                 name.lower().lstrip("-").replace("-", "_"),
                 shown[:30] or name,
+                # Paths have no doubled slashes, and numbers are shown shortened.
+                str(Path(value))[:30],
+                _shortened(value),
                 # Another option may be missing, or contradict it.
                 "--",
                 "No such option",
                 str(self.home),
+                "charuco.yaml",
                 *words,
             ),
             certain,
@@ -736,12 +885,19 @@ _VALUES = [(value, True) for value in _NO_NUMBERS] + [
 
 
 def commands(group, name=()) -> Iterator[tuple[tuple[str, ...], typer.core.TyperCommand]]:
-    """Yield every command with the words that call it."""
+    """Yield every command with the words that call it, but for those that work for hours."""
     for word, command in group.commands.items():
         if hasattr(command, "commands"):
             yield from commands(command, (*name, word))
-        elif word not in ("demo", "reproduce"):
+        elif word not in ("demo", "reproduce", "benchmark"):
             yield (*name, word), command
+
+
+def _shortened(value: str) -> str:
+    try:
+        return f"{float(value):g}"
+    except ValueError:
+        return value
 
 
 def _takes_float(words: tuple[str, ...], name: str) -> bool:
@@ -764,10 +920,17 @@ def failures(bench: Bench, seed: int, n_cases: int, folder: Path, tell=None) -> 
         bench.option_cases(rng, n_options, folder),
     )
     for cases in streams:
-        for case in cases:
+        for i, case in enumerate(cases):
+            # One in each few goes the whole way, through a process that begins with nothing.
+            if i % _WHOLE_EVERY == _WHOLE_EVERY - 1:
+                case = replace(case, whole=not callable(case.arguments))
             where = folder / "here"
             fault = fault_of(case, where)
             shutil.rmtree(where, ignore_errors=True)
+            if fault.startswith("hangs") and not case.whole:
+                # A copy can inherit a lock that a thread of this process held at that moment.
+                fault = fault_of(replace(case, whole=not callable(case.arguments)), where)
+                shutil.rmtree(where, ignore_errors=True)
             if fault:
                 found.append(f"{case.name}: {fault}")
                 if tell is not None:
@@ -798,6 +961,7 @@ def run_cases() -> int:
     print(
         f"{asked.cases} cases of seed {asked.seed} in {taken_s:.0f} s: {len(found)} failed", kinds
     )
+    print(f"{PROCESSES[True]} of them through a process of their own")
     print(f"{sum(taken for taken, _ in TIMES):.0f} s of the processor, of which most:")
     for taken, name in sorted(TIMES, reverse=True)[:8]:
         print(f"{taken:6.1f} s of the processor: {name}")

@@ -73,6 +73,12 @@ def demo_samples(n: int = 8) -> list[LiveSample]:
     return found
 
 
+@functools.cache
+def first_sample() -> LiveSample:
+    """The first sample of the dive; measured when first asked for, not at the import."""
+    return demo_samples(1)[0]
+
+
 def renumbered(frame: Frame, index: int) -> Frame:
     """The same picture as another frame of a 25 Hz stream."""
     return Frame(index, 0.04 * index, frame.luma, frame.chroma)

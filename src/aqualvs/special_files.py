@@ -13,7 +13,11 @@ _KINDS = {
 }
 
 
-def refuse_special(path: Path, error: type[AqualvsError] = SourceError) -> None:
+def refuse_special(
+    path: Path,
+    error: type[AqualvsError] = SourceError,
+    remedy: str = "give a file or a folder",
+) -> None:
     """Refuse a path at which there is neither a file nor a folder; one that is free is fine.
 
     Raises
@@ -27,4 +31,4 @@ def refuse_special(path: Path, error: type[AqualvsError] = SourceError) -> None:
         # Whoever opens the path says what is wrong with it.
         return
     if kind is not None:
-        raise error(f"{path}: is {kind}; give a file or a folder")
+        raise error(f"{path}: is {kind}; {remedy}")

@@ -6,13 +6,13 @@ built by recursion, so that no file, however nested, exhausts the stack.
 """
 
 import re
-import stat
 from pathlib import Path
 from typing import Any, Final
 
 import yaml
 
 from aqualvs.errors import AqualvsError
+from aqualvs.special_files import refuse_special
 
 __all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "parse_yaml", "read_text", "read_yaml"]
 
@@ -89,12 +89,9 @@ def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
     """
     remedy = f"give the path of {what}"
     try:
-        mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
+        if path.is_dir():
             raise error(f"{path}: is a folder; {remedy} in it")
-        # To open a FIFO may wait for ever; a device may have no end.
-        if not stat.S_ISREG(mode):
-            raise error(f"{path}: is no regular file; {remedy}")
+        refuse_special(path, error, remedy)
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except FileNotFoundError:

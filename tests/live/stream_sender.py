@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import json
 import random
+import select
 import socket
 import struct
 import sys
@@ -177,7 +178,7 @@ def send_clips(options, send):
             head, pictures = read_clip(Path(path))
             if n_frames == 0 or len(options.clips) > 1:
                 muxer = Muxer(options.kind, relay.push, head, options.ssrc + repeat)
-            for i, data in enumerate(pictures):
+            for i, data in in_order(pictures, options.again):
                 if n_frames in options.hold:
                     held = time.monotonic()
                     sys.stdin.readline()
@@ -195,6 +196,16 @@ def send_clips(options, send):
         "lost": relay.n_lost,
         "damaged": relay.n_damaged,
     }
+
+
+def in_order(pictures, n_again):
+    """Give the pictures with their numbers; before, the first ones until there is a line of input.
+
+    So a test can wait for what comes of the first ones, however long that takes.
+    """
+    while n_again and not select.select([sys.stdin], [], [], 0.0)[0]:
+        yield from enumerate(pictures[:n_again])
+    yield from enumerate(pictures)
 
 
 def to_port(port):
@@ -276,6 +287,7 @@ def parse_options():
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--rtsp", action="store_true", help="serve on the port, do not send to it")
     parser.add_argument("--repeat", type=int, default=1)
+    parser.add_argument("--again", type=int, default=0, help="so many first, until a line of input")
     parser.add_argument("--speed", type=float, default=1.0)
     parser.add_argument("--loss", type=float, default=0.0)
     parser.add_argument("--damage", type=float, default=0.0)

@@ -3,17 +3,19 @@
 import contextlib
 import csv
 import importlib.resources
+import json
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ from aqualvs.app.follow import FOLLOW_CSV
 from aqualvs.live.colour import bgr_of
 from aqualvs.live.recorder import DiveRecording, is_recording
 from live_cases import demo_frames, demo_rig
+from ports import free_port
 from shell_cases import write_video
 from waiting import PATIENCE_S
 
@@ -34,41 +37,54 @@ SENDER = Path(__file__).with_name("stream_sender.py")
 COMMAND = (sys.executable, "-c", "import sys; from aqualvs.app.cli import main; sys.exit(main())")
 
 
-N_FRAMES, FROZEN_FROM_S = 500, 4.0
+FPS = 25
+# The noise of a camera repeats after so many pictures, and clips begin again at a multiple.
+N_NOISE = 11
+N_FRAMES, N_STILL = 5 * N_NOISE, 4 * FPS
 
 
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:
     """A net that stands still at 0.47 m, with the noise of a camera."""
     image, rng = bgr_of(demo_frames(40)[-1]), np.random.default_rng(4)
-    noise = (rng.normal(0.0, 3.0, image.shape) for _ in range(11))
+    noise = (rng.normal(0.0, 3.0, image.shape) for _ in range(N_NOISE))
     return [np.clip(image + one, 0, 255).astype(np.uint8) for one in noise]
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -> Path:
-    """Twenty seconds before it."""
-    path = tmp_path_factory.mktemp("clip") / "live.mp4"
-    write_video(
-        path,
+    """Before it for longer than anything is waited for: the same pictures again and again."""
+    folder = tmp_path_factory.mktemp("clip")
+    short = write_video(
+        folder / "short.mp4",
         N_FRAMES,
         size=demo_rig().size_px,
-        options={"preset": "ultrafast", "crf": "18"},
+        options={"preset": "ultrafast", "crf": "23"},
         content=lambda i, _size: pictures[i % len(pictures)],
     )
+    path = folder / "live.mp4"
+    with av.open(str(short)) as source, av.open(str(path), "w") as container:
+        stream = container.add_stream_from_template(source.streams.video[0])
+        packets = [packet for packet in source.demux(video=0) if packet.size]
+        assert packets[0].is_keyframe
+        for i in range(round(PATIENCE_S * FPS)):
+            packet = av.Packet(bytes(packets[i % N_FRAMES]))
+            packet.stream, packet.time_base = stream, Fraction(1, FPS)
+            packet.pts = packet.dts = i
+            packet.is_keyframe = packets[i % N_FRAMES].is_keyframe
+            container.mux(packet)
     return path
 
 
 @pytest.fixture(scope="module")
 def freezing(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -> Path:
-    """Four seconds before it, as a stream; then an encoder gets one picture again and again."""
+    """Before it, as a stream; then an encoder gets one picture again and again."""
 
     def content(_size: tuple[int, int], n: int) -> Iterator[np.ndarray]:
-        last = round(25 * FROZEN_FROM_S) - 1
-        return (pictures[min(i, last) % len(pictures)] for i in range(n))
+        return (pictures[min(i, N_FRAMES - 1) % len(pictures)] for i in range(n))
 
     path = tmp_path_factory.mktemp("clip") / "freezing"
-    return make_clip(path, demo_rig().size_px, 2 * round(25 * FROZEN_FROM_S), content=content)
+    return make_clip(path, demo_rig().size_px, N_FRAMES + N_STILL, content=content)
 
 
 @dataclass
@@ -213,14 +229,23 @@ def assert_logged(path: Path) -> None:
 def test_a_picture_that_stands_still_ends_the_thrust(freezing: Path, tmp_path: Path) -> None:
     fake = Fake("--lapse", "0.5")
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
-            found.bind(("127.0.0.1", 0))
-            port = found.getsockname()[1]
+        port = free_port()
         source = f"udp://127.0.0.1:{port}"
         with follow(fake, source, tmp_path, "--range", "0.9") as one:
             one.engage()
             sender = [sys.executable, str(SENDER), str(freezing), "--port", str(port)]
-            subprocess.run(sender, stdout=subprocess.DEVNULL, check=True, timeout=PATIENCE_S)
+            with subprocess.Popen(
+                [*sender, "--again", str(N_FRAMES)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            ) as stream:
+                try:
+                    until(lambda: len(sticks(fake)) > 20, "efforts")
+                    told, _ = stream.communicate("\n", timeout=PATIENCE_S)
+                finally:
+                    stream.kill()
+            n_sent = json.loads(told.splitlines()[-1])["frames"]
             one.process.send_signal(signal.SIGTERM)
             one.process.wait(PATIENCE_S)
     finally:
@@ -228,10 +253,11 @@ def test_a_picture_that_stands_still_ends_the_thrust(freezing: Path, tmp_path: P
     with (tmp_path / FOLLOW_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     pushed = [float(row["frame_time_s"]) for row in rows if float(row["forward"]) != 0.0]
-    assert pushed[0] < FROZEN_FROM_S
+    frozen_from_s = (n_sent - N_STILL) / FPS
+    assert pushed[0] < frozen_from_s
     # By the stream's clock. A busy machine skips frames, and the stream's usual noise is then known
     # later; tests/unit/test_answer.py has the half second.
-    assert pushed[-1] <= FROZEN_FROM_S + 1.0
-    frozen = [row for row in rows if float(row["frame_time_s"]) > FROZEN_FROM_S + 1.0]
+    assert pushed[-1] <= frozen_from_s + 1.0
+    frozen = [row for row in rows if float(row["frame_time_s"]) > frozen_from_s + 1.0]
     assert {row["posture"] for row in frozen} <= {"frozen", "no_frames"}
     assert "frozen" in {row["reason"] for row in frozen}

@@ -25,6 +25,7 @@ from aqualvs.live.colour import bgr_of
 from aqualvs.live.recorder import DiveRecording, is_recording
 from aqualvs.optics.rigfile import load_rig
 from live_cases import demo_frames, demo_rig
+from ports import free_port
 from waiting import PATIENCE_S, until
 
 SENDER = Path(__file__).with_name("stream_sender.py")
@@ -73,12 +74,6 @@ def rig_file() -> Path:
     return Path(str(importlib.resources.files("aqualvs") / "data" / "demo" / "rig.yaml"))
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
 @dataclass
 class Live:
     """The command under test, and the JSON lines that it sends."""
@@ -114,7 +109,7 @@ class Live:
 @contextlib.contextmanager
 def live(rig: Path, *options: str, **process: Any) -> Iterator[Live]:
     """Run the command on a port of its own, listening to its JSON."""
-    port = free_udp_port()
+    port = free_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind(("127.0.0.1", 0))
         wire.settimeout(0.2)

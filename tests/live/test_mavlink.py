@@ -6,7 +6,6 @@ import json
 import os
 import queue
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -23,17 +22,22 @@ from aqualvs.live.health import State
 from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
 from aqualvs.live.outputs import mavlink_ports
 from aqualvs.live.outputs.mavlink import MavlinkOutput
+from aqualvs.live.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
-from live_cases import demo_samples
+from live_cases import first_sample
+from ports import free_port
 from waiting import PATIENCE_S, until
 
 pytest.importorskip("pymavlink")
 
-SAMPLE = demo_samples(1)[0]
-BLIND = replace(SAMPLE, scan=replace(SAMPLE.scan, posture=Refusal(Reason.NO_FRAMES)))
 # No call may wait for the other side, which would take a quarter of a second at least; a busy
 # machine holds up some calls, but not half of them for so long.
 CALL_S = 0.05
+
+
+def without_posture() -> LiveSample:
+    scan = replace(first_sample().scan, posture=Refusal(Reason.NO_FRAMES))
+    return replace(first_sample(), scan=scan)
 
 
 class Peer:
@@ -143,18 +147,12 @@ def stream(output: MavlinkOutput, condition: Callable[[], object], what: str) ->
 
     def sent() -> object:
         start = time.perf_counter()
-        output.send(SAMPLE)
+        output.send(first_sample())
         took.append(time.perf_counter() - start)
         return condition()
 
     until(sent, what)
     return took
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_the_autopilot_gets_what_was_measured(lab: Lab) -> None:
@@ -166,8 +164,8 @@ def test_the_autopilot_gets_what_was_measured(lab: Lab) -> None:
     assert (beat["fields"]["type"], beat["fields"]["autopilot"]) == (18, 8)
     becomes(output, State.OK, "autopilot sysid 1 ArduSub seen 0.")
 
-    output.send(SAMPLE)
-    posture = SAMPLE.scan.posture
+    output.send(first_sample())
+    posture = first_sample().scan.posture
     assert posture
     found = peer.wait_for("DISTANCE_SENSOR")["fields"]
     assert found["current_distance"] == round(100 * posture.range)
@@ -177,19 +175,19 @@ def test_the_autopilot_gets_what_was_measured(lab: Lab) -> None:
     assert variance > round(1e4 * float(posture.covariance[0, 0]))
     assert (found["type"], found["orientation"], found["covariance"]) == (0, 0, variance)
     assert 2 <= found["signal_quality"] <= 100
-    assert found["time_boot_ms"] == SAMPLE.instants.arrived_ns // 1_000_000
+    assert found["time_boot_ms"] == first_sample().instants.arrived_ns // 1_000_000
     value = peer.wait_for("NAMED_VALUE_FLOAT", name="aq_range")["fields"]["value"]
     # A float of 32 bits has 7 digits.
     assert value == pytest.approx(1e3 * posture.range, rel=1e-6)
 
-    output.send(BLIND)
+    output.send(without_posture())
     assert peer.wait_for("DISTANCE_SENSOR")["fields"]["current_distance"] == 0
     assert peer.wait_for("NAMED_VALUE_FLOAT", name="aq_valid")["fields"]["value"] == 0.0
     assert peer.wait_for("NAMED_VALUE_FLOAT", name="aq_range")["fields"]["value"] is None
 
     sequence = []
     peer.forget()
-    output.send(SAMPLE)
+    output.send(first_sample())
 
     def nine() -> bool:
         sequence.extend(entry["seq"] for entry in peer.forget())
@@ -238,7 +236,7 @@ def test_a_peer_that_goes_and_returns(lab: Lab, monkeypatch: pytest.MonkeyPatch)
     took = stream(output, lambda: "NAMED_VALUE_FLOAT" in kinds(back), "a sample at the peer")
     becomes(output, State.OK, "ArduSub")
     n_dropped = output.health().n_dropped
-    output.send(SAMPLE)
+    output.send(first_sample())
     assert output.health().n_dropped == n_dropped
 
 
@@ -250,12 +248,12 @@ def test_listening_for_a_peer(lab: Lab) -> None:
     port = free_port()
     output = lab.output(f"udpin:127.0.0.1:{port}")
     becomes(output, State.WARN, "no heartbeat of sysid 1 yet")
-    output.send(SAMPLE)
+    output.send(first_sample())
     assert output.health().n_dropped == 1
     peer = lab.peer(f"udpout:127.0.0.1:{port}", "--system", "7", "--autopilot", "12")
     # Another vehicle is heard, but it is not the one that this computer belongs to.
     becomes(output, State.WARN, "no heartbeat of sysid 1, but of sysid 7 PX4")
-    output.send(SAMPLE)
+    output.send(first_sample())
     peer.wait_for("DISTANCE_SENSOR")
 
 
@@ -263,15 +261,15 @@ def test_a_server_that_goes_and_returns(lab: Lab) -> None:
     peer = lab.peer("tcpin:127.0.0.1:0")
     output = lab.output(f"tcp:127.0.0.1:{peer.port}")
     becomes(output, State.OK, "ArduSub")
-    output.send(SAMPLE)
+    output.send(first_sample())
     peer.wait_for("DISTANCE_SENSOR")
     peer.stop()
     becomes(output, State.FAULT, "tried again")
     assert f"127.0.0.1:{peer.port}: " in output.health().detail
-    output.send(SAMPLE)
+    output.send(first_sample())
     back = lab.peer(f"tcpin:127.0.0.1:{peer.port}")
     becomes(output, State.OK, "ArduSub")
-    output.send(SAMPLE)
+    output.send(first_sample())
     back.wait_for("DISTANCE_SENSOR")
 
 
@@ -282,14 +280,14 @@ def test_a_serial_line_that_is_unplugged(lab: Lab, tmp_path: Path) -> None:
     becomes(output, State.FAULT, "No such file")
     peer = lab.peer(f"pty:{device}")
     becomes(output, State.OK, "ArduSub")
-    output.send(SAMPLE)
+    output.send(first_sample())
     assert peer.wait_for("DISTANCE_SENSOR")["magic"] == 0xFD
     peer.stop()
     becomes(output, State.FAULT, "tried again")
-    output.send(SAMPLE)
+    output.send(first_sample())
     back = lab.peer(f"pty:{device}")
     becomes(output, State.OK, "ArduSub")
-    output.send(SAMPLE)
+    output.send(first_sample())
     back.wait_for("DISTANCE_SENSOR")
 
 
@@ -305,12 +303,12 @@ def test_a_slow_line_carries_the_distance_first(
     # A pseudo terminal has no speed, so the driver's queue is pretended.
     monkeypatch.setattr(SerialPort, "lag_s", 0.05)
     peer.forget()
-    output.send(SAMPLE)
+    output.send(first_sample())
     peer.wait_for("DISTANCE_SENSOR")
     assert "NAMED_VALUE_FLOAT" not in peer.kinds_during(0.2)
     assert output.health().n_dropped == 1
     monkeypatch.setattr(SerialPort, "lag_s", 0.2)
-    output.send(SAMPLE)
+    output.send(first_sample())
     assert "DISTANCE_SENSOR" not in peer.kinds_during(0.2)
 
 
@@ -325,7 +323,7 @@ def test_a_peer_that_takes_nothing_holds_nobody_up(lab: Lab, tmp_path: Path, kin
     end = time.monotonic() + PATIENCE_S
     while output.health().n_dropped < 50:
         start = time.perf_counter()
-        output.send(SAMPLE)
+        output.send(first_sample())
         took.append(time.perf_counter() - start)
         assert time.monotonic() < end, "the line never filled"
     # No call waited for the line: fifty of them found it full.
@@ -347,7 +345,7 @@ def test_a_connection_that_takes_nothing_for_long_is_made_anew(
     end = time.monotonic() + PATIENCE_S
     while "takes nothing any more" not in (found := output.health()).detail:
         # At full speed, to fill the buffers of both systems.
-        output.send(SAMPLE)
+        output.send(first_sample())
         assert time.monotonic() < end, found
     assert found.state is State.FAULT
 
@@ -358,7 +356,7 @@ def test_several_share_one_link(lab: Lab) -> None:
     with contextlib.closing(link):
         until(link.autopilot, "a heartbeat")
         output = MavlinkOutput(link)
-        output.send(SAMPLE)
+        output.send(first_sample())
         assert peer.wait_for("DISTANCE_SENSOR")["component"] == 192
         output.close()
         assert link.send(link.dialect.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0))
@@ -369,7 +367,7 @@ def test_a_closed_link_is_quiet(lab: Lab) -> None:
     output = lab.output("udpout:127.0.0.1:9")
     output.close()
     output.close()
-    output.send(SAMPLE)
+    output.send(first_sample())
     found = output.health()
     assert (found.state, found.detail, found.n_dropped) == (State.OFF, "closed", 1)
 
@@ -394,5 +392,5 @@ def test_what_cannot_be_opened_is_told_and_tried_again(lab: Lab, url: str) -> No
 
     first_s = pause_s()
     until(lambda: pause_s() > first_s, "a longer pause")
-    output.send(SAMPLE)
+    output.send(first_sample())
     assert output.health().n_dropped == 1

@@ -26,6 +26,7 @@ from aqualvs.live.outputs.ros1_node import advertised_host, master_host
 from aqualvs.live.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from live_cases import demo_samples
+from ports import free_port
 from processes import children_of
 from ros_listener import (
     PATIENCE_S,
@@ -52,7 +53,7 @@ def ros_is_installed() -> bool:
     if shutil.which("roscore") is None:
         return False
     imports = "import rospy, sensor_msgs.msg, geometry_msgs.msg, diagnostic_msgs.msg"
-    return subprocess.run([PYTHON, "-c", imports], timeout=30, check=False).returncode == 0
+    return subprocess.run([PYTHON, "-c", imports], timeout=PATIENCE_S, check=False).returncode == 0
 
 
 # Where everything must be tested, absence is a failure.
@@ -119,8 +120,7 @@ Publish = Callable[..., Ros1Output]
 
 @pytest.fixture
 def port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
+    return free_port()
 
 
 @pytest.fixture

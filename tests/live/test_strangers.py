@@ -18,6 +18,7 @@ import pytest
 
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
+from ports import free_port
 
 pytest.importorskip("pymavlink")
 
@@ -40,12 +41,6 @@ which another address may speak as the vehicle."""
 
 STEERING = (b"\x45\x00\x00", b"\x54\x00\x00")
 """Message ids of `MANUAL_CONTROL` and `SET_POSITION_TARGET_LOCAL_NED` as frames hold them."""
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def frame(message: Any, system: int, component: int = 1) -> bytes:

@@ -20,6 +20,7 @@ import stream_sender
 from aqualvs.live.health import State
 from aqualvs.live.sources import inbox, open_feed, reception, remote
 from aqualvs.live.sources.remote import RemoteFeed
+from ports import free_port
 from waiting import PATIENCE_S, until
 
 SD, HD = (720, 576), (1920, 1080)
@@ -151,11 +152,6 @@ def send(*clips, port, **options):
     with sender(*clips, port=port, **options) as process:
         text, _ = process.communicate(timeout=2 * PATIENCE_S)
     return json.loads(text.splitlines()[-1])
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return found.getsockname()[1]
 
 
 @pytest.mark.parametrize(("name", "size", "n"), [("sd", SD, 50), ("hd", HD, 30)])

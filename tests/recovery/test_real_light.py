@@ -4,7 +4,8 @@ The truth is the plane of a paper chessboard in the same picture, so that bounds
 than those of rendered pictures: the board itself may be a millimetre or a degree off.
 """
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from aqualvs.app import calibrate_lasers
 from aqualvs.scanning.whole_picture import find_stripes
 from real_light_cases import CROP, PHOTOGRAPHS, tool
 
@@ -88,16 +90,41 @@ def test_two_photographs_of_fifteen_lines_are_too_few(wall, tmp_path) -> None:
     assert "add pictures" in said
 
 
+def once_for_each_picture(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function; it computes once for each content of its first argument, a picture."""
+    known: dict[tuple[str, str], Any] = {}
+
+    def remembered(image: np.ndarray, *more: Any, **options: Any) -> Any:
+        key = hashlib.sha256(image).hexdigest(), repr((image.shape, more, options))
+        if key not in known:
+            known[key] = function(image, *more, **options)
+        return known[key]
+
+    return remembered
+
+
+# The others, between these, are measured on two photographs above.
+LEFT_OUT_FORMATS = ("png", "crf23", "crf28")
+
+
 @pytest.fixture(scope="module")
 def left_out(samples: Path, wall, tmp_path_factory) -> dict[str, list]:
-    """Every photograph of the set by lasers of the eight others, by format."""
+    """Every photograph of the set by lasers of the eight others, by format.
+
+    Each photograph is among the others eight times; what is found in it is the same each time.
+    """
     work = tmp_path_factory.mktemp("real")
-    results = wall.leave_one_out(samples / "real-laser-on-wall", work, tell=lambda _: None)
-    return {fmt: [m for m in results if m.format == fmt] for fmt in FORMATS}
+    with pytest.MonkeyPatch.context() as patch:
+        for function in (calibrate_lasers.detect_board, calibrate_lasers.find_stripes):
+            patch.setattr(calibrate_lasers, function.__name__, once_for_each_picture(function))
+        results = wall.leave_one_out(
+            samples / "real-laser-on-wall", work, formats=LEFT_OUT_FORMATS, tell=lambda _: None
+        )
+    return {fmt: [m for m in results if m.format == fmt] for fmt in LEFT_OUT_FORMATS}
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize("fmt", FORMATS)
+@pytest.mark.parametrize("fmt", LEFT_OUT_FORMATS)
 def test_nine_photographs_leaving_one_out(left_out, fmt: str) -> None:
     results = left_out[fmt]
     good = [m for m in results if m.valid]

@@ -1,5 +1,6 @@
 """`calibrate_lasers`: the way through, and what it refuses."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -38,8 +39,12 @@ from windowed_cases import windowed
 
 RIG = example_rig()
 NOISE = Noise(corner_px=0.05, stripe_px=0.1)
-BOX = box_views(RIG, noise=NOISE, spacing=0.004)
 N_SURFACES = 4
+
+
+@functools.cache
+def box_seen() -> list[LaserView]:
+    return box_views(RIG, noise=NOISE, spacing=0.004)
 
 
 def check(result: LaserCalibration, rig: Rig, *, sigmas: float = 5.0) -> None:
@@ -59,7 +64,7 @@ def kept(views: list[LaserView], keep: Callable[[LaserView], BoolArray]) -> list
 
 
 def test_lasers_come_out_of_a_box() -> None:
-    result = calibrate_lasers(RIG, BOX, box())
+    result = calibrate_lasers(RIG, box_seen(), box())
     check(result, RIG)
     assert [f.laser.name for f in result.lasers] == ["lower", "left", "right"]
     assert result.warnings == ()
@@ -98,7 +103,7 @@ def test_a_box_in_air_serves_a_rig_in_water() -> None:
 
 
 def test_without_lasers_in_the_rig_they_are_named() -> None:
-    result = calibrate_lasers(without_lasers(RIG), BOX, box())
+    result = calibrate_lasers(without_lasers(RIG), box_seen(), box())
     assert [f.laser.name for f in result.lasers] == ["horizontal", "vertical", "diagonal"]
     check(result, RIG)
 
@@ -111,7 +116,7 @@ def test_names_follow_the_rig_whatever_its_order() -> None:
             for i in (2, 0, 1)
         ),
     )
-    result = calibrate_lasers(shuffled, BOX, box())
+    result = calibrate_lasers(shuffled, box_seen(), box())
     check(result, replace(RIG, lasers=tuple(RIG.lasers[i] for i in (2, 0, 1))))
     for figures, laser in zip(result.lasers, shuffled.lasers, strict=True):
         assert figures.laser.name == laser.name
@@ -121,7 +126,7 @@ def test_names_follow_the_rig_whatever_its_order() -> None:
 def test_a_laser_that_moved_far_is_named() -> None:
     moved = replace(RIG.lasers[0], plane=moved_plane(RIG.lasers[0].plane, 0.0, 0.0, 0.15))
     rig = replace(RIG, lasers=(moved, *RIG.lasers[1:]))
-    result = calibrate_lasers(rig, BOX, box())
+    result = calibrate_lasers(rig, box_seen(), box())
     assert result.warnings == (
         "laser 'lower' is far from where the rig had it; check that it is the same one",
     )
@@ -142,7 +147,7 @@ def test_bent_light_is_told_from_plane() -> None:
     for figures in bent.lasers:
         assert figures.laser.window is not None
         assert figures.sheet.startswith("bent at its window: residuals")
-    flat = calibrate_lasers(start, BOX, box())
+    flat = calibrate_lasers(start, box_seen(), box())
     check(flat, RIG)
     for figures in flat.lasers:
         assert figures.laser.window is None
@@ -192,7 +197,7 @@ def test_boards_are_left_out_in_turn() -> None:
         assert np.rad2deg(abs(h.pitch_error)) < 1.0
         assert np.rad2deg(abs(h.yaw_error)) < 1.0
     with pytest.raises(CalibrationError, match="not with a box"):
-        leave_one_out(RIG, BOX, box())
+        leave_one_out(RIG, box_seen(), box())
 
 
 def test_planes_are_fitted_robustly() -> None:
@@ -238,14 +243,14 @@ def on_forward(view: LaserView) -> BoolArray:
 
 
 def test_views_without_markers_are_left_out_with_the_reason() -> None:
-    views = [BOX[0], *corners_only([BOX[1]], lambda v: v.view.ids < 0), BOX[2]]
+    views = [box_seen()[0], *corners_only([box_seen()[1]], lambda v: v.view.ids < 0), box_seen()[2]]
     result = calibrate_lasers(RIG, views, box())
     assert len(result.views) == 2
     assert result.left_out[0].startswith("view_1.png: 0 corners of the target found")
 
 
 def test_no_markers_at_all() -> None:
-    views = corners_only(BOX, lambda v: v.view.ids < 0)
+    views = corners_only(box_seen(), lambda v: v.view.ids < 0)
     with pytest.raises(CalibrationError, match=r"no picture can be used: view_0\.png: 0 corners"):
         calibrate_lasers(RIG, views, box())
 
@@ -256,10 +261,10 @@ def test_no_pictures() -> None:
 
 
 def test_markers_on_one_plane_only() -> None:
-    views = corners_only(BOX, on_forward)
+    views = corners_only(box_seen(), on_forward)
     with pytest.raises(CalibrationError, match=r"markers are seen on plane 'forward' only"):
         calibrate_lasers(RIG, views, box())
-    mixed = [views[0], *BOX[1:]]
+    mixed = [views[0], *box_seen()[1:]]
     assert "'forward' only" in calibrate_lasers(RIG, mixed, box()).left_out[0]
 
 
@@ -270,7 +275,7 @@ def test_a_laser_on_one_plane_only() -> None:
         keep: BoolArray = (chain < 2 * N_SURFACES) | lonely
         return keep
 
-    views = kept(BOX, without_right)
+    views = kept(box_seen(), without_right)
     expected = (
         r"2 of 3 of the lasers.*\(not: right\).*on one plane only: view_0.png, plane 'forward'"
     )
@@ -284,12 +289,12 @@ def test_a_laser_on_one_plane_only() -> None:
 
 def test_more_lasers_than_expected() -> None:
     with pytest.raises(CalibrationError, match="more than 2 lasers are seen"):
-        calibrate_lasers(RIG, BOX, box(), options=LaserOptions(n_lasers=2))
+        calibrate_lasers(RIG, box_seen(), box(), options=LaserOptions(n_lasers=2))
 
 
 def test_fewer_lasers_than_expected() -> None:
     with pytest.raises(CalibrationError, match="3 of 5 of the lasers"):
-        calibrate_lasers(RIG, BOX, box(), options=LaserOptions(n_lasers=5))
+        calibrate_lasers(RIG, box_seen(), box(), options=LaserOptions(n_lasers=5))
 
 
 def test_one_picture_of_a_board_fixes_no_plane() -> None:
@@ -333,7 +338,7 @@ def test_a_plane_that_may_be_print_is_asked_about() -> None:
 
 def test_a_laser_that_no_point_tells_of_is_named_with_the_remedy() -> None:
     camera, surfaces = RIG.camera(), box()
-    placed, _ = place_views(camera, BOX, surfaces)
+    placed, _ = place_views(camera, box_seen(), surfaces)
     start = Start(RIG, surfaces, tuple(placed), None)
     n_points = sum(len(view.placed) for view in placed)
     with pytest.raises(CalibrationError, match=r"laser 'lower' cannot be solved.*nearer, farther"):
@@ -341,7 +346,7 @@ def test_a_laser_that_no_point_tells_of_is_named_with_the_remedy() -> None:
 
 
 def test_no_stripes() -> None:
-    views = kept(BOX, lambda v: v.stripes.chain < 0)
+    views = kept(box_seen(), lambda v: v.stripes.chain < 0)
     with pytest.raises(CalibrationError, match="no stripe lies on the target's surfaces"):
         calibrate_lasers(RIG, views, box())
 
@@ -354,7 +359,7 @@ def test_boards_all_at_one_place() -> None:
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3], ids=["metres for millimetres", "the reverse"])
 def test_swapped_units(factor: float) -> None:
-    views = [replace(v, view=replace(v.view, points=v.view.points * factor)) for v in BOX]
+    views = [replace(v, view=replace(v.view, points=v.view.points * factor)) for v in box_seen()]
     surfaces = box()
     scaled = replace(
         surfaces,
@@ -377,17 +382,17 @@ def test_a_target_ten_times_too_large_lies_too_far_away() -> None:
 
 def test_a_wrong_medium_is_refused() -> None:
     with pytest.raises(CalibrationError, match=r"corners miss by .* px .*air or water"):
-        calibrate_lasers(RIG.in_water(1.0003), BOX, box())
+        calibrate_lasers(RIG.in_water(1.0003), box_seen(), box())
 
 
 def test_a_medium_that_is_a_little_wrong_is_mentioned() -> None:
-    result = calibrate_lasers(RIG.in_water(1.25), BOX, box())
+    result = calibrate_lasers(RIG.in_water(1.25), box_seen(), box())
     assert any("check the rig, the medium" in words for words in result.warnings)
 
 
 def test_refinement_needs_something_uncertain() -> None:
     with pytest.raises(OptionError, match="refinement is asked for"):
-        calibrate_lasers(RIG, BOX, box(), options=LaserOptions(refine=True))
+        calibrate_lasers(RIG, box_seen(), box(), options=LaserOptions(refine=True))
 
 
 @pytest.mark.parametrize(

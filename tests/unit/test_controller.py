@@ -99,8 +99,9 @@ def test_step_of_the_yaw(name: str) -> None:
     overshoot, settling = overshoot_and_settling(run.time, run.yaw, 0.0, goal)
     assert overshoot <= 0.15
     assert settling <= 4.5
-    # The dome swings by 50 mm in that turn; the range is to stay.
-    assert np.abs(run.range - 0.6).max() < 0.01
+    # The dome swings by 50 mm in that turn; the range is to stay, but for what the thrusters wait
+    # in their dead band.
+    assert np.abs(run.range - 0.6).max() < 0.012
 
 
 def test_the_domes_swing_in_a_turn_is_made_up_for() -> None:
@@ -112,6 +113,8 @@ def test_the_domes_swing_in_a_turn_is_made_up_for() -> None:
         return float(np.abs(run.range - 0.6).max())
 
     gains = load_gains("bluerov2_heavy")
+    # Without what the thrusters wait in their dead band.
+    gains = replace(gains, range=replace(gains.range, crossing_impulse=0.0))
     unaware = replace(gains, vehicle=replace(gains.vehicle, dome_forward=0.0))
     assert worst(gains) < 0.75 * worst(unaware)
 

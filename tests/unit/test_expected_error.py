@@ -16,7 +16,7 @@ from aqualvs.optics.expected_error import (
 )
 from aqualvs.optics.rig import Rig, Window
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.stripe_view import point_per_pixel, see_stripe
+from aqualvs.optics.stripe_view import StripeView, point_per_pixel, see_stripe
 from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 
@@ -61,6 +61,14 @@ def posture_by_points(
         right.append(weight)
     x, y, z = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right))[0]
     return 1.0 / np.sqrt(x * x + y * y + z * z), np.arctan(z / y), np.arctan(x / y)
+
+
+def test_a_stripe_that_is_hardly_in_the_picture_has_a_direction_at_every_point() -> None:
+    rig = example_rig()
+    whole = see_stripe(rig.camera(), sheets_of(rig)[0], 0.6)
+    few = StripeView(whole.sheet, whole.points_in_dome[:5], whole.pixels[:5], 7.0).thinned(N_POINTS)
+    assert len(few.pixels) == 5
+    assert np.isfinite(point_per_pixel(rig.camera(), few)).all()
 
 
 @pytest.mark.parametrize("rig", [example_rig(), bluerov2_rig()], ids=lambda rig: rig.name)

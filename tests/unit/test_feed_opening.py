@@ -76,7 +76,13 @@ def test_addresses_to_listen_on(where, host, port):
     ("where", "words"),
     [
         ("udp://192.168.2.1", "no port"),
-        ("udp://:99999", "no port"),
+        ("udp://:99999", "Port out of range"),
+        ("udp://[", "no address"),
+        ("rtsp://[::1/video", "no address"),
+        ("http://\n", "control character"),
+        ("rtsp://a b/video", "space"),
+        ("rtsp://", "neither host nor port"),
+        ("tcp://127.0.0.1:0", "port 0"),
         ("udp://blueos.local:5600", r"numeric address.*udp://:5600"),
     ],
 )
@@ -84,6 +90,12 @@ def test_addresses_that_cannot_work_are_refused_in_one_line(where, words):
     with pytest.raises(SourceError, match=words) as fault:
         open_feed(where)
     assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize("where", ["udp://[", "rtsp://", "http://a:99999/", "tcp://\n:5600"])
+def test_what_is_no_address_is_refused_before_ffmpeg_waits_for_it(where):
+    with pytest.raises(SourceError, match="SCHEME://HOST:PORT"):
+        open_source(where)
 
 
 @pytest.mark.parametrize(

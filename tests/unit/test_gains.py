@@ -74,6 +74,27 @@ def test_noise_about_zero_crosses_no_dead_band() -> None:
     assert np.count_nonzero(np.diff(signs)) < 0.1 * n_noise
 
 
+def test_noise_does_not_push_in_the_dead_band() -> None:
+    """What is owed is taken off: the mean thrust is the one asked for, on either side."""
+    rng = np.random.default_rng(2)
+    for mean in (0.002, -0.002):
+        shares = mean + 0.02 * rng.normal(size=4000)
+        given = [MAP.share(one) for one in crossings(shares.tolist(), impulse=0.1, great=1.0)]
+        assert np.mean(given) == pytest.approx(np.mean(shares), abs=1e-4)
+
+
+def test_a_pair_turns_while_much_is_owed_and_for_a_while_after_the_crossing() -> None:
+    pair = DeadBandCrossing(MAP, 0.019, 1.0)
+    turns = []
+    for share in [0.05] * 2 + [-0.05] * 62:
+        pair.effort(share, 0.04)
+        turns.append(pair.turns)
+    # A third of the impulse is owed after 0.16 s, all of it after 0.4 s, and 2 s later it is over.
+    assert not any(turns[:5])
+    assert all(turns[5:60])
+    assert not any(turns[62:])
+
+
 def test_a_dead_band_is_crossed_once_an_impulse_is_lacking() -> None:
     found = crossings([0.1] * 3 + [-0.02] * 10)
     assert found[:3] == [MAP.effort(0.1)] * 3

@@ -1,9 +1,12 @@
 """The joint covariance of camera and lasers."""
 
+import functools
+
 import numpy as np
 import pytest
 
 from aqualvs.calibration.camera_doubt import CameraDoubt
+from aqualvs.calibration.laser_views import LaserView
 from aqualvs.calibration.lasers import LaserOptions, calibrate_lasers
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
@@ -12,7 +15,11 @@ from aqualvs.simulation.example_rigs import example_rig
 from laser_cases import Noise, box, box_views, camera_uncertainty
 
 RIG = example_rig()
-VIEWS = box_views(RIG, noise=Noise(corner_px=0.05, stripe_px=0.05), spacing=0.006)
+
+
+@functools.cache
+def views() -> list[LaserView]:
+    return box_views(RIG, noise=Noise(corner_px=0.05, stripe_px=0.05), spacing=0.006)
 
 
 def laser_names(rig: Rig) -> list[str]:
@@ -42,11 +49,11 @@ def block(uncertainty: RigUncertainty, rows: list[str], columns: list[str]) -> F
 def test_errors_of_held_numbers_move_the_planes_as_told(name: str, size: float) -> None:
     """Solve again with a camera that is a little wrong: the planes follow their covariance."""
     given = RigUncertainty((name,), np.array([[size**2]]))
-    result = calibrate_lasers(RIG, VIEWS, box(), uncertainty=given)
+    result = calibrate_lasers(RIG, views(), box(), uncertainty=given)
     lasers = laser_names(RIG)
     told = block(result.uncertainty, lasers, [name])[:, 0] / size**2
     wrong = [
-        calibrate_lasers(rig_moved_by(RIG, [name], np.array([s * size])), VIEWS, box()).rig
+        calibrate_lasers(rig_moved_by(RIG, [name], np.array([s * size])), views(), box()).rig
         for s in (1.0, -1.0)
     ]
     seen = steps(wrong[1], wrong[0]) / (2.0 * size)
@@ -56,8 +63,8 @@ def test_errors_of_held_numbers_move_the_planes_as_told(name: str, size: float) 
 
 
 def test_held_doubt_only_adds() -> None:
-    exact = calibrate_lasers(RIG, VIEWS, box())
-    doubtful = calibrate_lasers(RIG, VIEWS, box(), uncertainty=camera_uncertainty())
+    exact = calibrate_lasers(RIG, views(), box())
+    doubtful = calibrate_lasers(RIG, views(), box(), uncertainty=camera_uncertainty())
     names = laser_names(RIG)
     more = doubtful.uncertainty.of(names) - exact.uncertainty.of(names)
     sigma = np.sqrt(np.diag(doubtful.uncertainty.of(names)))
@@ -68,9 +75,9 @@ def test_held_doubt_only_adds() -> None:
 
 def test_refinement_learns_and_never_unlearns() -> None:
     given = camera_uncertainty()
-    held = calibrate_lasers(RIG, VIEWS, box(), uncertainty=given)
+    held = calibrate_lasers(RIG, views(), box(), uncertainty=given)
     refined = calibrate_lasers(
-        RIG, VIEWS, box(), uncertainty=given, options=LaserOptions(refine=True)
+        RIG, views(), box(), uncertainty=given, options=LaserOptions(refine=True)
     )
     names = [*given.names, *laser_names(RIG)]
     before, after = held.uncertainty.of(names), refined.uncertainty.of(names)
@@ -104,14 +111,14 @@ def test_numbers_that_play_no_part_follow_those_that_do() -> None:
 
 def test_what_was_known_of_the_lasers_is_replaced() -> None:
     old = RigUncertainty(("lens_x", "lower:offset"), np.diag([1e-8, 1.0]))
-    result = calibrate_lasers(RIG, VIEWS, box(), uncertainty=old)
+    result = calibrate_lasers(RIG, views(), box(), uncertainty=old)
     assert result.uncertainty.names == ("lens_x", *laser_names(RIG))
     assert result.uncertainty.sigmas["lower:offset"] < 1e-3
 
 
 def test_bias_of_stripes_does_not_average_out() -> None:
     clean, biased = (
-        calibrate_lasers(RIG, VIEWS, box(), options=LaserOptions(stripe_bias_px=b))
+        calibrate_lasers(RIG, views(), box(), options=LaserOptions(stripe_bias_px=b))
         for b in (1e-6, 0.3)
     )
     for a, b in zip(clean.lasers, biased.lasers, strict=True):

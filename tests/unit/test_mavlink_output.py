@@ -36,19 +36,17 @@ from aqualvs.live.sample import LiveSample
 from aqualvs.live.time_filter import FilteredPosture
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
-from live_cases import demo_samples
+from live_cases import first_sample
 
 pytest.importorskip("pymavlink")
 
-SAMPLE = demo_samples(1)[0]
-
 
 def with_posture(posture: Posture | Refusal) -> LiveSample:
-    return replace(SAMPLE, scan=replace(SAMPLE.scan, posture=posture))
+    return replace(first_sample(), scan=replace(first_sample().scan, posture=posture))
 
 
 def measured() -> Posture:
-    posture = SAMPLE.scan.posture
+    posture = first_sample().scan.posture
     assert isinstance(posture, Posture)
     return posture
 
@@ -99,10 +97,10 @@ def bench() -> Iterator[Bench]:
 
 
 def test_a_posture_becomes_messages(bench: Bench) -> None:
-    distance, values = bench.send(SAMPLE)
+    distance, values = bench.send(first_sample())
     posture = measured()
     assert distance.current_distance == round(100 * posture.range)
-    assert distance.time_boot_ms == SAMPLE.instants.arrived_ns // 1_000_000
+    assert distance.time_boot_ms == first_sample().instants.arrived_ns // 1_000_000
     assert distance.signal_quality > 50
     assert tuple(values) == NAMES
     assert posture.rig_covariance.any()
@@ -115,7 +113,7 @@ def test_a_posture_becomes_messages(bench: Bench) -> None:
         "aq_s_range": 1e3 * sigmas[0],
         "aq_s_pitch": math.degrees(sigmas[1]),
         "aq_s_yaw": math.degrees(sigmas[2]),
-        "aq_n": SAMPLE.scan.n_water,
+        "aq_n": first_sample().scan.n_water,
     }
     # A float of 32 bits has 7 digits.
     assert values == pytest.approx(expected, rel=1e-6)
@@ -128,7 +126,7 @@ def test_without_a_posture_there_is_no_distance(bench: Bench, reason: Reason) ->
     assert distance.current_distance == 0 < distance.min_distance < distance.max_distance
     assert (distance.signal_quality, distance.covariance) == (1, 255)
     assert values.pop("aq_valid") == 0.0
-    assert values.pop("aq_n") == pytest.approx(SAMPLE.scan.n_water)
+    assert values.pop("aq_n") == pytest.approx(first_sample().scan.n_water)
     assert all(math.isnan(value) for value in values.values())
 
 
@@ -141,13 +139,13 @@ def test_a_range_without_sense_is_no_distance(bench: Bench, value: float) -> Non
 
 def test_filtered_values_have_their_own_names(bench: Bench) -> None:
     filtered = FilteredPosture(0.5, 0.1, -0.2, np.array([-0.03, 0.0, 0.0]), np.eye(6), 0.0, True)
-    _, values = bench.send(replace(SAMPLE, filtered=filtered))
+    _, values = bench.send(replace(first_sample(), filtered=filtered))
     assert tuple(values) == NAMES + FILTERED_NAMES
     assert values["aq_range"] == pytest.approx(1e3 * measured().range, rel=1e-6)
     expected = (1.0, 500.0, math.degrees(0.1), math.degrees(-0.2), -30.0)
     assert [values[name] for name in FILTERED_NAMES] == pytest.approx(expected, rel=1e-6)
     # Once seen, its end is told, not left to be guessed.
-    _, values = bench.send(SAMPLE)
+    _, values = bench.send(first_sample())
     assert values["aqf_valid"] == 0.0
     assert all(math.isnan(values[name]) for name in FILTERED_NAMES[1:])
 
@@ -162,7 +160,9 @@ def test_the_clock_wraps(bench: Bench) -> None:
     late = 2**32 * 10**6 + 7 * 10**6
     assert boot_ms(late - 8 * 10**6) == 2**32 - 1
     assert boot_ms(late) == 7
-    distance, _ = bench.send(replace(SAMPLE, instants=replace(SAMPLE.instants, arrived_ns=late)))
+    distance, _ = bench.send(
+        replace(first_sample(), instants=replace(first_sample().instants, arrived_ns=late))
+    )
     assert distance.time_boot_ms == 7
 
 

@@ -1,7 +1,9 @@
 """Images in MCAP files and ROS bags, written by the projects' own writers."""
 
 import base64
+import contextlib
 import json
+import os
 import struct
 from fractions import Fraction
 
@@ -13,7 +15,7 @@ import pytest
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.recorder.reader import decompressed
-from aqualvs.live.sources import open_feed, open_source
+from aqualvs.live.sources import bag_images, open_feed, open_source
 from aqualvs.live.sources.image_messages import ImageMessage, planes_of_message
 from aqualvs.live.sources.image_schemas import protobuf_fields
 from shell_cases import luma_level, picture
@@ -193,10 +195,13 @@ def test_video_with_a_lost_packet_waits_for_the_next_key_frame(tmp_path):
         assert [f.index for f in source] == [0, 1, 2, 3, 6, 7, 8]
 
 
-def bag1(path):
+def bag1(path, packed=None):
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     kind = "sensor_msgs/msg/Image"
-    with rosbag1.Writer(path) as writer:
+    with contextlib.closing(rosbag1.Writer(path)) as writer:
+        if packed is not None:
+            writer.set_compression(packed)
+        writer.open()
         connection = writer.add_connection("/camera/image", kind, typestore=store)
         for i in range(6):
             data = store.serialize_ros1(ros_image(store, i, ros1=True), kind)
@@ -204,10 +209,13 @@ def bag1(path):
     return path
 
 
-def bag2(path, plugin):
+def bag2(path, plugin, packed=None):
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     kind = "sensor_msgs/msg/Image"
-    with rosbag2.Writer(path, version=8, storage_plugin=plugin) as writer:
+    with contextlib.closing(rosbag2.Writer(path, version=8, storage_plugin=plugin)) as writer:
+        if packed is not None:
+            writer.set_compression(packed, rosbag2.CompressionFormat.ZSTD)
+        writer.open()
         connection = writer.add_connection("/camera/image", kind, typestore=store)
         for i in range(6):
             data = store.serialize_cdr(ros_image(store, i), kind)
@@ -225,6 +233,47 @@ def test_images_of_a_bag_of_ros_2(tmp_path, plugin):
     check(open_source(folder))
     file = next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
     check(open_source(file))
+
+
+def test_a_bag_whose_metadata_count_nothing_is_refused_in_one_line(tmp_path):
+    folder = bag2(tmp_path / "dive", rosbag2.StoragePlugin.SQLITE3)
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 6", "message_count: null"))
+    with pytest.raises(SourceError, match="count of a topic") as fault:
+        open_source(folder)
+    assert str(folder) in str(fault.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_pipe_in_the_place_of_a_bags_file_is_not_waited_for(tmp_path):
+    folder = bag2(tmp_path / "dive", rosbag2.StoragePlugin.SQLITE3)
+    (folder / "dive.db3").unlink()
+    os.mkfifo(folder / "dive.db3")
+    with pytest.raises(SourceError, match="is a pipe"):
+        open_source(folder)
+
+
+SQLITE, MCAP = rosbag2.StoragePlugin.SQLITE3, rosbag2.StoragePlugin.MCAP
+PACKED = {
+    "ROS 1 bz2": lambda path: bag1(path / "a.bag", rosbag1.Writer.CompressionFormat.BZ2),
+    "ROS 1 lz4": lambda path: bag1(path / "a.bag", rosbag1.Writer.CompressionFormat.LZ4),
+    "messages": lambda path: bag2(path / "a", SQLITE, rosbag2.CompressionMode.MESSAGE),
+    "file": lambda path: bag2(path / "a", SQLITE, rosbag2.CompressionMode.FILE),
+    "MCAP chunks": lambda path: bag2(path / "a", MCAP, rosbag2.CompressionMode.STORAGE),
+}
+
+
+@pytest.mark.parametrize("kind", list(PACKED))
+def test_packed_bags_are_read_and_never_unpacked_without_bound(tmp_path, monkeypatch, kind):
+    path = PACKED[kind](tmp_path)
+    check(open_source(path))
+    # A picture has 6 kB.
+    monkeypatch.setattr(bag_images, "MAX_BYTES", 3_000)
+    monkeypatch.setattr(bag_images, "_FREE_BYTES", 1 << 60)
+    with pytest.raises(SourceError, match="unpacked") as fault:
+        list(open_source(path))
+    assert str(path) in str(fault.value)
+    assert "\n" not in str(fault.value)
 
 
 def test_one_of_several_topics_must_be_named(tmp_path):

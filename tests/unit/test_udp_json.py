@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,20 +27,20 @@ from aqualvs.live.outputs.udp_json_line import json_fields, json_line
 from aqualvs.live.sample import LiveSample
 from aqualvs.live.time_filter import FilteredPosture
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from live_cases import demo_samples
+from live_cases import first_sample
+from ports import free_port
 from waiting import PATIENCE_S, until
 
-SAMPLE = demo_samples(1)[0]
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "json.md"
 
 
 def with_posture(posture: Posture | Refusal) -> LiveSample:
-    return replace(SAMPLE, scan=replace(SAMPLE.scan, posture=posture))
+    return replace(first_sample(), scan=replace(first_sample().scan, posture=posture))
 
 
 def measured() -> Posture:
-    assert isinstance(SAMPLE.scan.posture, Posture)
-    return SAMPLE.scan.posture
+    assert isinstance(first_sample().scan.posture, Posture)
+    return first_sample().scan.posture
 
 
 def curved() -> LiveSample:
@@ -67,8 +67,11 @@ def address_of(receiver: socket.socket) -> str:
     return f"127.0.0.1:{receiver.getsockname()[1]}"
 
 
-@pytest.mark.parametrize("sample", [SAMPLE, curved(), with_posture(Refusal(Reason.ONE_LASER))])
-def test_values_are_those_of_the_csv(sample: LiveSample) -> None:
+@pytest.mark.parametrize(
+    "make", [first_sample, curved, lambda: with_posture(Refusal(Reason.ONE_LASER))]
+)
+def test_values_are_those_of_the_csv(make: Callable[[], LiveSample]) -> None:
+    sample = make()
     row = next(csv.reader(io.StringIO(posture_row(sample.scan))))
     fields = decoded(sample)
     assert set(POSTURE_COLUMNS) <= set(fields)
@@ -85,8 +88,8 @@ def test_values_are_those_of_the_csv(sample: LiveSample) -> None:
 
 def test_what_is_live_comes_along() -> None:
     health = Health(rate_hz=24.98, n_frames=3)
-    fields = decoded(replace(SAMPLE, health=health))
-    assert fields["utc_ns"] == SAMPLE.utc_ns
+    fields = decoded(replace(first_sample(), health=health))
+    assert fields["utc_ns"] == first_sample().utc_ns
     assert fields["rate_hz"] == 24.98
     assert fields["delay_s"] == 0.0015
     assert fields["state"] == health.state.value == "off"
@@ -95,13 +98,13 @@ def test_what_is_live_comes_along() -> None:
     refused = decoded(with_posture(Refusal(Reason.NOT_A_PLANE, "12 mm rms")))
     assert refused["valid"] is False
     assert (refused["reason"], refused["detail"]) == ("not_a_plane", "12 mm rms")
-    assert decoded(replace(SAMPLE, frame=None))["delay_s"] is None
+    assert decoded(replace(first_sample(), frame=None))["delay_s"] is None
 
 
 def test_filtered_values_stand_beside_the_raw_ones() -> None:
     cov = np.diag([1e-6, 4e-6, 9e-6, 1.0, 1.0, 1.0])
     filtered = FilteredPosture(0.5, 0.1, -0.2, np.array([-0.03, 0.2, 0.3]), cov, 0.04, False)
-    fields = decoded(replace(SAMPLE, filtered=filtered))
+    fields = decoded(replace(first_sample(), filtered=filtered))
     assert fields["range_m"] == round(measured().range, 6)
     expected = {
         "filtered_range_m": 0.5,
@@ -118,12 +121,12 @@ def test_filtered_values_stand_beside_the_raw_ones() -> None:
     }
     # Sigmas are rounded to four digits.
     assert {name: fields[name] for name in expected} == pytest.approx(expected, rel=2e-4)
-    without = decoded(SAMPLE)
+    without = decoded(first_sample())
     assert [without[name] for name in expected] == [None] * len(expected)
 
 
 def test_every_sample_has_the_same_keys() -> None:
-    kinds = (SAMPLE, curved(), with_posture(Refusal(Reason.NO_FRAMES)))
+    kinds = (first_sample(), curved(), with_posture(Refusal(Reason.NO_FRAMES)))
     assert len({tuple(json_fields(sample)) for sample in kinds}) == 1
 
 
@@ -152,8 +155,8 @@ def test_every_receiver_gets_every_sample(receiver: socket.socket) -> None:
         other.settimeout(PATIENCE_S)
         both = (address_of(receiver), f"[::1]:{other.getsockname()[1]}")
         with contextlib.closing(UdpJsonOutput(both)) as output:
-            output.send(SAMPLE)
-            assert receiver.recv(65535) == other.recv(65535) == json_line(SAMPLE)
+            output.send(first_sample())
+            assert receiver.recv(65535) == other.recv(65535) == json_line(first_sample())
             found = output.health()
             assert (found.state, found.detail, found.n_dropped) == (State.OK, "sent to 2", 0)
 
@@ -164,8 +167,8 @@ def test_broadcast_is_allowed() -> None:
         listener.settimeout(PATIENCE_S)
         address = f"127.255.255.255:{listener.getsockname()[1]}"
         with contextlib.closing(UdpJsonOutput(address)) as output:
-            output.send(SAMPLE)
-            assert listener.recv(65535) == json_line(SAMPLE)
+            output.send(first_sample())
+            assert listener.recv(65535) == json_line(first_sample())
 
 
 def test_names_are_looked_up_without_waiting(
@@ -183,17 +186,17 @@ def test_names_are_looked_up_without_waiting(
     output = UdpJsonOutput(f"vehicle.local:{receiver.getsockname()[1]}")
     with contextlib.closing(output):
         # It returns although there is no answer yet.
-        output.send(SAMPLE)
+        output.send(first_sample())
         assert output.health().n_dropped == 1
         assert output.health().state is State.FAULT
         answered.set()
 
         def arrived() -> bool:
-            output.send(SAMPLE)
+            output.send(first_sample())
             return output.health().state is State.OK
 
         until(arrived)
-        assert receiver.recv(65535) == json_line(SAMPLE)
+        assert receiver.recv(65535) == json_line(first_sample())
 
 
 def test_a_receiver_that_goes_and_returns(receiver: socket.socket) -> None:
@@ -203,21 +206,21 @@ def test_a_receiver_that_goes_and_returns(receiver: socket.socket) -> None:
     with contextlib.closing(UdpJsonOutput([address_of(receiver), address])) as output:
 
         def refused() -> bool:
-            output.send(SAMPLE)
+            output.send(first_sample())
             return output.health().state is State.WARN
 
         until(refused)
         assert output.health().detail == f"nobody listens at {address}"
-        assert receiver.recv(65535) == json_line(SAMPLE)
+        assert receiver.recv(65535) == json_line(first_sample())
         # Its refusal waits for the next call.
-        output.send(SAMPLE)
+        output.send(first_sample())
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as back:
             host, _, port = address.partition(":")
             back.bind((host, int(port)))
             back.settimeout(PATIENCE_S)
-            output.send(SAMPLE)
+            output.send(first_sample())
             # The first datagram after its return arrives: the old refusal costs none.
-            assert back.recv(65535) == json_line(SAMPLE)
+            assert back.recv(65535) == json_line(first_sample())
 
 
 def test_a_network_that_fails_is_told_and_tried_again(
@@ -227,17 +230,17 @@ def test_a_network_that_fails_is_told_and_tried_again(
     with contextlib.closing(output):
         with monkeypatch.context() as broken:
             broken.setattr(socket.socket, "connect", unreachable)
-            output.send(SAMPLE)
+            output.send(first_sample())
             found = output.health()
             assert (found.state, found.n_dropped) == (State.FAULT, 1)
             assert found.detail == f"{address_of(receiver)}: Network is unreachable"
 
         def recovered() -> bool:
-            output.send(SAMPLE)
+            output.send(first_sample())
             return output.health().state is State.OK
 
         until(recovered)
-        assert receiver.recv(65535) == json_line(SAMPLE)
+        assert receiver.recv(65535) == json_line(first_sample())
 
 
 def test_a_full_buffer_drops_and_does_not_wait(
@@ -252,11 +255,11 @@ def test_a_full_buffer_drops_and_does_not_wait(
 
         with monkeypatch.context() as busy:
             busy.setattr(socket.socket, "send", full)
-            output.send(SAMPLE)
+            output.send(first_sample())
         assert made == [False]
         assert (output.health().state, output.health().n_dropped) == (State.OK, 1)
-        output.send(SAMPLE)
-        assert receiver.recv(65535) == json_line(SAMPLE)
+        output.send(first_sample())
+        assert receiver.recv(65535) == json_line(first_sample())
 
 
 def unreachable(_socket: socket.socket, _address: object) -> None:
@@ -267,7 +270,7 @@ def test_after_closing_nothing_is_sent(receiver: socket.socket) -> None:
     output = UdpJsonOutput(address_of(receiver))
     output.close()
     output.close()
-    output.send(SAMPLE)
+    output.send(first_sample())
     assert output.health().state is State.OFF
     receiver.setblocking(False)
     with pytest.raises(BlockingIOError):
@@ -285,9 +288,7 @@ def test_the_documented_receiver_works(tmp_path: Path) -> None:
     example = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert example is not None
     assert len(example[1].strip().splitlines()) == 6
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     script = tmp_path / "receive.py"
     assert "14660" in example[1]
     script.write_text(example[1].replace("14660", str(port)))
@@ -297,7 +298,7 @@ def test_the_documented_receiver_works(tmp_path: Path) -> None:
     try:
         with contextlib.closing(UdpJsonOutput(f"127.0.0.1:{port}")) as output:
             # It takes a moment to start.
-            until(lambda: output.send(SAMPLE) or printed.read_text().endswith("\n"))
+            until(lambda: output.send(first_sample()) or printed.read_text().endswith("\n"))
     finally:
         process.kill()
         process.wait(PATIENCE_S)
@@ -306,5 +307,5 @@ def test_the_documented_receiver_works(tmp_path: Path) -> None:
 
 def test_every_key_is_documented() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    missing = [name for name in json_fields(SAMPLE) if f"`{name}`" not in page]
+    missing = [name for name in json_fields(first_sample()) if f"`{name}`" not in page]
     assert missing == []

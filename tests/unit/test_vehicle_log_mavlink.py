@@ -294,6 +294,14 @@ def dataflash(n: int = 100, boot_us: int = 60_000_000) -> list[bytes]:
     return records
 
 
+def test_a_column_without_a_name_costs_its_own_kind_of_records_only(tmp_path: Path) -> None:
+    data = b"".join(dataflash())
+    assert b"Roll,Pitch,Yaw" in data
+    log = logged(tmp_path, data.replace(b"Roll,Pitch,Yaw", b"Roll,,Yaw\0\0\0\0\0"))
+    assert log.sources["depth"] == "CTUN.Alt"
+    assert "heading" not in log.sources or not log.sources["heading"].startswith("ATT")
+
+
 def test_a_dataflash_log_is_read(tmp_path: Path) -> None:
     data = b"".join(dataflash())
     log = logged(tmp_path, data)

@@ -144,4 +144,4 @@ def doctor(
 
     setup = vehicle_setup(vehicle_file, mavlink_peer, mavlink_key)
     request = DoctorRequest(source=source, rig=rig, mavlink=mavlink, vehicle=setup)
-    raise typer.Exit(run_doctor(request))
+    run_doctor(request)

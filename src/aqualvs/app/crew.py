@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from types import TracebackType
 from typing import Self, cast
 
 from aqualvs.app.crew_messages import Ended, Message
@@ -14,6 +13,7 @@ from aqualvs.app.crew_post import Receiver, SharedMemory
 from aqualvs.app.crew_start import context, deaf_to_interrupts, interrupts_blocked
 from aqualvs.app.crew_work import CrewWork, serve
 from aqualvs.app.measuring import Measured
+from aqualvs.closing import Closing
 
 _MOST_WAITING = 100
 """Blocks for each process that wait for those of parts before; then only these are taken in."""
@@ -31,7 +31,7 @@ class _Hand:
     number: int = -1
 
 
-class Crew:
+class Crew(Closing):
     """Processes that measure the parts of a dive; a context manager that ends them.
 
     Parameters
@@ -129,12 +129,7 @@ class Crew:
             memory.seal()
         return _Hand(process, mine, Receiver(mine, memory))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """End the processes."""
         for hand in self._hands:
             with contextlib.suppress(OSError):

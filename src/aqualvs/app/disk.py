@@ -4,6 +4,7 @@ import contextlib
 import errno
 import json
 import os
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,8 @@ def replace_text(path: Path, text: str) -> None:
     OSError
         As the system says it.
     """
-    draft = path.with_name(path.name + ".part")
+    # A name of its own: two processes may write the same file at the same moment.
+    draft = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:
         draft.write_text(text, encoding="utf-8")
         os.replace(draft, path)

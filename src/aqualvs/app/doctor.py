@@ -26,8 +26,6 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.scan import Frame
 
-EXIT_READY, EXIT_NOT_READY = 0, 2
-
 _EXTRAS = {
     "mavlink": (("pymavlink",), "MAVLink, .tlog and .BIN logs"),
     "dds": (("cyclonedds",), "ROS 2 without ROS"),
@@ -64,28 +62,30 @@ class DoctorRequest:
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
 
-def run_doctor(request: DoctorRequest, console: Console | None = None) -> int:
-    """Look at everything, print what was found, and return the exit code.
+def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
+    """Look at everything and print what was found.
 
-    Returns
-    -------
-    int
-        0 where all that was looked at works, 2 where something does not.
+    Raises
+    ------
+    AqualvsError
+        At the end, if something does not work: the first such finding.
     """
     console = console or Console()
     console.print(f"aqualvs {__version__}", style="bold", highlight=False)
     looks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
+    if request.rig is not None:
+        looks.append(lambda: _rig_file(Path(str(request.rig))))
     if request.source is not None:
         looks.append(lambda: _stream(str(request.source), request.rig))
     if request.mavlink is not None:
         looks.append(lambda: autopilot(str(request.mavlink), request.vehicle, request.rig))
-    worst = Severity.OK
+    broken: list[str] = []
     for look in looks:
         found = list(_guarded(look))
         console.print(findings_table(found))
-        if any(finding.severity is Severity.BAD for finding in found):
-            worst = Severity.BAD
-    return EXIT_NOT_READY if worst is Severity.BAD else EXIT_READY
+        broken += [finding.sentence for finding in found if finding.severity is Severity.BAD]
+    if broken:
+        raise AqualvsError(f"not ready: {broken[0]}")
 
 
 def _guarded(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
@@ -158,6 +158,12 @@ def _speed(rig: Rig, frames: list[Frame]) -> Finding:
     if middle > 0.5 / _FRAME_RATE:
         return Finding(Severity.WARN, f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
     return Finding(Severity.OK, words)
+
+
+def _rig_file(path: Path) -> Iterator[Finding]:
+    rig = load_rig(path)
+    size = "x".join(map(str, rig.size_px))
+    yield Finding(Severity.OK, f"rig {rig.name!r}: {size} px, lasers: {len(rig.lasers)}")
 
 
 def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:

@@ -132,17 +132,19 @@ def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> Hold
     )
 
 
-def effort_measures(log: LoopLog, name: str, start_s: float = 0.0) -> EffortMeasures:
-    """Return how often an effort turned round from `start_s` on.
+def effort_measures(
+    log: LoopLog, name: str, start_s: float = 0.0, end_s: float = math.inf
+) -> EffortMeasures:
+    """Return how often an effort turned round between two times.
 
     Parameters
     ----------
     log : LoopLog
     name : {"forward", "right", "down", "turn"}
         Of the effort.
-    start_s : float
+    start_s, end_s : float
     """
-    here = _between(log, start_s, math.inf)
+    here = _between(log, start_s, end_s)
     efforts, time_s = log.column(name)[here], log.column("time_s")[here]
     minutes = max((time_s[-1] - time_s[0]) / 60.0, 1e-9) if len(time_s) else math.inf
     signs = np.sign(efforts)

@@ -187,7 +187,7 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
     Returns
     -------
     claim : Claim
-        To be settled when the folder is complete.
+        To be closed when the folder is complete.
 
     Raises
     ------

@@ -2,8 +2,6 @@
 
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import av
 import cv2
@@ -14,6 +12,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from aqualvs.app.report_words import bgr, laser_colour, reason_words
+from aqualvs.closing import Closing
 from aqualvs.errors import OutputError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
@@ -119,7 +118,7 @@ def draw_legend(image: ImagePlane, names: list[str]) -> None:
         x += _text_width(name, size) + round(24 * size)
 
 
-class OverlayWriter:
+class OverlayWriter(Closing):
     """Write pictures to an MP4 that stays readable if the program dies before `close`.
 
     Parameters
@@ -174,19 +173,6 @@ class OverlayWriter:
         self._closed = True
         self._container.mux(self._stream.encode(None))
         self._container.close()
-
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Finish the file, also after a fault."""
-        self.close()
 
 
 def _video_stream(container: OutputContainer, size: tuple[int, int], fps: float) -> VideoStream:

@@ -8,14 +8,13 @@ user: no option replaces it. Rig files follow a rule of their own: `save_rig` ke
 import contextlib
 import json
 import os
-import uuid
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
-from aqualvs.app.disk import writing
+from aqualvs.app.disk import replace_text, writing
+from aqualvs.closing import Closing
 from aqualvs.errors import OutputError
 from aqualvs.yamlfile import read_text
 
@@ -27,7 +26,7 @@ _WRITER, _MARK = "writer", "mark"
 _ENDS = 1 << 16
 
 
-class Claim:
+class Claim(Closing):
     """Files that a command is about to write; a context manager that notes what they became.
 
     A command that is killed leaves its files noted without a checksum: they stay its own.
@@ -72,7 +71,7 @@ class Claim:
                 folder.mkdir(parents=True, exist_ok=True)
                 _note(folder, {name: {_WRITER: writer, _MARK: None} for name in names})
 
-    def settle(self) -> None:
+    def close(self) -> None:
         """Note what the files are now; call it when they are complete."""
         for folder, names in self._names.items():
             written = {
@@ -107,19 +106,6 @@ class Claim:
         if not overwrite:
             raise OutputError(f"{path}: exists; choose another place with -o, or add --overwrite")
 
-    def __enter__(self) -> Self:
-        """Return the claim."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Note what the files are now."""
-        self.settle()
-
 
 def _noted(folder: Path) -> dict[str, Any]:
     """Return the record of a folder; empty where there is none that can be read."""
@@ -134,12 +120,7 @@ def _note(folder: Path, entries: Mapping[str, dict[str, Any] | None]) -> None:
     """Write entries into the record of a folder; those of None are taken out."""
     merged = {**_noted(folder), **entries}
     content = {name: one for name, one in merged.items() if one is not None}
-    draft = folder / f"{RECORD}.{uuid.uuid4().hex[:8]}.part"
-    try:
-        draft.write_text(json.dumps(content, indent=1, sort_keys=True), encoding="utf-8")
-        os.replace(draft, folder / RECORD)
-    finally:
-        draft.unlink(missing_ok=True)
+    replace_text(folder / RECORD, json.dumps(content, indent=1, sort_keys=True))
 
 
 def _mark(path: Path) -> list[int] | None:

@@ -2,12 +2,11 @@
 
 import math
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
 from aqualvs.app.append_file import AppendFile
+from aqualvs.closing import Closing
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
@@ -45,7 +44,7 @@ both."""
 _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 
 
-class PostureCsv:
+class PostureCsv(Closing):
     """Writer of `posture.csv`, row by row as `AppendFile` does it.
 
     Parameters
@@ -77,19 +76,6 @@ class PostureCsv:
 
     def _append(self, row: str) -> None:
         self._file.append(row.encode("ascii"))
-
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the file."""
-        self.close()
 
 
 def posture_row(scan: Scan) -> str:

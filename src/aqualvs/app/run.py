@@ -126,7 +126,7 @@ def run(
         comparison=folder.comparison(request),
         fault=fault,
     )
-    claim.settle()
+    claim.close()
     return result
 
 

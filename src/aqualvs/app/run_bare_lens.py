@@ -4,18 +4,17 @@ import statistics
 from array import array
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from aqualvs.app.disk import writing
 from aqualvs.app.measuring import Measured
 from aqualvs.app.outputs import POSTURE_BARE_CSV
 from aqualvs.app.posture_csv import PostureCsv
+from aqualvs.closing import Closing
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture
 
 
-class RunBareLens:
+class RunBareLens(Closing):
     """Writes `posture_bare.csv` while a run goes on, or does nothing for a rig without a dome.
 
     Parameters
@@ -58,16 +57,7 @@ class RunBareLens:
         percent = 100.0 * (statistics.median(self._ratios) - 1.0)
         return [f"without the dome model the range would read {percent:+.1f} % (median)"]
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close the file."""
         if self._file is not None:
             self._file.close()

@@ -23,7 +23,7 @@ from aqualvs.optics.rigfile import rig_to_mapping
 
 
 def prepare(request: RunRequest) -> Claim:
-    """Make sure that the run can be written; returns the claim to be settled at its end.
+    """Make sure that the run can be written; returns the claim to be closed at its end.
 
     Raises
     ------

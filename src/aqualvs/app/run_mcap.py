@@ -2,14 +2,14 @@
 
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from aqualvs.app.disk import writing
 from aqualvs.app.measuring import ScansFrames
 from aqualvs.app.outputs import DIVE_MCAP, RUN_FILES
 from aqualvs.app.run_replay import Replay
 from aqualvs.app.run_water import WaterFollowingScanner
+from aqualvs.closing import Closing
 from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Measured = tuple[Rig, Scan, dict[SearchAxis, Returns]]
 
 
-class RunMcap:
+class RunMcap(Closing):
     """Writes `dive.mcap` while a run goes on, or does nothing; a context manager.
 
     Parameters
@@ -82,16 +82,7 @@ class RunMcap:
             health=Health(),
         )
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close the file; readable in any case."""
         if self._recording is not None:
             with writing(self._path):

@@ -4,7 +4,6 @@ from collections.abc import Generator, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from aqualvs.app.blocks import in_blocks, read_ahead
@@ -14,12 +13,13 @@ from aqualvs.app.measuring import Measured, Meter, ScansFrames, measured_blocks
 from aqualvs.app.run_frames import ready, window_of, with_losses
 from aqualvs.app.run_inputs import FrameWindow
 from aqualvs.app.run_replay import Replay
+from aqualvs.closing import Closing
 from aqualvs.live.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Frame
 
 
-class RunMeasuring:
+class RunMeasuring(Closing):
     """Measures the frames of a dive; a context manager, within which processes are at work.
 
     Parameters
@@ -101,12 +101,7 @@ class RunMeasuring:
             self._shared = self._stack.enter_context(self._crew).blocks()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """End the processes."""
         self._stack.close()
 

@@ -1,14 +1,13 @@
 """The video that shows what the scanner saw."""
 
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
 from aqualvs.app.disk import writing
 from aqualvs.app.outputs import OVERLAY_MP4
 from aqualvs.app.overlay import OverlayWriter, draw_overlay
+from aqualvs.closing import Closing
 from aqualvs.live.colour import bgr_of
 from aqualvs.live.sources import FrameSource
 from aqualvs.optics.rig import Rig
@@ -17,7 +16,7 @@ from aqualvs.scanning.scan import Frame, Scan
 _FPS_WITHOUT_CLOCK = 25.0
 
 
-class RunOverlay:
+class RunOverlay(Closing):
     """Writes `overlay.mp4` while a run goes on, or does nothing; a context manager.
 
     Parameters
@@ -52,16 +51,7 @@ class RunOverlay:
         with writing(self._path):
             self._writer.write(draw_overlay(image, scan.points, scan.posture, self._rig))
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Finish the video."""
         if self._writer is not None:
             with writing(self._path):

@@ -6,12 +6,12 @@ What reads recordings is imported where it is used: every run reads this module,
 from collections.abc import Iterator, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aqualvs.app.run_inputs import Water, in_water, prepared_rig
+from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
@@ -64,7 +64,7 @@ class ReplayRequest:
     pictures: bool
 
 
-class Replay:
+class Replay(Closing):
     """A recording that is measured again; both `FrameSource` and scanner of a run.
 
     Parameters
@@ -146,18 +146,6 @@ class Replay:
         if self._follows and n_water != self._scanner.rig.n_water:
             self._scanner = Scanner(self.rig.in_water(n_water), self.options)
         return self._scanner
-
-    def __enter__(self) -> Self:
-        """Return itself; nothing stays open."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Do nothing."""
 
 
 def replay_of(source: str, request: ReplayRequest) -> Replay | None:

@@ -2,13 +2,15 @@
 
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
+
+from aqualvs.closing import Closing
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class StopSignals:
+class StopSignals(Closing):
     """Note a request to stop instead of dying from it; a context manager.
 
     The second request is no longer caught, so that whoever insists gets out. Outside of the main
@@ -35,12 +37,7 @@ class StopSignals:
             self._previous = {s: signal.signal(s, self._note) for s in _SIGNALS}
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Put the previous handlers back."""
         self._restore()
 

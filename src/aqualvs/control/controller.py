@@ -22,6 +22,8 @@ from aqualvs.control.vehicle import Effort
 
 # Beyond this yaw forward hardly changes the range, in radians.
 _GREATEST_YAW = math.radians(60.0)
+# Time constant in seconds with which a small integral fades while thrust changes its side.
+_FORGETS_S = 1.0
 
 
 class RangeYawController:
@@ -74,6 +76,8 @@ class RangeYawController:
         self._slope = _Slope(gains.rate_time)
         band = thrust, near.crossing_impulse, near.crossing_share
         self._pairs = (DeadBandCrossing(*band), DeadBandCrossing(*band))
+        # A force whose impulse in that time does not cross the dead band is none.
+        self._least = near.crossing_impulse * thrust.forward / mass / _FORGETS_S
         self._quiet = QuietZone(turn.quiet_rate)
         self.reset()
 
@@ -213,13 +217,32 @@ class RangeYawController:
         # Speeds and accelerations as seen along the forward axis.
         ahead = (mending - ramp.rate - aside) / c
         asked, found = (mending - ramp.seen_rate) / c, -rate / c
-        swing = self._swell.update(step, asked - found)
+        turns = self._turns(step)
+        swing = self._swell.update(step, asked - found) * (not turns)
         push, schedule = self._against_drag(ahead)
         push += schedule[0] * self._swing_gain * swing - ramp.change / c
         force = vehicle.mass * self._speed.update(
-            self._time_s, asked, found, forward=push, schedule=schedule
+            self._time_s,
+            asked,
+            found,
+            forward=push,
+            schedule=(schedule[0], 0.0) if turns else schedule,
         )
         return force, vehicle.right_drag.force(side)
+
+    def _turns(self, step: float) -> bool:
+        """Return whether thrust goes to and fro about nothing; then the integral fades.
+
+        In the dead band's hysteresis the loop's gain is low, and with an integral a loop is stable
+        above some gain only: it would swing by itself for ever. Where thrust changes its side, and
+        no swell is met, no force is needed that an integral had to know.
+        """
+        swell = self._swing_gain * self._swell.amplitude
+        small = max(abs(self._speed.integral), swell) < self._least
+        if not (small and all(pair.turns for pair in self._pairs)):
+            return False
+        self._speed.fade(math.exp(-max(step, 0.0) / _FORGETS_S))
+        return True
 
     def _mending(self, range: float) -> float:
         """Return the closing speed that mends the range's error."""

@@ -30,6 +30,11 @@ class SwellFilter:
         """Forget everything."""
         self._output = self._sum = 0.0
 
+    @property
+    def amplitude(self) -> float:
+        """Of what swings now."""
+        return math.hypot(self._output, self._sum)
+
     def update(self, step: float, value: float) -> float:
         """Return what of `value` swings; unchanged if `step` seconds are not positive.
 

@@ -93,13 +93,14 @@ class RangeGains:
     ramp_speed, ramp_acceleration : float
         With which a new setpoint is approached, in m/s and m/s².
     jerk : float
-        Greatest change of the acceleration asked for, per second.
+        Greatest change of the acceleration asked for, per second. What it holds back comes late:
+        with 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
     lag : float
         Time from an effort until pictures show it, in seconds: so much later a setpoint's change
         is expected to be seen.
     crossing_impulse, crossing_share : float
-        Thrust across the thrusters' dead band that must be lacking before it is crossed: as share
-        of the full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
+        Thrust across the thrusters' dead band that must be owed before it is crossed: as share of
+        the full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
     swell : float
         Share by which `speed` is greater for errors that swing with the swell's period; 0 for
         calm water.
@@ -114,9 +115,9 @@ class RangeGains:
     greatest_speed: float = 0.25
     ramp_speed: float = 0.15
     ramp_acceleration: float = 0.12
-    jerk: float = 8.0
-    crossing_impulse: float = 0.005
-    crossing_share: float = 0.1
+    jerk: float = 30.0
+    crossing_impulse: float = 0.0175
+    crossing_share: float = 0.4
     swell: float = 0.0
     swell_period: float = 5.0
     swell_damping: float = 0.15

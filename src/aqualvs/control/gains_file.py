@@ -76,9 +76,9 @@ class RangePart(Part):
     greatest_speed_m_s: Positive = 0.25
     ramp_speed_m_s: Positive = 0.15
     ramp_acceleration_m_s2: Positive = 0.12
-    jerk_m_s3: Positive = 8.0
-    crossing_impulse_s: NotNegative = 0.005
-    crossing_share: NotNegative = 0.1
+    jerk_m_s3: Positive = 30.0
+    crossing_impulse_s: NotNegative = 0.0175
+    crossing_share: NotNegative = 0.4
 
 
 class YawPart(Part):

@@ -119,8 +119,9 @@ class DeadBandCrossing:
     """Efforts of one pair of thrusters: its dead band is crossed once, with hysteresis.
 
     Where the thrust asked for changes its sign, the effort waits at the edge of the dead band, with
-    the thrusters about to start, until the thrust that is lacking has added up to an impulse, or is
-    great. Noise about zero crosses nothing.
+    the thrusters about to start, until the impulse that it owes is great, or the thrust is. What
+    is owed is taken off the thrust that follows on the side in force: so the mean thrust is the one
+    asked for, and noise about zero neither crosses nor pushes.
 
     Parameters
     ----------
@@ -136,24 +137,42 @@ class DeadBandCrossing:
         self.reset()
 
     def reset(self, effort: float = 0.0) -> None:
-        """Begin in the middle of the dead band, or beyond it where an effort is in force."""
+        """Begin with an effort that is in force; in the dead band, on the side asked for next."""
         beyond = abs(effort) > self._thrust.dead_band
-        self._side, self._lacking = math.copysign(1.0, effort) if beyond else 0.0, 0.0
+        self._side, self._owed = math.copysign(1.0, effort) if beyond else 0.0, 0.0
+        self._stood_s = math.inf
+
+    @property
+    def turns(self) -> bool:
+        """Whether thrust waits to change its side, or has just done so."""
+        waits = abs(self._owed) > _WAITING_SHARE * self._impulse
+        return waits or (self._stood_s < _STANDS_S and self._impulse > 0.0)
 
     def effort(self, share: float, step: float) -> float:
         """Return the effort for a share of the full thrust, `step` seconds after the last one."""
-        against = -share * self._side if self._side else abs(share)
-        if against <= 0.0:
-            self._lacking = max(self._lacking + against * step, 0.0)
-            return self._thrust.effort(share) if share else self._edge()
-        self._lacking += against * step
-        if self._lacking <= self._impulse and against < self._great:
+        if not self._side and share:
+            self._side = math.copysign(1.0, share)
+        self._stood_s += step
+        owed = self._owed + share * step
+        if share * self._side <= 0.0 and not step > 0.0:
             return self._edge()
-        self._side, self._lacking = math.copysign(1.0, share), 0.0
-        return self._thrust.effort(share)
+        if owed * self._side < 0.0:
+            if abs(owed) <= self._impulse and abs(share) < self._great:
+                self._owed = owed
+                return self._edge()
+            # What has waited is late: the loop asks for it anew where it is still needed.
+            self._side, self._stood_s, owed = -self._side, 0.0, share * step
+        self._owed = 0.0
+        given = owed / step if step > 0.0 else share
+        return self._thrust.effort(given) if given * self._side > 0.0 else self._edge()
 
     def _edge(self) -> float:
         return self._side * self._thrust.dead_band
+
+
+# Noise of postures owes less than that share of the impulse; and so long thrust must stand on one
+# side, in seconds, before it is more than a correction of the last one.
+_WAITING_SHARE, _STANDS_S = 1.0 / 3.0, 2.0
 
 
 def _clipped(value: float, most: float) -> float:

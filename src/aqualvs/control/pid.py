@@ -121,6 +121,10 @@ class Pid:
         straight = self.options.proportional * (setpoint - measured) + forward
         self._integral = self._output - straight if self.options.integral > 0.0 else 0.0
 
+    def fade(self, kept: float) -> None:
+        """Forget all but a share of the integral."""
+        self._integral *= kept
+
     def applied(self, output: float) -> None:
         """Take in what the actuator really did with the last output, where others limit it."""
         if math.isfinite(output):

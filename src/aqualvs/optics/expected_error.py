@@ -21,7 +21,7 @@ from aqualvs.optics.uncertainty import RigUncertainty
 SIGMA_PX = 0.1
 """Standard deviation of a stripe point across the stripe, in pixels."""
 N_POINTS = 100
-"""Points on every stripe."""
+"""Points on every stripe that is long enough in the picture."""
 USUAL_RANGES = (0.3, 0.6, 1.0)
 """Where errors are told, in metres."""
 
@@ -107,7 +107,8 @@ class WallView:
     wall_range : float
         Metres.
     stripes : tuple of StripeView
-        For every laser; `N_POINTS` each, none where the stripe is out of the picture.
+        For every laser; `N_POINTS` each, fewer where the stripe is hardly in the picture, none
+        where it is out of it.
     slopes : tuple of array, shape (N,)
         For every laser, the change of its points' distance ahead by a pixel across the stripe,
         in m/px.

@@ -45,8 +45,10 @@ class StripeView:
         return len(self.pixels) > 1
 
     def thinned(self, n_points: int) -> "StripeView":
-        """Return the same stripe with `n_points` points."""
-        pick = np.linspace(0, len(self.pixels) - 1, n_points).round().astype(int)
+        """Return the same stripe with `n_points` points, or all if there are fewer."""
+        # No point twice: a stripe has no direction between a point and itself.
+        n = min(n_points, len(self.pixels))
+        pick = np.linspace(0, len(self.pixels) - 1, n).round().astype(int)
         return StripeView(self.sheet, self.points_in_dome[pick], self.pixels[pick], self.length_px)
 
 

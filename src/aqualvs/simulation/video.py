@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self, TypeAlias, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import av
 import cv2
@@ -14,6 +13,7 @@ from av.container import OutputContainer
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
 
 Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
@@ -63,7 +63,7 @@ _FALLBACK_BIT_RATE = 6_000_000
 _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 
 
-class VideoWriter:
+class VideoWriter(Closing):
     """Writes RGB frames; use it as a context manager, so that the file is always closed well.
 
     Parameters
@@ -159,17 +159,6 @@ class VideoWriter:
                 self._container.mux(packet)
         except (OSError, av.error.FFmpegError) as error:
             raise OutputError(f"{self._path}: cannot write video ({error}); {_REMEDY}") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 _REMEDY = "choose a folder that can be written, with space left"

@@ -1,19 +1,19 @@
 """How far a batch is: a bar with the time left on standard error, and a line for every dive."""
 
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from aqualvs.app.batch.records import DiveRecord
+from aqualvs.closing import Closing
 
 # Pieces take seconds, so that the last half minute says little of the speed.
 _SPEED_OVER_S = 600.0
 
 
-class BatchProgress:
+class BatchProgress(Closing):
     """Shows a bar where standard error is a terminal, and tells each dive; a context manager.
 
     Parameters
@@ -64,11 +64,6 @@ class BatchProgress:
         self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Take the bar away."""
         self._bar.stop()

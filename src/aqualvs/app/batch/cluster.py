@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from aqualvs.app import crew_start
 from aqualvs.app.runfile import versions
+from aqualvs.closing import Closing
 from aqualvs.errors import AqualvsError, OptionError
 
 _MEMORY_BYTES = 2_000_000_000
@@ -82,7 +82,7 @@ class Workers(Protocol):
         """Return a task that has ended; None if none does within the time."""
 
 
-class DaskWorkers:
+class DaskWorkers(Closing):
     """Workers of a Dask scheduler; a context manager.
 
     Parameters
@@ -188,16 +188,7 @@ class DaskWorkers:
                     f"{mine[name]}; install the same versions"
                 )
 
-    def __enter__(self) -> Self:
-        """Return the workers."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Drop what is under way, and end the processes of this machine."""
         self._client.close()
         if self._cluster is not None:

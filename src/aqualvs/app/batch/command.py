@@ -138,7 +138,7 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
         ):
             tell(line)
         tell(f"summary: {write_summary(request.out, records)}")
-    claim.settle()
+    claim.close()
     if stop.caught:
         return stop.exit_code
     unfinished = [r for r in found.values() if r.state is not DiveState.FINISHED]

@@ -101,7 +101,7 @@ def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.expe
             tell(f"[{number}/{len(names)}] {_line(book.records[name], book.seconds[name])}")
             bar.end()
             write_page(book.in_order(), book.seconds, request.out)
-    claim.settle()
+    claim.close()
     for line in _closing(book, names, request.out):
         tell(line)
     return _EXIT_FAILED if any(book.records[name].failure for name in names) else 0

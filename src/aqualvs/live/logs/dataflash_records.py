@@ -71,7 +71,8 @@ class Format:
         """A record without its head as a NumPy type; None where the description makes no sense."""
         if len(self.codes) != len(self.columns) or any(c not in _TYPES for c in self.codes):
             return None
-        if len(set(self.columns)) != len(self.columns) or not self.columns:
+        named = all(self.columns) and len(set(self.columns)) == len(self.columns)
+        if not named or not self.columns:
             return None
         layout = np.dtype(
             [(name, _TYPES[code][0]) for name, code in zip(self.columns, self.codes, strict=True)]

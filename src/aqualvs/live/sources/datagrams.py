@@ -56,13 +56,14 @@ def parse_udp(where: str) -> UdpAddress:
     SourceError
         If there is no port, or the host is no numeric address.
     """
-    parts = urlsplit(where)
+    scheme = where.partition("://")[0]
     try:
+        parts = urlsplit(where)
         host, port = (parts.hostname or "").strip("@"), parts.port
     except ValueError:
         port = None
     if port is None:
-        raise SourceError(f"{where}: no port; type {parts.scheme}://:5600, for instance")
+        raise SourceError(f"{where}: no port; type {scheme}://:5600, for instance")
     if host == "localhost":
         host = "127.0.0.1"
     try:
@@ -70,7 +71,7 @@ def parse_udp(where: str) -> UdpAddress:
     except ValueError:
         raise SourceError(
             f"{where}: listening needs a numeric address of this machine, or none; "
-            f"type {parts.scheme}://:{port}"
+            f"type {scheme}://:{port}"
         ) from None
 
 

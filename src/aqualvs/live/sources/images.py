@@ -3,11 +3,11 @@
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
 import cv2
 
+from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.quiet import quiet_decoders
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
@@ -15,7 +15,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 
 
-class ImageSource:
+class ImageSource(Closing):
     """Images as frames, in natural order of their names (`img2` before `img10`).
 
     Parameters
@@ -68,18 +68,6 @@ class ImageSource:
                 f"{path}: {size[0]}x{size[1]} px, but the first image has "
                 f"{self.size_px[0]}x{self.size_px[1]} px; keep one size a folder"
             )
-
-    def __enter__(self) -> Self:
-        """Return itself; nothing stays open between two images."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Do nothing; no image file stays open."""
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -17,7 +17,13 @@ from aqualvs.live.sources.image_schemas import (
     image_of_ros,
     kind_of_schema,
 )
-from aqualvs.live.sources.message_source import Logged, MessageSource, Topic, choose_topic
+from aqualvs.live.sources.message_source import (
+    MAX_BYTES,
+    Logged,
+    MessageSource,
+    Topic,
+    choose_topic,
+)
 
 _Reader: TypeAlias = Callable[[bytes], ImageMessage]
 
@@ -153,6 +159,9 @@ def _records_of(chunk: Any) -> list[Any]:
     """Return the records in a chunk; the package would take any amount of memory for them."""
     from mcap.stream_reader import breakup_chunk
 
+    # Of the smallest messages, records take ten times the room that their bytes take.
+    if max(chunk.uncompressed_size, len(chunk.data)) > MAX_BYTES:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
     return list(breakup_chunk(replace(chunk, compression="", data=raw)))
 

@@ -2,18 +2,21 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self, TypeAlias, cast
+from typing import TypeAlias, cast
 
 import av
 from av.video.codeccontext import VideoCodecContext
 
+from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.live.sources.image_messages import ENCODINGS, ImageMessage, planes_of_message
 from aqualvs.live.sources.live_decoder import LiveDecoder
 from aqualvs.live.sources.packets import packet_with
 from aqualvs.live.sources.planes import planes_of
 from aqualvs.scanning.scan import Frame, Planes
+
+MAX_BYTES = 1 << 27
+"""Size of a chunk or message when unpacked; an RGB picture of 40 megapixels takes 120 MB."""
 
 Logged: TypeAlias = tuple[int, ImageMessage | None]
 """Time of the log in nanoseconds, and the image; None for a message that cannot be read."""
@@ -66,7 +69,7 @@ def choose_topic(where: str, topics: list[Topic], wanted: str | None) -> Topic:
     raise OptionError(f"{where}: no images on topic {wanted}; there is {listed}")
 
 
-class MessageSource:
+class MessageSource(Closing):
     """Images of one topic as frames; satisfies `FrameSource`.
 
     Parameters
@@ -123,18 +126,6 @@ class MessageSource:
                 f"{self.name}: the last {self.n_frames - last - 1} of {self.n_frames} images "
                 "cannot be decoded; the recording is damaged"
             )
-
-    def __enter__(self) -> Self:
-        """Return itself; the file is open only while frames are read."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Do nothing; the reading generator closes the file."""
 
     def _survey(self) -> tuple[tuple[int, int], float | None]:
         """Return the size of the first picture, and the rate of the first ones."""

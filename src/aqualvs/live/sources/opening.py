@@ -6,6 +6,7 @@ What reads streams, cameras and recordings is imported where it is used: most di
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import av
 from av.container import InputContainer
@@ -56,7 +57,7 @@ def open_source(
     Raises
     ------
     SourceError
-        If there is nothing at `where`, or it cannot be read.
+        If there is nothing at `where`, it is no address, or it cannot be read.
     OptionError
         If `fps` is given for a video or is not positive; if `topic` is missing, wrong, or given
         for what has none; if a package is missing.
@@ -64,6 +65,7 @@ def open_source(
     if fps is not None and not 0 < fps < math.inf:
         raise OptionError(f"frame rate {fps:g}: must be positive and finite")
     if is_address(where):
+        _check_address(str(where))
         _no(topic, where, "a stream has no topics; leave the topic out")
         return _video(str(where), fps)
     path, topic = _split_topic(where, topic)
@@ -159,6 +161,24 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (".bag", ".db3") or (path / "metadata.yaml").is_file()
 
 
+def _check_address(where: str) -> None:
+    """Refuse what no stream can have for an address, which FFmpeg would try again and again."""
+    shown = where if where.isprintable() else repr(where)
+    remedy = "write SCHEME://HOST:PORT, such as rtsp://192.168.2.10:554/video or udp://:5600"
+    try:
+        parts = urlsplit(where)
+        host, port = parts.hostname, parts.port
+    except ValueError as fault:
+        raise SourceError(f"{shown}: no address ({fault}); {remedy}") from None
+    if not where.isprintable() or " " in where:
+        raise SourceError(f"{shown}: no address (a space or control character in it); {remedy}")
+    if not host and port is None:
+        raise SourceError(f"{shown}: neither host nor port; {remedy}")
+    # Who listens at UDP port 0 gets a free one; nobody can be reached there.
+    if port == 0 and parts.scheme.lower() not in ("udp", "rtp"):
+        raise SourceError(f"{shown}: port 0 cannot be reached; {remedy}")
+
+
 def _is_stream(where: str) -> bool:
     return where == "bluerov" or is_address(where) or where.lower().endswith(".sdp")
 
@@ -179,6 +199,7 @@ def _stream(where: str, transport: "Transport") -> Feed:
         return UdpFeed(where, UdpAddress("", BLUEROV_PORT))
     if where.lower().endswith(".sdp"):
         return _described(Path(where))
+    _check_address(where)
     if where.lower().startswith(("udp://", "rtp://")):
         return UdpFeed(where, parse_udp(where))
     return remote_feed(where, transport=transport)

@@ -3,8 +3,7 @@
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
 import av
 from av.container import InputContainer
@@ -12,6 +11,7 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.images import ImageSource, images_in
 from aqualvs.live.sources.planes import planes_of
@@ -26,7 +26,7 @@ class UnlikeSurveyError(Exception):
     """A part of a dive does not hold what it should; the dive must be measured in one piece."""
 
 
-class VideoParts:
+class VideoParts(Closing):
     """Reads parts of a video, opened once for all of them; a context manager.
 
     Parameters
@@ -88,19 +88,6 @@ class VideoParts:
             self._container = av.open(str(self._path), timeout=_PATIENCE_S)
             _prepare(self._container.streams.video[0])
         return self._container.streams.video[0]
-
-    def __enter__(self) -> Self:
-        """Return itself; the file is opened when it is needed."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the file."""
-        self.close()
 
 
 def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:

@@ -2,8 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import av
 from av.container import InputContainer
@@ -11,6 +9,7 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
 from aqualvs.live.sources.ledger import Ledger
 from aqualvs.live.sources.planes import planes_of
@@ -29,7 +28,7 @@ predict the next ones. Elsewhere it is the torn end of a file; its error would t
 pictures with it that the decoder still holds."""
 
 
-class VideoSource:
+class VideoSource(Closing):
     """A video file, or a stream that FFmpeg can open.
 
     Parameters
@@ -165,19 +164,6 @@ class VideoSource:
         """Close the file; frames already delivered stay valid."""
         self._container.close()
 
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the file."""
-        self.close()
-
 
 def _open(where: str) -> InputContainer:
     """Open a container, or say in one line why not."""
@@ -187,6 +173,8 @@ def _open(where: str) -> InputContainer:
         raise SourceError(f"{where}: no such file; check the path") from fault
     except (av.error.InvalidDataError, av.error.EOFError) as fault:
         raise SourceError(_not_a_video(where)) from fault
+    except av.error.ExitError as fault:
+        raise SourceError(f"{where}: nothing came in {_STALL_S:g} s; is the sender on?") from fault
     except (av.error.FFmpegError, OSError) as fault:
         raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
 
