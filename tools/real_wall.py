@@ -76,6 +76,7 @@ class BoardPose:
     pitch_deg: float
     yaw_deg: float
     residual_px: float
+    flat_range_m: float
     flat_pitch_deg: float
     flat_yaw_deg: float
 
@@ -142,11 +143,16 @@ def board_pose(image: np.ndarray, k: np.ndarray = K) -> BoardPose:
     # Camera to `dome`: x right, y forward, z up.
     n_x, n_y, n_z = normal[0], normal[2], -normal[1]
     placed = points @ rotation.T
+    # The range is that of the plane where it comes nearest to the camera, beside the board: what
+    # the plane may be tilted counts over the way there, along either side of the board.
+    beside = (distance * rotation[:, 2] - tvec[:, 0]) @ rotation[:, :2] - points[:, :2].mean(axis=0)
+    levers = beside / points[:, :2].std(axis=0)
     return BoardPose(
         range_m=abs(distance),
         pitch_deg=math.degrees(math.atan2(n_z, n_y)),
         yaw_deg=math.degrees(math.atan2(n_x, n_y)),
         residual_px=float(np.sqrt(((projected - corners.reshape(-1, 1, 2)) ** 2).sum(-1).mean())),
+        flat_range_m=FLATNESS_M * math.hypot(1.0, *levers.tolist()),
         flat_pitch_deg=math.degrees(FLATNESS_M / placed[:, 1].std()),
         flat_yaw_deg=math.degrees(FLATNESS_M / placed[:, 0].std()),
     )
@@ -247,7 +253,7 @@ def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose
         float(row["yaw_deg"]) - board.yaw_deg,
     )
     sigmas = tuple(_sigma(row, what) for what in ("range_m", "pitch_deg", "yaw_deg"))
-    flat = (FLATNESS_M, board.flat_pitch_deg, board.flat_yaw_deg)
+    flat = (board.flat_range_m, board.flat_pitch_deg, board.flat_yaw_deg)
     scores = [e / math.hypot(s, f) for e, s, f in zip(errors, sigmas, flat, strict=True)]
     return Measured(
         picture,

@@ -1,5 +1,6 @@
 """Which laser made which stripe: rivals, light that is missing, planes by chance."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,15 @@ from aqualvs.scanning.assignment import UNTESTED, Outcome, Verdict, widened
 from aqualvs.scanning.measure import Measurement
 from aqualvs.scanning.pipeline import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.readings import read_returns
+from aqualvs.scanning.search import SearchAxis, plan_searches
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.surfaces import surface_on
 from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.example_rigs import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
-from scanning_cases import everywhere, returns_of
+from scanning_cases import everywhere, returns_of, strands
 
 FAN = Fan()
 FAR_FAN = Fan(baseline=(0.2, 0.0, 0.02), aim_deg=-10.0)
@@ -166,3 +172,68 @@ def test_a_table_with_gaps_is_solid_where_something_solid_is_asked_for() -> None
         labels[kind] = np.bincount(scan.points.label, minlength=2)
     assert labels[TargetKind.AUTO][0] > labels[TargetKind.AUTO][1]
     assert labels[TargetKind.SOLID][1] > labels[TargetKind.SOLID][0]
+
+
+def nearer_strands(points: FloatArray) -> BoolArray:
+    return strands(points) & (points[:, 0] < 0.0)
+
+
+def farther_strands(points: FloatArray) -> BoolArray:
+    return strands(points) & (points[:, 0] > 0.0)
+
+
+def joined(parts: list[dict[SearchAxis, Returns]]) -> dict[SearchAxis, Returns]:
+    """Returns of several parts of a scene, in the order that detection gives."""
+    found = {}
+    for axis in SearchAxis:
+        mine = [part[axis] for part in parts if axis in part]
+        if mine:
+            rows = [np.concatenate(column) for column in zip(*map(columns, mine), strict=True)]
+            order = np.lexsort((rows[1], rows[0]))
+            found[axis] = Returns(*(row[order] for row in rows))
+    return found
+
+
+def columns(part: Returns) -> tuple[FloatArray, ...]:
+    return part.line, part.position, part.height, part.width, part.likelihood
+
+
+def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each plane lacks a laser that lights the other one: which of them is the net?"""
+    rig = example_rig()
+    first, second, third = rig.lasers
+    near, far = (Plane.from_normal((0.1 * k, 1.0, 0.0), 0.5 + 0.12 * k) for k in range(2))
+    parts = [
+        returns_of(replace(rig, lasers=(second, third)), [(near, nearer_strands)], 0.1),
+        returns_of(replace(rig, lasers=(first, second)), [(far, farther_strands)], 0.1),
+    ]
+    camera = rig.camera()
+    searches, triangulator = plan_searches(rig, camera), Triangulator(rig, camera)
+    test = assignment.AssignmentTest(searches, triangulator, rig.working_range)
+
+    def outweighed(
+        parts: list[dict[SearchAxis, Returns]], *, share: float = 1.0, mesh: bool = True
+    ) -> bool:
+        chunks, _ = read_returns(joined(parts), searches, triangulator).chunks()
+        target, other = (surface_on(one, chunks, len(rig.lasers), 850.0) for one in (far, near))
+        target = replace(target, is_mesh=True)
+        other = replace(other, is_mesh=mesh, voice=share * target.voice)
+        assert test.outweighed(chunks, [target, other], other) is None
+        return test.outweighed(chunks, [target, other], target) is other
+
+    assert outweighed(parts)
+    # Not by less light, by something solid, or where every laser is on the net.
+    assert not outweighed(parts, share=0.9)
+    assert not outweighed(parts, mesh=False)
+    whole = returns_of(rig, [(far, strands)], 0.1)
+    assert not outweighed([parts[0], whole])
+    scanner, returns = Scanner(rig), joined(parts)
+    chunks, _ = read_returns(returns, searches, triangulator).chunks()
+    other = surface_on(near, chunks, len(rig.lasers), 850.0)
+    assert scanner.measure(0, 0.0, returns).posture
+    monkeypatch.setattr(assignment.AssignmentTest, "outweighed", lambda *_: other)
+    refused = scanner.measure(0, 0.0, returns).posture
+    assert isinstance(refused, Refusal)
+    assert refused.reason is Reason.AMBIGUOUS

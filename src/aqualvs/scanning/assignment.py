@@ -43,6 +43,7 @@ from aqualvs.scanning.assignment_kernels import (
 from aqualvs.scanning.chunks import Chunks
 from aqualvs.scanning.measure import Measurement
 from aqualvs.scanning.net_mean import doubted
+from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.readings import Readings
 from aqualvs.scanning.search import SearchAxis, StripeSearch
@@ -147,6 +148,40 @@ class AssignmentTest:
         most, faint = seen_of(plane, target.members, chunks.n_lines, chunks.laser, self._bands)
         small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not target.is_mesh)
         return small and faint > _MAY_BE_FAINT
+
+    def outweighed(
+        self, chunks: Chunks, surfaces: Sequence[Surface], target: Surface
+    ) -> Surface | None:
+        """Return a nearer net with as much light as a net that lacks a laser; None mostly.
+
+        Two stripes test a plane by one number. Of a folded net's many pieces two may pass that and
+        be no plane, while the third laser, which should be seen there, lights the net elsewhere.
+        Behind a net other light is no wonder; nearer, the net would have to be twice there.
+
+        Parameters
+        ----------
+        chunks : Chunks
+            C of them.
+        surfaces : sequence of Surface
+            All that were found.
+        target : Surface
+            The one to judge.
+        """
+        voice, plane = chunks.table[WEIGHT], target.plane
+        near = plane.normal @ chunks.table[X : Z + 1] < plane.offset
+        nearer = [
+            one
+            for one in surfaces
+            if one is not target
+            and one.is_mesh
+            and one.voice >= target.voice
+            and voice[one.members & near].sum() > 0.5 * voice[one.members].sum()
+        ]
+        if not (target.is_mesh and nearer):
+            return None
+        packed = np.append(plane.normal, plane.offset)
+        _, faint = seen_of(packed, target.members, chunks.n_lines, chunks.laser, self._bands)
+        return nearer[0] if faint > _MAY_BE_FAINT else None
 
     def test(
         self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surface: Surface

@@ -179,6 +179,10 @@ class Scanner:
         else:
             found = self._meter.measure(readings, chunk_index, target)
             found = widened(found, tested)
+            # The mean plane of folds takes all of a net's light, a nearer part of it too.
+            other = None if found.folded else self._assignment.outweighed(chunks, surfaces, target)
+            if other is not None and found.posture:
+                found = _ambiguous(readings, target.plane, other.plane)
         points, listed = label_readings(
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )

@@ -26,6 +26,9 @@ X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 N_ROWS = 7
 
 _MAX_HYPOTHESES = 6000
+# Trials for a plane, times the square of its share of the voice; beyond so many in all, only this
+# part of them.
+_TRIALS, _MANY, _SOME = 45.0, 2500.0, 0.55
 # Chunks looked at in all: a frame full of noise must not hold up a live run.
 _MAX_WORK = 10_000_000
 # So many chunks are scored before it is asked whether the rest can matter.
@@ -319,11 +322,13 @@ def search_plane(
             continue
         best = score
         best_plane[:] = plane
-        # With a share s of the voice on the plane a trial succeeds with probability of about
-        # s^2 / 5: of neighbours half fit, and a third of the draws are of one laser. Five times the
-        # expected number of trials leaves one search in 150 short of it.
+        # With a share s of the voice on the plane a trial succeeds with probability of s^2 / 12 to
+        # s^2 / 5: of neighbours half fit or fewer, and a third of the draws are of one laser. Where
+        # two thirds of a net's light make a plane of their own, its trials leave one search in
+        # 1000 without the whole net. Planes through noise are not worth as many.
         share = min(best / total, 1.0)
-        needed = min(most, int(25.0 / (share * share)) + 20)
+        trials = _TRIALS / (share * share)
+        needed = min(most, int(max(min(trials, _MANY), _SOME * trials)) + 20)
     for _ in range(3):
         if best > 0.0:
             refine_plane(table, best_plane, 1.0, normal, scratch, lanes)
