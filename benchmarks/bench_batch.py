@@ -21,14 +21,13 @@ from typing import Any
 
 import av
 
-from aqualvs.app.batch.cluster import DaskWorkers, Outcome
-from aqualvs.app.batch.pieces import PieceResult
-from aqualvs.app.batch.season import Season, Steps
-from aqualvs.app.batch.survey import Survey
-from aqualvs.app.batch.work import PIECE_FRAMES, DiveWork
-from aqualvs.app.demo import bundled_dive
-from aqualvs.app.run_inputs import RunRequest
-from aqualvs.live.sources.spans import Span, SpanKind
+from aqualvs.batch.cluster import DaskWorkers, Outcome
+from aqualvs.batch.parts import PieceResult
+from aqualvs.batch.scheduler import Season, Steps
+from aqualvs.batch.work import PIECE_FRAMES, DiveWork, Survey
+from aqualvs.demo import bundled_dive
+from aqualvs.results.run_request import RunRequest
+from aqualvs.sources.spans import Span, SpanKind
 
 _SHORT, _FRAMES, _PIECE = 100, 300, 100
 _DIVES, _PIECES_A_DIVE = 1000, 15

@@ -15,18 +15,16 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from aqualvs.calibration.board_sets import BoardSet, DomeOptions
-from aqualvs.calibration.bundle import BundleState
-from aqualvs.calibration.dome import dome
-from aqualvs.calibration.dome_problem import DomeProblem, dome_problem
-from aqualvs.calibration.rig_priors import PRIORS
-from aqualvs.calibration.view import View
+from aqualvs.calibration.dome.calibrate import dome
+from aqualvs.calibration.dome.problem import BoardSet, DomeOptions, DomeProblem, dome_problem
+from aqualvs.calibration.solver.bundle import BundleState
+from aqualvs.calibration.solver.priors import PRIORS
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty
+from aqualvs.simulation.scenarios import example_rig
 
 _AIR = 1.0003
 _NOISE_PX = 0.1

@@ -1,7 +1,7 @@
 """The closed loop in simulation: trials against what is asked for, and 500 random dives.
 
 Run `python -m benchmarks control`. Vehicle, sea, net and delays are those of
-`aqualvs.app.follow_trials` and `aqualvs.app.follow_fast`; postures are sampled with the scanner's
+`aqualvs.follow.case` and `aqualvs.follow.monte_carlo`; postures are sampled with the scanner's
 noise. Set AQUALVS_LOOP_RENDERED=1 for the trials through rendered pictures as well (half an hour).
 References are what the loop must reach.
 """
@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from aqualvs.app.follow_fast import DiveResult, random_dives
-from aqualvs.app.follow_sim_case import tuned_gains, vehicle_model
-from aqualvs.app.follow_sim_measures import step_measures
-from aqualvs.app.follow_trials import RANGE, STEP, STEP_S, Trials
+from aqualvs.follow.case import RANGE, STEP, STEP_S, Trials, tuned_gains, vehicle_model
+from aqualvs.follow.log import step_measures
+from aqualvs.follow.monte_carlo import DiveResult, random_dives
 
 _VEHICLES = ("bluerov2", "bluerov2-heavy")
 _DIVES = {"bluerov2": 200, "bluerov2-heavy": 200, "videoray": 100}

@@ -19,25 +19,22 @@ from typing import Any
 
 import numpy as np
 
-from aqualvs.app.dashboard.access import Access
-from aqualvs.app.dashboard.commands import Controls, NoRecorder
-from aqualvs.app.dashboard.output import Dashboard
-from aqualvs.app.dashboard.server import DashboardServer
-from aqualvs.app.live import SWITCH_S
-from aqualvs.control.setpoint import SetpointHolder
-from aqualvs.live.health import PartHealth, State
+from aqualvs.control.time_filter import PostureFilter
+from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.live.command import SWITCH_S
+from aqualvs.live.dashboard.access import Access, Controls, NoRecorder
+from aqualvs.live.dashboard.output import Dashboard
+from aqualvs.live.dashboard.server import DashboardServer
 from aqualvs.live.outputs.mavlink import MavlinkOutput
-from aqualvs.live.runner import FixedScanner, LiveRunner
-from aqualvs.live.sample import LiveSample
-from aqualvs.live.sources.opening import open_feed
-from aqualvs.live.time_filter import PostureFilter
-from aqualvs.live.warm_up import warm_up
+from aqualvs.live.runner import FixedScanner, LiveRunner, warm_up
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.recording.sample import LiveSample
+from aqualvs.scanner import Scanner
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.video import VideoWriter
+from aqualvs.sources.base import PartHealth, State
+from aqualvs.sources.opening import open_feed
 
 _RENDERED, _PLAYED, _FPS = 6, 250, 25.0
 # Median and 99th percentile that are asked for, in ms.

@@ -15,7 +15,7 @@ import numpy as np
 
 from aqualvs.geometry import Plane
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.scanning.mesh import (
+from aqualvs.scanning.paper.mesh_filter import (
     MeshFilterOptions,
     laser_frame,
     laser_plane_image,

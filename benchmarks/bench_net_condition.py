@@ -26,12 +26,11 @@ from tests.net_dives import (
 from tests.quick_pictures import quick_scans
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.nets.condition import NetCondition, NetStretch
+from aqualvs.nets.holes import Hole
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.net_condition import NetCondition, NetStretch
-from aqualvs.scanning.net_holes import Hole
 from aqualvs.scanning.scan import Scan
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
-from aqualvs.simulation.random_scenes import Difficulty
+from aqualvs.simulation.scenarios import Difficulty, bluerov2_rig, example_rig
 from aqualvs.simulation.scene import Net
 
 SERIES = 2031

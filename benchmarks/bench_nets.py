@@ -12,20 +12,19 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.candidates import Readings, read_returns
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.labels import label_readings
-from aqualvs.scanning.measure import FitMethod, PostureMeter
-from aqualvs.scanning.pipeline import Scanner
-from aqualvs.scanning.readings import Readings, read_returns
+from aqualvs.scanning.laser_bands import plan_searches, searched_range
+from aqualvs.scanning.posture_estimator import FitMethod, PostureMeter
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.search import plan_searches, searched_range
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.surfaces import find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.random_scenes import Difficulty, random_scene
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
 from aqualvs.simulation.scene import Label, Scene
 from aqualvs.simulation.truth import visible_fit
 

@@ -12,11 +12,10 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, DomeCamera
-from aqualvs.optics.camera_params import parameter_names
+from aqualvs.optics.camera import BareCamera, DomeCamera, parameter_names
+from aqualvs.optics.camera_kernels import trace_all
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.rays_batch import trace_all
 
 SIZE_PX = (720, 576)
 LENS = Lens(

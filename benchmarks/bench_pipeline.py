@@ -21,11 +21,11 @@ import av
 from benchmarks.dive_files import Dive, small_dive, wide_dive
 from benchmarks.history import machine
 
-from aqualvs.app.run import run as run_dive
-from aqualvs.app.run_inputs import RunRequest
-from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.pipeline import run as run_dive
+from aqualvs.results.run_request import RunRequest
+from aqualvs.scanner import Scanner
+from aqualvs.sources import open_source
 
 # A run may take so many times as long as decoding.
 _ASKED = 1.25

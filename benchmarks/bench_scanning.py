@@ -20,25 +20,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.live.colour import bgr_of
-from aqualvs.live.sources import open_source
 from aqualvs.optics.camera import DomeCamera
 from aqualvs.optics.rig import Rig
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.candidates import read_returns
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.measure import FitMethod, PostureMeter
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import range_pitch_yaw
-from aqualvs.scanning.readings import read_returns
+from aqualvs.scanning.posture_estimator import FitMethod, PostureMeter
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.search import SearchAxis, plan_searches
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.surfaces import find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.video import VideoWriter
+from aqualvs.sources import open_source
+from aqualvs.sources.base import bgr_of
 
 U8 = NDArray[np.uint8]
 # An area drawn by hand reaches this far to either side of the stripe, as a share of the width.

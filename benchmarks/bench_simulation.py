@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.lasers import default_sources
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import Scene
-from aqualvs.simulation.sensor import expose, spread
 
 _TARGET_MS = 400.0
 _NETS = ("net_diamond", "net_clutter")

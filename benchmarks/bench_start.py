@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks.dive_files import small_dive
 
-from aqualvs.app.demo import bundled_dive
+from aqualvs.demo import bundled_dive
 
 # Growth of a dive's memory that still counts as none, of the memory of a short one.
 _FLAT = 5.0
@@ -33,9 +33,9 @@ parser.print_help()
 
 _FIRST_POSTURE = """
 import sys
-from aqualvs.live.sources import open_source
+from aqualvs.sources import open_source
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 scanner = Scanner(load_rig(sys.argv[2]))
 with open_source(sys.argv[1]) as source:
     assert scanner.process(next(iter(source))).posture
@@ -114,9 +114,9 @@ def start_rows(rounds: int, *, with_imports: bool) -> list[dict[str, Any]]:
     demo = [str(bundled_dive() / name) for name in ("dive.mp4", "rig.yaml")]
     imports = {
         "aqualvs.optics": "numpy, numba",
-        "aqualvs.scanning.pipeline": "numpy, numba, cv2",
-        "aqualvs.app.run": "numpy, numba, cv2, av, pydantic, yaml",
-        "aqualvs.app.run_folder": "numpy, numba, cv2, av, pydantic, yaml, pyarrow, plotly.offline",
+        "aqualvs.scanner": "numpy, numba, cv2",
+        "aqualvs.pipeline": "numpy, numba, cv2, av, pydantic, yaml",
+        "aqualvs.run_outputs": "numpy, numba, cv2, av, pydantic, yaml, pyarrow, plotly.offline",
     }
     found = [
         start_row("aqualvs --help", ["-m", "aqualvs", "--help"], ["-c", _PLAIN_HELP], rounds),

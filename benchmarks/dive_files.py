@@ -7,11 +7,10 @@ from pathlib import Path
 import av
 import numpy as np
 
-from aqualvs.app.demo import bundled_dive
+from aqualvs.demo import bundled_dive
 from aqualvs.optics.rigfile import save_rig
-from aqualvs.simulation.example_rigs import bluerov2_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import bluerov2_rig, load_scenario
 from aqualvs.simulation.video import VideoWriter
 
 _RENDERED, _FPS = 4, 25.0

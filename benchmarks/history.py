@@ -12,8 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from aqualvs.app.crew_start import n_cores
 from aqualvs.errors import OutputError, SourceError
+from aqualvs.workers.start_method import n_cores
 
 DEFAULT = Path("out/bench/history.json")
 FORMAT = 1

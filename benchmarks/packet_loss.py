@@ -34,23 +34,19 @@ import numpy as np
 from av.codec.context import Flags, Flags2
 from av.video.frame import VideoFrame
 
-from aqualvs.app.demo import bundled_dive
-from aqualvs.live.colour import bgr_of
-from aqualvs.live.sources import open_source
-from aqualvs.live.sources.h264 import IDR, SEI, SLICE, START_CODE
-from aqualvs.live.sources.live_frames import LiveFrames
-from aqualvs.live.sources.packets import packet_with
-from aqualvs.live.sources.planes import planes_of
-from aqualvs.live.sources.reception import Reception
-from aqualvs.live.sources.rtp import RtpOrder, parse_rtp
-from aqualvs.live.sources.rtp_h264 import TICKS_HZ, H264Depacketizer
-from aqualvs.live.sources.udp_readers import decoded, decoder_of
+from aqualvs.demo import bundled_dive
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane
-from aqualvs.scanning.search import SearchAxis, plan_searches
+from aqualvs.sources import open_source
+from aqualvs.sources.base import bgr_of, packet_with, planes_of
+from aqualvs.sources.h264 import IDR, SEI, SLICE, START_CODE
+from aqualvs.sources.live_frames import LiveFrames, Reception
+from aqualvs.sources.rtp import TICKS_HZ, H264Depacketizer, RtpOrder, parse_rtp
+from aqualvs.sources.udp import decoded, decoder_of
 
 FPS = 25
 # Of H.264 in a packet; one slice of `slice-max-size` fits into it.

@@ -18,12 +18,11 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.random_scenes import Difficulty, random_scene
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
 from aqualvs.simulation.scene import Label
 from aqualvs.simulation.truth import visible_fit
 

@@ -6,10 +6,10 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.plane_fit import SOLID_ERROR, fit_robust
 from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
 from aqualvs.scanning.scan import Scan, ScanPoints
-from aqualvs.scanning.search import SearchAxis, plan_searches
 from aqualvs.scanning.triangulate import Triangulator
 
 

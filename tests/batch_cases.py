@@ -7,10 +7,10 @@ from pathlib import Path
 
 import av
 
-from aqualvs.app.batch.cluster import Outcome
-from aqualvs.app.batch.work import DiveWork
-from aqualvs.app.demo import bundled_dive
-from aqualvs.app.run_inputs import RunRequest
+from aqualvs.batch.cluster import Outcome
+from aqualvs.batch.work import DiveWork
+from aqualvs.demo import bundled_dive
+from aqualvs.results.run_request import RunRequest
 
 DEMO = Path(str(bundled_dive()))
 """A net with a hole among fish and bubbles, and its rig."""

@@ -7,10 +7,9 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.simulation.cameras import simulated_camera
-from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.lasers import default_sources
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import example_rig, load_scenario
 
 REAL = ("webcam", "action", "pal")
 

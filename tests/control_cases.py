@@ -8,8 +8,7 @@ import numpy as np
 
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.gains import ControlGains
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import Effort, Mode, VehicleState
+from aqualvs.control.vehicle import Effort, Mode, Setpoint, VehicleState
 from aqualvs.scanning.posture import Posture
 
 FRAME_S = 0.04

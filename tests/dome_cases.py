@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.board_sets import BoardSet, DomeOptions
-from aqualvs.calibration.dome_result import DomeCalibration
-from aqualvs.calibration.rig_priors import rig_difference
-from aqualvs.calibration.view import View
+from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
+from aqualvs.calibration.solver.priors import rig_difference
+from aqualvs.calibration.solver.result import DomeCalibration
+from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 from aqualvs.optics.camera import Camera
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty, rig_moved_by
 
 AIR, WATER = 1.0003, 1.3333
 NOISE_PX = 0.1

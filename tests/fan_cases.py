@@ -15,7 +15,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
-from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
 from aqualvs.scanning.stripe import Returns
 
 

@@ -31,8 +31,8 @@ import numpy as np
 import typer
 
 import aqualvs
-from aqualvs.app import cli
-from aqualvs.app.cli import main
+from aqualvs.cli import main as cli
+from aqualvs.cli.main import main
 from aqualvs.errors import SourceError
 
 CPU_S = 20
@@ -313,7 +313,7 @@ class Format:
 
 def look_at(path: Path) -> None:
     """Look at a source as `aqualvs doctor` does, without looking at the machine each time."""
-    from aqualvs.app import doctor
+    from aqualvs.check import doctor
 
     broken = [
         one.sentence for one in doctor._stream(str(path), None) if one.severity.value == "bad"
@@ -343,14 +343,14 @@ class Bench:
         self._make()
 
     def _make(self) -> None:
-        from aqualvs.app.batch.dive_lists import read_list
-        from aqualvs.app.design.file import EXAMPLE
-        from aqualvs.calibration.pose_files import load_poses
-        from aqualvs.live.logs import read_vehicle_log
-        from aqualvs.live.sources import open_source
-        from aqualvs.live.sources.sdp import read_sdp
-        from aqualvs.simulation.example_rigs import example_rig
-        from aqualvs.simulation.scenario_file import read_scenario
+        from aqualvs.batch.dives import read_list
+        from aqualvs.calibration.targets.pose_files import load_poses
+        from aqualvs.design.file import EXAMPLE
+        from aqualvs.simulation.scenario import read_scenario
+        from aqualvs.simulation.scenarios import example_rig
+        from aqualvs.sources import open_source
+        from aqualvs.sources.udp import read_sdp
+        from aqualvs.vehicle_logs import read_vehicle_log
         from shell_cases import rig_file, wall_picture, write_video
 
         home = self.home
@@ -648,8 +648,8 @@ class Bench:
 
     def _make_settings(self) -> None:
         """Add files that say who is there, what was before, and what is true."""
-        from aqualvs.app.mavlink_options import vehicle_setup
-        from aqualvs.live.mavlink_signing import load_key
+        from aqualvs.live.mavlink.peers import load_key
+        from aqualvs.live.options import vehicle_setup
 
         vehicle = (
             b"aqualvs_vehicle: 1\nsystem: 2\nground_station: 250\nstation_timeout_s: 3.5\n"
@@ -735,8 +735,8 @@ class Bench:
 
     def _make_foreign(self) -> None:
         """Add logs and recordings that other programs write, as their own tests make them."""
-        from aqualvs.live.logs import read_vehicle_log
-        from aqualvs.live.sources import open_source
+        from aqualvs.sources import open_source
+        from aqualvs.vehicle_logs import read_vehicle_log
 
         sys.path.insert(0, str(Path(__file__).parent / "unit"))
         import test_sources_messages as messages

@@ -45,7 +45,7 @@ class Kills:
     caught: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        from aqualvs.simulation.example_rigs import example_rig
+        from aqualvs.simulation.scenarios import example_rig
         from shell_cases import rig_file, wall_picture, write_video
 
         self.home.mkdir(parents=True, exist_ok=True)

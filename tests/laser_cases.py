@@ -4,18 +4,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.laser_views import LaserView
-from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import Surfaces, board_surface, box_surfaces
-from aqualvs.calibration.view import View
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    StripePoints,
+    Surfaces,
+    board_surface,
+    box_surfaces,
+)
+from aqualvs.calibration.lasers.views import LaserView
+from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.sheet import Sheet, sheets_of
-from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 BOX_PLANES = {
     "left": Plane(np.array([1.0, 0.0, 0.0]), -0.2),

@@ -9,17 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.box_pose import SpatialPose
-from aqualvs.calibration.laser_views import PlacedView
-from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import board_surface, place_stripes
-from aqualvs.calibration.view import View
+from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, place_stripes
+from aqualvs.calibration.lasers.views import PlacedView, SpatialPose
+from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Laser, Rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 SQUARE, SQUARES = 0.03, (12, 9)
 _FACING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from aqualvs.errors import SourceError
-from aqualvs.live.health import Health, PartHealth, State
-from aqualvs.live.sample import Instants, LiveSample
-from aqualvs.live.sources import open_source
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.recording.sample import Instants, LiveSample
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame
+from aqualvs.sources import open_source
+from aqualvs.sources.base import Health, PartHealth, State
 
 Step = Frame | float | Exception
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from aqualvs.app.net_seen import DivePostures
-from aqualvs.live.logs import Interpolation, Signal, VehicleLog
-from aqualvs.scanning.net_condition import NetStretch
-from aqualvs.scanning.net_holes import Hole
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.net_lattice import NetLattice
-from aqualvs.scanning.net_twine import Twine
+from aqualvs.nets.condition import NetStretch
+from aqualvs.nets.coverage import Twine
+from aqualvs.nets.holes import Hole
+from aqualvs.nets.lattice import NetLattice
+from aqualvs.nets.places import DivePostures
+from aqualvs.nets.spectrum import Mesh
+from aqualvs.vehicle_logs import Interpolation, Signal, VehicleLog
 
 STRETCH_S = 2.5
 """Length of the stretches made here."""

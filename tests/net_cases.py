@@ -6,15 +6,15 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
-from aqualvs.scanning.search import SearchAxis, plan_searches
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.lit_points import LitPoints
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Label as TrueLabel
 from aqualvs.simulation.scene import Net, Scene
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.truth import LitPoints
 
 # How much wider than the twine a detector sees its light, as `net_twine` assumes.
 HALO = 0.72e-3

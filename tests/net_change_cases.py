@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from aqualvs.app.net_change.cells import COMMON, SIGMA_SCALE
-from aqualvs.app.net_change.surveys import Holes, Stretches, Survey
-from aqualvs.app.net_tables import HOLE_COLUMNS, NET_COLUMNS
+from aqualvs.net_survey.growth import COMMON, SIGMA_SCALE
+from aqualvs.net_survey.surveys import Holes, Stretches, Survey
+from aqualvs.nets.tables import HOLE_COLUMNS, NET_COLUMNS
 
 RADIUS = 8.0
 START = date(2026, 5, 1)

@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
-from aqualvs.live.sources.opening import open_source
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
-from aqualvs.simulation.clutter import random_bubbles, random_fish
-from aqualvs.simulation.lit_points import cast
-from aqualvs.simulation.random_scenes import Difficulty, random_scene
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target, random_bubbles, random_fish
+from aqualvs.simulation.scenarios import Difficulty, random_scene
 from aqualvs.simulation.scene import Label, Net, Scene, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.truth import cast
 from aqualvs.simulation.video import VideoWriter
+from aqualvs.sources.opening import open_source
 
 # Period of pitch and yaw, in seconds.
 _SWAY_S = 3.0

@@ -6,8 +6,8 @@ import numpy as np
 
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.panel_textures import CharucoPrint
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.textures import CharucoPrint
 
 BOARD = CharucoPrint(
     squares=(7, 5), square=24e-3, marker=18e-3, border=12e-3, dictionary="DICT_4X4_250"

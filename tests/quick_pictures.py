@@ -8,14 +8,14 @@ from tests.net_dives import Dive, frame_of
 
 from aqualvs.geometry.arrays import BoolArray
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Scan
+from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.lasers import NORMAL, fan_rays
-from aqualvs.simulation.lit_points import cast, light_sheets
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Scene
-from aqualvs.simulation.sensor import expose, spread
 from aqualvs.simulation.surfaces import pack_surfaces
+from aqualvs.simulation.truth import cast, light_sheets
 
 # Every third pixel away from the lasers' light, which reaches so far to each side: on surfaces in
 # metres, and in the picture in pixels; and the share of a fan's power that counts.

@@ -9,8 +9,8 @@ import numpy as np
 from mcap.reader import NonSeekingReader, SeekingReader
 from rosbags.rosbag2 import Reader
 
-from aqualvs.live.recorder import schemas
-from aqualvs.live.recorder.chunk import Chunk, ChunkBuilder
+from aqualvs.recording.encoding import POSTURE, STRIPES
+from aqualvs.recording.growing_file import Chunk, ChunkBuilder
 
 STEP_NS = 1_000_000_000
 
@@ -58,7 +58,7 @@ def chunk_of(n: int, *, n_messages: int = 3, n_bytes: int = 200) -> Chunk:
     for i in range(n_messages):
         log_ns = n * STEP_NS + i
         content = f"{n}.{i} ".encode() + noise.bytes(n_bytes)
-        topic = schemas.POSTURE if i % 2 == 0 else schemas.STRIPES
+        topic = POSTURE if i % 2 == 0 else STRIPES
         messages.add(topic.number, n, log_ns, log_ns + 7, content)
     return messages.seal()
 

@@ -9,8 +9,8 @@ import pyarrow as pa
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.overlay import OverlayWriter
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.report.overlay import OverlayWriter
 
 COLUMNS = (
     "frame,time_s,valid,reason,range_m,pitch_deg,yaw_deg,sigma_range_m,sigma_pitch_deg,"

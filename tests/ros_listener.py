@@ -15,7 +15,7 @@ import numpy as np
 
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import POINT_TYPE
-from aqualvs.live.sample import LiveSample
+from aqualvs.recording.sample import LiveSample
 from waiting import PATIENCE_S
 
 

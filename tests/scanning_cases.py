@@ -8,7 +8,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
 from aqualvs.scanning.stripe import Returns
 
 Lit: TypeAlias = Callable[[FloatArray], BoolArray]

@@ -11,7 +11,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 SIZE = (720, 576)
 """Width and height of `example_rig`."""

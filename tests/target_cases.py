@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from aqualvs.calibration.printed import board_rectangles, marker_rectangles
-from aqualvs.calibration.targets import Board, BoardKind
+from aqualvs.calibration.targets.printed import board_rectangles, marker_rectangles
+from aqualvs.calibration.targets.targets import Board, BoardKind
 
 # Finer pixels, per pixel each way, that are averaged: leaves 0.01 px of jaggies at most.
 _FINE = 6

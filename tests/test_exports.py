@@ -46,7 +46,7 @@ def _undocumented_methods(owner: type) -> Iterator[str]:
 
 
 def test_modules_are_found() -> None:
-    assert {"aqualvs.geometry.planes", "aqualvs.optics.rig", "aqualvs.app.cli"} <= set(MODULES)
+    assert {"aqualvs.geometry.planes", "aqualvs.optics.rig", "aqualvs.cli.main"} <= set(MODULES)
 
 
 @pytest.mark.parametrize("name", MODULES)

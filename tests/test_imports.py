@@ -48,7 +48,7 @@ def test_imports_go_one_way() -> None:
     [
         ("geometry/planes.py", "from aqualvs.optics import rig"),
         ("scanning/posture.py", "from aqualvs.simulation import scene"),
-        ("optics/rig.py", "from aqualvs.app import cli"),
+        ("optics/rig.py", "from aqualvs.cli import main"),
         ("geometry/planes.py", "import scipy"),
     ],
 )
@@ -71,7 +71,7 @@ def test_every_package_has_its_layer() -> None:
 def test_help_needs_no_numerical_package() -> None:
     """`aqualvs --help` must answer at once."""
     heavy = ("numpy", "numba", "cv2", "scipy", "pyarrow", "plotly", "av")
-    code = f"import sys, aqualvs.app.cli; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, aqualvs.cli.main; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )

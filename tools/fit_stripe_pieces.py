@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import real_lines
+from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.laser_colour import WHITE
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe_pieces import (
     ACROSS,
     ALONG,

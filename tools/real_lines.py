@@ -32,9 +32,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.live.sources import open_source
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
+from aqualvs.sources import open_source
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from typer.testing import CliRunner
 
-from aqualvs.app.cli import app
+from aqualvs.cli.main import app
 from aqualvs.errors import AqualvsError
 
 K = np.array([[1407.86, 0.0, 1083.25], [0.0, 1407.12, 623.67], [0.0, 0.0, 1.0]])

@@ -14,13 +14,13 @@ def main() -> int:
     Returns
     -------
     exit_code : int
-        As `aqualvs.app.cli.main`.
+        As `aqualvs.cli.main.main`.
     """
     _open_standard_files()
     interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if interruptible:
         signal.signal(signal.SIGINT, _leave)
-    from aqualvs.app.cli import main as run
+    from aqualvs.cli.main import main as run
 
     if interruptible:
         signal.signal(signal.SIGINT, signal.default_int_handler)

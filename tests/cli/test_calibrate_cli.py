@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app.cli import main
-from aqualvs.app.simulate import calibration_commands
+from aqualvs.cli.main import main
+from aqualvs.experiments.simulate import calibration_commands
 from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration

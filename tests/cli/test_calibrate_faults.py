@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app.cli import main
-from aqualvs.calibration.target_files import save_board
+from aqualvs.calibration.targets.target_files import save_board
+from aqualvs.cli.main import main
 from aqualvs.optics.rigfile import save_rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from target_cases import board_cells, charuco, homography, picture
 
 SIZE = (440, 340)

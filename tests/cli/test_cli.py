@@ -11,9 +11,9 @@ import typer
 import yaml
 
 from aqualvs import __version__
-from aqualvs.app import cli
-from aqualvs.app.cli import main
-from aqualvs.app.cli_command import CheckedCommand
+from aqualvs.cli import main as cli
+from aqualvs.cli.command import CheckedCommand
+from aqualvs.cli.main import main
 from aqualvs.errors import AqualvsError
 from shell_cases import rig_file
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from aqualvs.app.cli import main
+from aqualvs.cli.main import main
 
 
 @pytest.fixture(scope="module")
@@ -15,7 +15,7 @@ def short_dive(tmp_path_factory):
 
 
 def test_the_demo_measures_and_compares(short_dive, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("aqualvs.app.demo.bundled_dive", lambda: short_dive)
+    monkeypatch.setattr("aqualvs.demo.bundled_dive", lambda: short_dive)
     out = tmp_path / "out"
     # The second time it replaces the first, when asked to.
     for options in ([], ["--overwrite"]):
@@ -28,7 +28,7 @@ def test_the_demo_measures_and_compares(short_dive, tmp_path, monkeypatch, capsy
 
 
 def test_a_missing_dive_is_said(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("aqualvs.app.demo.bundled_dive", lambda: tmp_path)
+    monkeypatch.setattr("aqualvs.demo.bundled_dive", lambda: tmp_path)
     assert main(["demo", "-o", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1

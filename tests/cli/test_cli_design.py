@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.app.cli import main
-from aqualvs.app.design.command import designed_rig
-from aqualvs.app.design.file import EXAMPLE, design_of_rig
-from aqualvs.app.design.predict import predict
+from aqualvs.cli.main import main
+from aqualvs.design.command import designed_rig
+from aqualvs.design.file import EXAMPLE, design_of_rig
+from aqualvs.design.judge import predict
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import example_rig, load_scenario
 from shell_cases import rig_file
 
 SMALL = ["--image", "720x576", "--fov-deg", "48", "--dome-mm", "44.25:5.75"]

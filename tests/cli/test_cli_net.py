@@ -10,15 +10,14 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app import net as body
-from aqualvs.app.cli import main
-from aqualvs.app.journal import PointsJournal
-from aqualvs.app.net_pass import NetPass
-from aqualvs.app.net_request import NetRequest
-from aqualvs.app.outputs import NET_FILES, RunOutputs
-from aqualvs.app.stored_scans import stored_scans
+from aqualvs.cli.main import main
+from aqualvs.net_survey import command as body
+from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.results.folder import NET_FILES, RunOutputs
+from aqualvs.results.net_survey import NetPass, stored_scans
+from aqualvs.results.points import PointsJournal
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net
 from net_cases import passing
 from shell_cases import rig_file, write_video

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.app.cli import main
-from aqualvs.app.outputs import RunOutputs
+from aqualvs.cli.main import main
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.results.folder import RunOutputs
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net, Scene
 from net_cases import passing
 from net_change_cases import Cage, dive, write

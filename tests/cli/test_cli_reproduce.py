@@ -2,8 +2,8 @@
 
 import pytest
 
-from aqualvs.app.cli import main
-from aqualvs.app.reproduce import catalogue
+from aqualvs.cli.main import main
+from aqualvs.experiments import experiment
 
 
 def test_unknown_experiment_is_one_line_and_exit_code_2(tmp_path, capsys):
@@ -23,7 +23,7 @@ def test_folder_that_is_a_file_is_exit_code_2(tmp_path, capsys):
 def test_list_names_every_experiment(capsys):
     assert main(["reproduce", "--list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(catalogue.MODULES)
+    assert [line.split()[0] for line in lines] == list(experiment.MODULES)
 
 
 @pytest.mark.parametrize("name", ["rig"])

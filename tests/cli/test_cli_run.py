@@ -15,9 +15,9 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.cli import main
-from aqualvs.app.crew_start import n_cores
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.cli.main import main
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.workers.start_method import n_cores
 from processes import children_of, on_proc, still_there
 from shell_cases import (
     all_key_frames,

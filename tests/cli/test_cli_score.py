@@ -7,9 +7,9 @@ import shutil
 import pytest
 import yaml
 
-from aqualvs.app.cli import main
-from aqualvs.app.score_own import BARE_LENS, OWN_SYSTEMS
-from aqualvs.simulation.benchmark_scenarios import LEVELS
+from aqualvs.cli.main import main
+from aqualvs.experiments.benchmark.score import BARE_LENS, OWN_SYSTEMS
+from aqualvs.simulation.benchmark import LEVELS
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import re
 import av
 import pytest
 
-from aqualvs.app.cli import main
-from aqualvs.app.simulate import CALIBRATION
+from aqualvs.cli.main import main
+from aqualvs.experiments.simulate import CALIBRATION
 from aqualvs.simulation.cameras import list_cameras
 from aqualvs.simulation.scenarios import list_scenarios
 from shell_cases import rig_file

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app.report import write_report
-from aqualvs.app.report_words import LASER_COLOURS, bgr
+from aqualvs.report.run_page import write_report
+from aqualvs.text import LASER_COLOURS, bgr
 from report_cases import NASTY_LASER, make_dive, write_truth
 
 BROWSERS = (

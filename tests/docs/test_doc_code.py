@@ -16,12 +16,12 @@ from importlib.resources import files
 import pytest
 import yaml
 
-from aqualvs.app.run import run_and_tell
-from aqualvs.app.run_inputs import FrameWindow, RunRequest
-from aqualvs.calibration.target_files import load_board, load_box
+from aqualvs.calibration.targets.target_files import load_board, load_box
 from aqualvs.control.plan import load_plan
-from aqualvs.live.vehicle_file import load_vehicle
+from aqualvs.live.options import load_vehicle
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.pipeline import run_and_tell
+from aqualvs.results.run_request import FrameWindow, RunRequest
 from doc_blocks import ROOT, Block, blocks
 
 PYTHON = blocks("python")

@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from aqualvs.app import simulate
-from aqualvs.app.cli import app, main
+from aqualvs.cli.main import app, main
+from aqualvs.experiments import simulate
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
 from doc_blocks import PAGES, ROOT, Command, all_commands, commands

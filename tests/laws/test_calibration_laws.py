@@ -7,16 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.calibration.board_sets import BoardSet, DomeOptions
-from aqualvs.calibration.bundle import Bundle, BundleState, TargetView
-from aqualvs.calibration.dome import dome
-from aqualvs.calibration.target_pose import target_pose
-from aqualvs.calibration.view import View
+from aqualvs.calibration.dome.calibrate import dome
+from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
+from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
+from aqualvs.calibration.solver.initial_pose import target_pose
+from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 from aqualvs.optics.dome import Dome
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from dome_cases import AIR, INTRINSICS, WATER, board_points, guessed, rail, see
 
 QUICK = DomeOptions(check_held_back=False)

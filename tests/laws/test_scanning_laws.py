@@ -11,16 +11,16 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import Laser, Rig
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
 from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.stripe import Returns, StripeOptions
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 U8 = NDArray[np.uint8]
 LENGTH, N_LINES = 160, 64

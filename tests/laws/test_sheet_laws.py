@@ -8,8 +8,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Window
-from aqualvs.optics.sheet import Sheet
-from aqualvs.optics.sheet_kernels import crossing
+from aqualvs.optics.sheet import Sheet, crossing
 
 TILT = st.floats(-0.5, 0.5)
 SHIFT = st.floats(-0.3, 0.3)

@@ -17,18 +17,17 @@ from fake_ardusub import PARAMETERS
 
 from aqualvs.control.autopilot import NetPilot
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.mission import HoldMission
+from aqualvs.control.missions import HoldMission
 from aqualvs.control.safety import SafetyGate, SafetyLimits
-from aqualvs.control.setpoint import Setpoint, SetpointHolder
-from aqualvs.control.vehicle import Effort
-from aqualvs.live.ardusub_link import ArduSubLink, ArduSubOptions
-from aqualvs.live.health import Health
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.control.time_filter import FilteredPosture, PostureFilter
+from aqualvs.control.vehicle import Effort, Setpoint, SetpointHolder
+from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
+from aqualvs.live.mavlink.link import MavlinkLink
 from aqualvs.live.pilot import Pilot
-from aqualvs.live.sample import Instants, LiveSample
-from aqualvs.live.time_filter import FilteredPosture, PostureFilter
+from aqualvs.recording.sample import Instants, LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
+from aqualvs.sources.base import Health
 from live_cases import demo_rig
 from waiting import PATIENCE_S
 

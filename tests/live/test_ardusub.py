@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from aqualvs.control.sticks import StickShaping
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode
 from aqualvs.errors import OptionError
-from aqualvs.live.ardusub_link import ArduSubLink, ArduSubOptions
-from aqualvs.live.ardusub_link_commands import Command, is_finite
-from aqualvs.live.mavlink_link import Received
+from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
+from aqualvs.live.mavlink.ardusub_commands import Command, is_finite
+from aqualvs.live.mavlink.link import Received
 
 dialect = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 

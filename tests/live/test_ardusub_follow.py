@@ -19,9 +19,9 @@ import av
 import numpy as np
 import pytest
 
-from aqualvs.app.follow import FOLLOW_CSV
-from aqualvs.live.colour import bgr_of
-from aqualvs.live.recorder import DiveRecording, is_recording
+from aqualvs.follow.command import FOLLOW_CSV
+from aqualvs.recording import DiveRecording, is_recording
+from aqualvs.sources.base import bgr_of
 from live_cases import demo_frames, demo_rig
 from ports import free_port
 from shell_cases import write_video
@@ -34,7 +34,7 @@ from stream_sender import make_clip
 
 SENDER = Path(__file__).with_name("stream_sender.py")
 # As the installed command ends; the interpreter's own `exit` would wait for the keys.
-COMMAND = (sys.executable, "-c", "import sys; from aqualvs.app.cli import main; sys.exit(main())")
+COMMAND = (sys.executable, "-c", "import sys; from aqualvs.cli.main import main; sys.exit(main())")
 
 
 FPS = 25

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from aqualvs.control.setpoint import Setpoint
+from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
-from aqualvs.live.ardusub_link import ArduSubOptions
-from aqualvs.live.health import State
+from aqualvs.live.mavlink.ardusub import ArduSubOptions
+from aqualvs.sources.base import State
 
 pytest.importorskip("pymavlink")
 

@@ -10,18 +10,16 @@ import pytest
 
 from aqualvs.control.autopilot import Motion
 from aqualvs.control.safety import Reason
-from aqualvs.control.setpoint import Setpoint, SetpointHolder
-from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
+from aqualvs.control.time_filter import FilteredPosture
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, Setpoint, SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live import pilot as live_pilot
-from aqualvs.live import pilot_watchdog
-from aqualvs.live.health import State
-from aqualvs.live.output_worker import OutputWorker
-from aqualvs.live.pilot import Pilot
-from aqualvs.live.pilot_watchdog import Watchdog
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.live import pilot as pilot_watchdog
+from aqualvs.live.pilot import Pilot, Watchdog
+from aqualvs.live.runner import OutputWorker
 from aqualvs.scanning.posture import Reason as NoPosture
 from aqualvs.scanning.posture import Refusal
+from aqualvs.sources.base import State
 
 pytest.importorskip("pymavlink")
 

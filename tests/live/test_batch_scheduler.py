@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from aqualvs.app.cli import main
+from aqualvs.cli.main import main
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 
 distributed = pytest.importorskip("distributed")

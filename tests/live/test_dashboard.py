@@ -15,18 +15,22 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from aqualvs.app.dashboard.access import Access, make_access, token_fault
-from aqualvs.app.dashboard.commands import MAX_MESSAGE_BYTES, Controls
-from aqualvs.app.dashboard.hub import Hub, Watcher
-from aqualvs.app.dashboard.limits import ConnectionLimits, TokenGate
-from aqualvs.app.dashboard.output import Dashboard
-from aqualvs.app.dashboard.picture import page_picture
-from aqualvs.app.dashboard.server import DashboardServer
-from aqualvs.app.live_outputs import host_and_port
-from aqualvs.app.posture_csv import POSTURE_COLUMNS, posture_row
-from aqualvs.control.setpoint import Setpoint, SetpointHolder
+from aqualvs.control.vehicle import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
-from aqualvs.live.sample import LiveSample
+from aqualvs.live.dashboard.access import (
+    MAX_MESSAGE_BYTES,
+    Access,
+    ConnectionLimits,
+    Controls,
+    TokenGate,
+    make_access,
+    token_fault,
+)
+from aqualvs.live.dashboard.output import Dashboard, page_picture
+from aqualvs.live.dashboard.server import DashboardServer, Hub, Watcher
+from aqualvs.live.options import host_and_port
+from aqualvs.recording.sample import LiveSample
+from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
 from browser import open_page
 from live_cases import demo_rig, demo_samples, of_size
 from waiting import PATIENCE_S, until
@@ -243,7 +247,7 @@ def test_oversized_messages_end_the_connection(bench: Bench) -> None:
 
 
 def test_who_says_nothing_is_not_let_in(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aqualvs.app.dashboard.server._HELLO_S", 0.2)
+    monkeypatch.setattr("aqualvs.live.dashboard.server._HELLO_S", 0.2)
     with connect(f"ws://{bench.address}/live") as connection, pytest.raises(ConnectionClosed):
         connection.recv(timeout=PATIENCE_S)
 

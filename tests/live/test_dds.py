@@ -12,15 +12,18 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.live.health import State
-from aqualvs.live.outputs import dds_types as types_module
-from aqualvs.live.outputs.axes import plane_pose
-from aqualvs.live.outputs.dds import DdsOutput, domain_of_this_machine, stays_on_this_machine
-from aqualvs.live.outputs.dds_types import type_hash
+from aqualvs.live.outputs import dds as types_module
+from aqualvs.live.outputs.dds import (
+    DdsOutput,
+    domain_of_this_machine,
+    stays_on_this_machine,
+    type_hash,
+)
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES
-from aqualvs.live.outputs.ros_messages import RosOptions, Topic
-from aqualvs.live.sample import LiveSample
+from aqualvs.live.outputs.ros_messages import RosOptions, Topic, plane_pose
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.sources.base import State
 from live_cases import demo_samples
 from ros_listener import (
     Listener,

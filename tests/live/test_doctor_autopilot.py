@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from aqualvs.app.check_finding import Severity
-from aqualvs.app.demo import bundled_dive
-from aqualvs.app.doctor_autopilot import autopilot
-from aqualvs.live.ardusub_link import ArduSubOptions
-from aqualvs.live.vehicle_file import VehicleSetup
+from aqualvs.check.doctor import autopilot
+from aqualvs.check.finding import Severity
+from aqualvs.demo import bundled_dive
+from aqualvs.live.mavlink.ardusub import ArduSubOptions
+from aqualvs.live.options import VehicleSetup
 from live_cases import demo_rig
 
 pytest.importorskip("pymavlink")

@@ -130,8 +130,8 @@ def answer(process):
 
 
 def test_a_viewer_sees_what_was_sent(output, watch, samples):
-    from aqualvs.live.recorder.messages import points_message
-    from aqualvs.live.recorder.pictures import jpeg_of
+    from aqualvs.recording.encoding import jpeg_of
+    from aqualvs.recording.messages import points_message
 
     for sample in samples[:2]:
         output.send(sample)
@@ -198,9 +198,9 @@ def test_a_viewer_that_vanishes_disturbs_nobody(output, watch, samples):
 
 
 def test_it_listens_on_this_machine_alone_and_frees_its_port(samples):
-    from aqualvs.live.health import State
     from aqualvs.live.outputs.base import Output
     from aqualvs.live.outputs.foxglove import FoxgloveOutput
+    from aqualvs.sources.base import State
 
     made = FoxgloveOutput(port=0)
     output: Output = made
@@ -234,18 +234,18 @@ def test_without_the_sdk_it_says_what_to_install(monkeypatch):
 
 
 def test_nothing_is_made_that_nobody_watches(output, samples, monkeypatch):
-    from aqualvs.live.recorder import pictures
+    from aqualvs.live.outputs import foxglove as output
 
     def made(*_):
         raise AssertionError("a picture for nobody")
 
-    monkeypatch.setattr(pictures, "jpeg_of", made)
+    monkeypatch.setattr(output, "jpeg_of", made)
     for sample in samples:
         output.send(sample)
 
 
 def test_lines_and_plate_lie_where_the_points_are(samples):
-    from aqualvs.live.outputs.foxglove_scene import laser_lines, quaternion
+    from aqualvs.live.outputs.foxglove import laser_lines, quaternion
 
     sample = samples[0]
     posture = sample.scan.posture
@@ -270,12 +270,12 @@ def test_lines_and_plate_lie_where_the_points_are(samples):
 
 def test_the_layout_names_topics_and_fields_that_exist():
     from aqualvs.live.outputs.foxglove import LAYOUT
-    from aqualvs.live.recorder import schemas
+    from aqualvs.recording.encoding import TOPICS
 
     layout = json.loads(LAYOUT.read_text())
     panels = set(re.findall(r'"(\w+!\w+)"', json.dumps(layout["layout"])))
     assert panels == set(layout["configById"])
-    known = {topic.name: topic.definition for topic in schemas.TOPICS}
+    known = {topic.name: topic.definition for topic in TOPICS}
     paths = re.findall(r'"(/aqualvs/\w+)((?:\.\w+|\[:\])*)"', LAYOUT.read_text())
     assert len(paths) > 10
     for topic, path in paths:

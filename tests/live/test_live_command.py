@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 from stream_sender import make_clip
 
-from aqualvs.app.posture_csv import POSTURE_COLUMNS
-from aqualvs.live.colour import bgr_of
-from aqualvs.live.recorder import DiveRecording, is_recording
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.recording import DiveRecording, is_recording
+from aqualvs.results.folder import POSTURE_COLUMNS
+from aqualvs.sources.base import bgr_of
 from live_cases import demo_frames, demo_rig
 from ports import free_port
 from waiting import PATIENCE_S, until
@@ -115,7 +115,7 @@ def live(rig: Path, *options: str, **process: Any) -> Iterator[Live]:
         wire.settimeout(0.2)
         json_port = wire.getsockname()[1]
         source = f"udp://127.0.0.1:{port}"
-        command = [sys.executable, "-c", "from aqualvs.app.cli import main; exit(main())", "live"]
+        command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "live"]
         command += [source, "--rig", str(rig), "--json", f"127.0.0.1:{json_port}", *options]
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **process
@@ -181,7 +181,7 @@ def test_a_stream_comes_goes_returns_and_the_recording_replays(
 
 
 def replayed(recording: Path, out: Path) -> list[dict[str, str]]:
-    command = [sys.executable, "-c", "from aqualvs.app.cli import main; exit(main())", "run"]
+    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "run"]
     done = subprocess.run(
         [*command, str(recording), "-o", str(out), "--no-report"],
         capture_output=True,
@@ -283,7 +283,7 @@ def test_five_percent_of_loss_gives_no_false_posture(
     rig = load_rig(rig_file)
     near, far = rig.working_range
     # The dive goes between these; a stripe patched up from another picture would leave them.
-    from aqualvs.scanning.pipeline import Scanner
+    from aqualvs.scanner import Scanner
 
     scanner = Scanner(rig)
     true = [p.range for f in demo_frames(N_CLIP) if (p := scanner.process(f).posture)]
@@ -305,7 +305,7 @@ def test_five_percent_of_loss_gives_no_false_posture(
 def test_what_cannot_work_is_told_in_one_line(
     arguments: list[str], words: str, rig_file: Path, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-c", "from aqualvs.app.cli import main; exit(main())", "live"]
+    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "live"]
     done = subprocess.run(
         [*command, *arguments, "--rig", str(rig_file)],
         capture_output=True,
@@ -326,10 +326,10 @@ def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     2000 frames; AQUALVS_SOAK_FRAMES=90000 makes it an hour of a stream of 25 frames a second.
     """
     n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "2000"))
+    from aqualvs.control.time_filter import PostureFilter
     from aqualvs.live.outputs.udp_json import UdpJsonOutput
-    from aqualvs.live.recorder import RecorderSwitch
     from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner
-    from aqualvs.live.time_filter import PostureFilter
+    from aqualvs.recording import RecorderSwitch
     from live_cases import Collector, ScriptedFeed, demo_scanner, renumbered
 
     frames = demo_frames(N_CLIP)

@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from aqualvs.live import mavlink_link
-from aqualvs.live.health import State
-from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
-from aqualvs.live.outputs import mavlink_ports
+from aqualvs.live.mavlink import link as mavlink_link
+from aqualvs.live.mavlink import ports as mavlink_ports
+from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from aqualvs.live.outputs.mavlink import MavlinkOutput
-from aqualvs.live.sample import LiveSample
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.sources.base import State
 from live_cases import first_sample
 from ports import free_port
 from waiting import PATIENCE_S, until
@@ -295,7 +295,7 @@ def test_a_serial_line_that_is_unplugged(lab: Lab, tmp_path: Path) -> None:
 def test_a_slow_line_carries_the_distance_first(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from aqualvs.live.outputs.mavlink_serial import SerialPort
+    from aqualvs.live.mavlink.ports import SerialPort
 
     peer = lab.peer(f"pty:{tmp_path / 'ttyACM0'}")
     output = lab.output(f"serial:{tmp_path / 'ttyACM0'}")

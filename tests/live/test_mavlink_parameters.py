@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from aqualvs.live.mavlink_link import MavlinkLink
+from aqualvs.live.mavlink.link import MavlinkLink
 
 pytest.importorskip("pymavlink")
 

@@ -27,7 +27,7 @@ _ROOM = 20 << 20
 
 def child(path, kind):
     """Record without end; what is surely in the file is told in a file beside it."""
-    from aqualvs.live.recorder import Recorder, RecorderOptions, Recording
+    from aqualvs.recording import Recorder, RecorderOptions, Recording
 
     options = RecorderOptions(chunk_s=0.04, points_hz=None, sync_s=None)
     told = os.open(path.with_suffix(".told"), os.O_CREAT | os.O_WRONLY)
@@ -134,8 +134,8 @@ def told_by(path):
 
 def check(path):
     """Read a file in every way; returns the number of frames in it."""
-    from aqualvs.live.recorder import DiveRecording
-    from aqualvs.live.recorder.schemas import POSTURE, STRIPES
+    from aqualvs.recording import DiveRecording
+    from aqualvs.recording.encoding import POSTURE, STRIPES
     from recorder_cases import counted, read_by_mcap, read_by_rosbags
 
     found, linear = read_by_mcap(path), read_by_mcap(path, linear=True)

@@ -19,12 +19,11 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.live.health import State
-from aqualvs.live.outputs.axes import plane_pose
-from aqualvs.live.outputs.ros1 import Ros1Output
-from aqualvs.live.outputs.ros1_node import advertised_host, master_host
-from aqualvs.live.sample import LiveSample
+from aqualvs.live.outputs.ros1 import Ros1Output, advertised_host, master_host
+from aqualvs.live.outputs.ros_messages import plane_pose
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.sources.base import State
 from live_cases import demo_samples
 from ports import free_port
 from processes import children_of

@@ -11,12 +11,11 @@ import pytest
 
 from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
-from aqualvs.live.frozen import FrozenOptions
-from aqualvs.live.health import PartHealth, State
-from aqualvs.live.mailbox import Arrival, Mailbox
-from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner
+from aqualvs.live.health_monitor import FrozenOptions
+from aqualvs.live.runner import Arrival, FixedScanner, LiveOptions, LiveRunner, Mailbox
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.sources.base import PartHealth, State
 from live_cases import (
     Collector,
     ScriptedFeed,

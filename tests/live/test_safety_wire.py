@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 
 from aqualvs.control.safety import SafetyLimits
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import Effort
+from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError
-from aqualvs.live.ardusub_link import ArduSubLink, ArduSubOptions
-from aqualvs.live.ardusub_link_commands import Command
-from aqualvs.live.health import State
+from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
+from aqualvs.live.mavlink.ardusub_commands import Command
 from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.sources.base import State
 
 pytest.importorskip("pymavlink")
 
@@ -285,7 +284,7 @@ KILLED = """
 import sys, time
 sys.path[:0] = {paths!r}
 from fake_ardusub_cases import *
-from aqualvs.live.ardusub_link import ArduSubLink
+from aqualvs.live.mavlink.ardusub import ArduSubLink
 
 vehicle = ArduSubLink({url!r})
 holder = SetpointHolder((0.3, 2.0))

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
+from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from ports import free_port
 
 pytest.importorskip("pymavlink")

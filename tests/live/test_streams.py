@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 import stream_sender
 
-from aqualvs.live.health import State
-from aqualvs.live.sources import inbox, open_feed, reception, remote
-from aqualvs.live.sources.remote import RemoteFeed
+from aqualvs.sources import datagrams, live_frames, open_feed, remote
+from aqualvs.sources.base import State
+from aqualvs.sources.remote import RemoteFeed
 from ports import free_port
 from waiting import PATIENCE_S, until
 
@@ -33,8 +33,8 @@ END_S = 5.0
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """A machine that is busy is no silence, and what it does not keep up with is kept."""
-    monkeypatch.setattr(reception, "_SILENT_S", PATIENCE_S)
-    monkeypatch.setattr(inbox, "_MAX_LAG_S", PATIENCE_S)
+    monkeypatch.setattr(live_frames, "_SILENT_S", PATIENCE_S)
+    monkeypatch.setattr(datagrams, "_MAX_LAG_S", PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +236,7 @@ def test_a_stream_that_stops_is_a_fault_and_goes_on_when_it_returns(clips, monke
         with sender(clips["sd"], port=port, hold=30, speed=2, first_time=1000) as first:
             heard.wait(lambda: len(heard.indices) >= 30)
             with monkeypatch.context() as usual:
-                usual.setattr(reception, "_SILENT_S", 0.1)
+                usual.setattr(live_frames, "_SILENT_S", 0.1)
                 heard.wait(lambda: heard.feed.health().state is State.FAULT)
                 assert "silent" in heard.feed.health().detail
             assert len(heard.indices) == 30

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.camera import camera
-from aqualvs.calibration.camera_problem import fitted_camera
-from aqualvs.calibration.view import View
-from aqualvs.calibration.view_covariance import shared_covariance
+from aqualvs.calibration.camera.calibrate import camera
+from aqualvs.calibration.camera.problem import fitted_camera
+from aqualvs.calibration.solver.covariance import shared_covariance
+from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import BareCamera

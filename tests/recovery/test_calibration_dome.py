@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.calibration.board_sets import BoardSet, DomeOptions
-from aqualvs.calibration.camera import CameraCalibration, camera
-from aqualvs.calibration.detection import detect_board
-from aqualvs.calibration.dome import dome
-from aqualvs.calibration.target_files import load_board
-from aqualvs.calibration.view import View
+from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
+from aqualvs.calibration.detection.detection import detect_board
+from aqualvs.calibration.dome.calibrate import dome
+from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
+from aqualvs.calibration.targets.target_files import load_board
+from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from dome_cases import (
     AIR,
     INTRINSICS,

@@ -8,23 +8,32 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.calibration import hold_out
-from aqualvs.calibration.detection import detect_board, detect_markers
-from aqualvs.calibration.hold_out import HeldOutView, leave_one_out
-from aqualvs.calibration.laser_report import LaserCalibration
-from aqualvs.calibration.laser_views import LaserView
-from aqualvs.calibration.lasers import LaserOptions, calibrate_lasers
-from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import board_surface, box_surfaces
-from aqualvs.calibration.target_files import load_box
-from aqualvs.calibration.targets import Board, BoardKind
+from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.lasers import calibrate
+from aqualvs.calibration.lasers.calibrate import (
+    HeldOutView,
+    LaserOptions,
+    calibrate_lasers,
+    leave_one_out,
+)
+from aqualvs.calibration.lasers.report import LaserCalibration
+from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, box_surfaces
+from aqualvs.calibration.lasers.views import LaserView
+from aqualvs.calibration.targets.target_files import load_box
+from aqualvs.calibration.targets.targets import Board, BoardKind
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.uncertainty import LASER_PARAMETERS, RigUncertainty, rig_moved_by, tangent_basis
+from aqualvs.optics.rig import (
+    DOME_FROM_CAM_NOMINAL,
+    LASER_PARAMETERS,
+    Rig,
+    RigUncertainty,
+    rig_moved_by,
+    tangent_basis,
+)
 from aqualvs.scanning.whole_picture import find_stripes
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import (
     Noise,
     board_views,
@@ -172,7 +181,7 @@ def left_out(wall_views: list[LaserView]) -> LeftOut:
         return made[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hold_out, "calibrate_lasers", recorded)
+        patch.setattr(calibrate, "calibrate_lasers", recorded)
         views = leave_one_out(BARE, wall_views, board_surface())
     return LeftOut(views, made)
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.app.cli import main
+from aqualvs.cli.main import main
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import rotvec_from_rotation
-from aqualvs.live.sources import open_source
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.solved import rig_uncertainty, solved_steps
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
+from aqualvs.sources import open_source
 
 pytestmark = pytest.mark.samples
 

@@ -10,14 +10,22 @@ import os
 import numpy as np
 import pytest
 
-from aqualvs.app.follow_fast import DiveResult, dive_and_measure, random_dive, random_dives
-from aqualvs.app.follow_fast_eye import SampledEye
-from aqualvs.app.follow_sim_case import SimCase, tuned_gains, vehicle_model
-from aqualvs.app.follow_sim_measures import effort_measures, hold_measures, step_measures
-from aqualvs.app.follow_trials import FROM_REST_S, RANGE, STEP, STEP_S, Trials
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.mission import HoldMission
-from aqualvs.control.setpoint import Setpoint
+from aqualvs.control.missions import HoldMission
+from aqualvs.control.vehicle import Setpoint
+from aqualvs.follow.case import (
+    FROM_REST_S,
+    RANGE,
+    STEP,
+    STEP_S,
+    SimCase,
+    Trials,
+    tuned_gains,
+    vehicle_model,
+)
+from aqualvs.follow.log import effort_measures, hold_measures, step_measures
+from aqualvs.follow.monte_carlo import DiveResult, dive_and_measure, random_dive, random_dives
+from aqualvs.follow.sensor_model import SampledEye
 
 N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))
 # Some of any kind, and the hardest that were met: a BlueROV2 Heavy that swings its pitch up with

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from aqualvs.calibration.laser_split import LaserSplit, split_lasers
-from aqualvs.calibration.laser_views import pooled
-from aqualvs.calibration.stripes_on_planes import board_surface
+from aqualvs.calibration.lasers.laser_assignment import LaserSplit, split_lasers
+from aqualvs.calibration.lasers.stripes_on_planes import board_surface
+from aqualvs.calibration.lasers.views import pooled
 from laser_cases import laser_error
 from laser_scenes import Clutter, Scene, scene
 

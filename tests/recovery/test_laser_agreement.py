@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.live.sources import open_source
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.uncertainty import rig_moved_by
+from aqualvs.optics.rig import Rig, rig_moved_by
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
-from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import example_rig, load_scenario
+from aqualvs.sources import open_source
 
 _TOOL = Path(__file__).resolve().parents[2] / "tools" / "rig_from_sample_truth.py"
 _TIMES = np.linspace(0.1, 3.7, 8)

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.live.sources import open_source
-from aqualvs.scanning.net_condition import NetCondition, NetStretch
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.pipeline import Scanner
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.random_scenes import Difficulty
+from aqualvs.nets.condition import NetCondition, NetStretch
+from aqualvs.nets.spectrum import Mesh
+from aqualvs.scanner import Scanner
+from aqualvs.simulation.scenarios import Difficulty, example_rig
+from aqualvs.sources import open_source
 from net_cases import NetCamera
 from net_dives import Dive, passed_holes, random_dive, scans_of, true_solidity
 

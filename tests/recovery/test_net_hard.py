@@ -10,16 +10,15 @@ import pytest
 from scipy.spatial import cKDTree
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.lit_points import LitPoints
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Fold, Net, Scene, Wall
 from aqualvs.simulation.scene import Label as Kind
-from aqualvs.simulation.trajectory import dome_from_target
-from aqualvs.simulation.truth import visible_fit
+from aqualvs.simulation.truth import LitPoints, visible_fit
 
 PITCH, YAW = 4.0, -6.0
 NET = Net(bar=0.022, twine=0.002, roll=0.3)

@@ -11,24 +11,22 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from aqualvs.app.reproduce.point_truth import Judged as Reflections
-from aqualvs.app.reproduce.point_truth import LitTruth, judge_reflections, mean_judged
+from aqualvs.experiments.mesh_filter import Judged as Reflections
+from aqualvs.experiments.mesh_filter import LitTruth, judge_reflections, mean_judged
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.live.sources import open_source
-from aqualvs.scanning.mesh import MeshFilterOptions
-from aqualvs.scanning.paper_filter import PaperFilter
-from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.paper.detector import PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
-from aqualvs.scanning.search import plan_searches
 from aqualvs.scanning.target import TargetKind
-from aqualvs.scanning.threshold import ThresholdOptions
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.random_scenes import Difficulty, random_scene
 from aqualvs.simulation.render import Picture, Renderer
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
 from aqualvs.simulation.scene import Label as Kind
 from aqualvs.simulation.scene import Net, Scene, Wall
-from aqualvs.simulation.trajectory import dome_from_target
 from aqualvs.simulation.truth import visible_fit
+from aqualvs.sources import open_source
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 from rig_from_sample_truth import load_truth

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app import calibrate_lasers
+from aqualvs.calibrate import lasers
 from aqualvs.scanning.whole_picture import find_stripes
 from real_light_cases import CROP, PHOTOGRAPHS, tool
 
@@ -115,8 +115,8 @@ def left_out(samples: Path, wall, tmp_path_factory) -> dict[str, list]:
     """
     work = tmp_path_factory.mktemp("real")
     with pytest.MonkeyPatch.context() as patch:
-        for function in (calibrate_lasers.detect_board, calibrate_lasers.find_stripes):
-            patch.setattr(calibrate_lasers, function.__name__, once_for_each_picture(function))
+        for function in (lasers.detect_board, lasers.find_stripes):
+            patch.setattr(lasers, function.__name__, once_for_each_picture(function))
         results = wall.leave_one_out(
             samples / "real-laser-on-wall", work, formats=LEFT_OUT_FORMATS, tell=lambda _: None
         )

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.live.sources import open_source
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.triangulate import Triangulator
+from aqualvs.sources import open_source
 
 pytestmark = pytest.mark.samples
 

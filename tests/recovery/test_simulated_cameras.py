@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.sources import open_source
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.simulation.cameras import simulated_camera
 from aqualvs.simulation.dive import simulate_dive
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import example_rig, load_scenario
+from aqualvs.sources import open_source
 from camera_cases import REAL
 
 _TRUTH = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg")

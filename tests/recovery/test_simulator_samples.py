@@ -13,8 +13,8 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scene import Scene, Wall
-from aqualvs.simulation.trajectory import dome_from_target
 
 pytestmark = pytest.mark.samples
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.geometry.rays import Rays
+from aqualvs.geometry.planes import Rays
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import Label, Net, Scene, Wall, WaterOptics
-from aqualvs.simulation.trajectory import dome_from_target
 from windowed_cases import windowed
 
 # Laser light alone: nothing else can pull a stripe's centre.

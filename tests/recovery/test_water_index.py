@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.calibration.index_estimator import IndexEstimator
-from aqualvs.calibration.index_prior import IndexPrior
-from aqualvs.calibration.index_reading import IndexOptions
-from aqualvs.calibration.view import View
-from aqualvs.calibration.water import WaterCalibration, calibrate_water
+from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.water_index.estimator import (
+    IndexEstimator,
+    WaterCalibration,
+    calibrate_water,
+)
+from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
+from aqualvs.simulation.scenarios import example_rig
 
 FPS = 25.0
 
@@ -179,8 +180,8 @@ def test_hidden_corners_late_pictures_and_nan_are_passed_over() -> None:
 def test_samples_within_a_thousandth(samples: Path, clip: int) -> None:
     import cv2
 
-    from aqualvs.calibration.detection import detect_markers
-    from aqualvs.calibration.target_files import load_target
+    from aqualvs.calibration.detection.detection import detect_markers
+    from aqualvs.calibration.targets.target_files import load_target
 
     folder = samples / "lab-paper"
     markers = load_target(folder / "index" / "target.yaml")

@@ -12,12 +12,11 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
-from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.simulation.scene import Label as Kind
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.truth import visible_fit

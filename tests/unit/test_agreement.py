@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 
 from agreement_cases import Diver, Target
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.solved import with_uncertainty
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
-from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
+from aqualvs.scanning.agreement import (
+    N_BINS,
+    AgreementState,
+    AgreementVerdict,
+    LaserAgreement,
+    bin_stripes,
+)
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
-from aqualvs.scanning.stripe_bins import N_BINS, bin_stripes
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 RIG = example_rig()
 N_FRAMES = 24

@@ -6,16 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.follow_fast_eye import Blind, Loss, SampledEye
-from aqualvs.app.follow_sim_case import SimCase, sea, vehicle_model
-from aqualvs.control.answer import AnswerLimits, AnswerWatch
 from aqualvs.control.autopilot import Decision
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.mission import HoldMission
-from aqualvs.control.safety import Reason
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import NEUTRAL, Effort
+from aqualvs.control.missions import HoldMission
+from aqualvs.control.safety import AnswerLimits, AnswerWatch, Reason
+from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
+from aqualvs.follow.case import SimCase, sea, vehicle_model
+from aqualvs.follow.sensor_model import Blind, Loss, SampledEye
 from aqualvs.scanning.posture import Posture
 from control_cases import FRAME_S, posture_at, state_at
 

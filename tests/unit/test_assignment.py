@@ -8,18 +8,18 @@ import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning import assignment
 from aqualvs.scanning.assignment import UNTESTED, Outcome, Verdict, widened
-from aqualvs.scanning.measure import Measurement
-from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanning.candidates import read_returns
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.readings import read_returns
-from aqualvs.scanning.search import SearchAxis, plan_searches
+from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.surfaces import surface_on
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
 from scanning_cases import everywhere, returns_of, strands
 

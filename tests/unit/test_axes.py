@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.outputs.axes import (
+from aqualvs.live.outputs.ros_messages import (
     FLU_FROM_DOME,
     FRD_FROM_DOME,
     UNOBSERVABLE_VARIANCE,

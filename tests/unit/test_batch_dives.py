@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.app.batch.dive_lists import read_list
-from aqualvs.app.batch.dives import find_dives
-from aqualvs.app.batch.names import name_dives, safe_name
-from aqualvs.app.run_inputs import Water
+from aqualvs.batch.dives import find_dives, name_dives, read_list, safe_name
 from aqualvs.errors import OptionError, RigError, SourceError
+from aqualvs.results.run_request import Water
 
 
 @pytest.fixture

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.app.batch.cluster import WorkersLostError
-from aqualvs.app.batch.dataset import holds_dive
-from aqualvs.app.batch.ledger import read_seal
-from aqualvs.app.batch.records import DiveState
-from aqualvs.app.batch.season import Season, look
-from aqualvs.app.run import run
-from aqualvs.app.run_inputs import scanner_options
+from aqualvs.batch.cluster import WorkersLostError
+from aqualvs.batch.dataset import holds_dive, read_seal
+from aqualvs.batch.records import DiveState
+from aqualvs.batch.scheduler import Season, look
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.pipeline import run
+from aqualvs.results.run_request import scanner_options
 from batch_cases import DEMO, RESULTS, InlineWorkers, Listener, demo_dive, without_times, work_for
 from shell_cases import cut_after, damage_frame, destroy_frame, rig_file, write_video
 

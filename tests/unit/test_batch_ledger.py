@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from aqualvs.app.batch.ledger import SEAL, drafted, read_seal, seal, sealed
+from aqualvs.batch.dataset import SEAL, drafted, read_seal, seal, sealed
 
 
 @pytest.fixture

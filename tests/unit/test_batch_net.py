@@ -7,16 +7,15 @@ from dataclasses import replace
 import pytest
 from pyarrow import dataset as arrow_dataset
 
-from aqualvs.app.batch.net_state import known_net
-from aqualvs.app.batch.records import DiveState
-from aqualvs.app.batch.season import Season
-from aqualvs.app.batch.summary_page import write_summary
-from aqualvs.app.batch.survey import survey
-from aqualvs.app.net import NetSource, net_of_run
-from aqualvs.app.net_request import NetRequest, net_request
-from aqualvs.app.outputs import NET_FILES
-from aqualvs.app.run_inputs import scanner_options
+from aqualvs.batch.records import DiveState
+from aqualvs.batch.scheduler import Season, known_net
+from aqualvs.batch.summary_page import write_summary
+from aqualvs.batch.work import survey
 from aqualvs.errors import OptionError
+from aqualvs.net_survey.command import NetSource, net_of_run
+from aqualvs.nets.target_file import NetRequest, net_request
+from aqualvs.results.folder import NET_FILES
+from aqualvs.results.run_request import scanner_options
 from batch_cases import DEMO, InlineWorkers, Listener, demo_dive, work_for
 
 BARE = NetRequest()

@@ -7,13 +7,11 @@ import pytest
 from pyarrow import dataset as arrow_dataset
 from pyarrow import parquet
 
-from aqualvs.app.batch.dataset import drop_dive, holds_dive, put_dive, write_dives
-from aqualvs.app.batch.records import DiveRecord, DiveState
-from aqualvs.app.batch.summary_page import write_summary
-from aqualvs.app.batch.thumbnail import range_steps, range_svg
-from aqualvs.app.journal import PointsJournal
-from aqualvs.app.points_export import export_points
-from aqualvs.app.posture_csv import PostureCsv
+from aqualvs.batch.dataset import drop_dive, holds_dive, put_dive, write_dives
+from aqualvs.batch.records import DiveRecord, DiveState
+from aqualvs.batch.summary_page import range_steps, range_svg, write_summary
+from aqualvs.results.folder import PostureCsv
+from aqualvs.results.points import PointsJournal, export_points
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
 

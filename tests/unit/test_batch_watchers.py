@@ -8,15 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.app.batch.watchers import NoteTaker, stand_ins, stored_bars, stored_ranges, write_notes
-from aqualvs.app.net_check import NetCheck
-from aqualvs.app.tally import Tally
-from aqualvs.app.target_file import NetFacts
-from aqualvs.live.sources.span_frames import UnlikeSurveyError
+from aqualvs.batch.parts import NoteTaker, stand_ins, stored_bars, stored_ranges, write_notes
+from aqualvs.nets.target_file import NetCheck, NetFacts
+from aqualvs.results.summary import Tally
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.sources.spans import UnlikeSurveyError
 from shell_cases import scan
 
 RIG = example_rig()
@@ -149,7 +148,7 @@ def test_the_summary_is_that_of_the_frames(tmp_path):
 def test_the_net_is_looked_at_in_the_same_frames(tmp_path, monkeypatch):
     """Its watcher looks at every fifth frame of the dive, not of the piece."""
     monkeypatch.setattr(
-        "aqualvs.app.net_check.bar_of", lambda one, *_: float(one.index) if one.posture else None
+        "aqualvs.nets.target_file.bar_of", lambda one, *_: float(one.index) if one.posture else None
     )
 
     def check():

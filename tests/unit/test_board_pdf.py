@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app.board import BoardRequest, print_board
-from aqualvs.app.pdf import Page, Text, pdf_bytes
-from aqualvs.calibration.detection import detect_board, detect_markers
-from aqualvs.calibration.target_files import load_board, load_box, load_target
-from aqualvs.calibration.view import View
+from aqualvs.calibrate.board import BoardRequest, print_board
+from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.targets.printed import Page, Text, pdf_bytes
+from aqualvs.calibration.targets.target_files import load_board, load_box, load_target
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, OptionError, OutputError
 
 _POINTS_PER_MM = 72.0 / 25.4

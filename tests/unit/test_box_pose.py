@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.box_pose import planes_with_points, pose_difference, spatial_pose
-from aqualvs.calibration.pose_steps import moved_target
+from aqualvs.calibration.lasers.views import planes_with_points, pose_difference, spatial_pose
+from aqualvs.calibration.solver.bundle import moved_target
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import BOX_PLANES, Noise, box_views, dome_from_box
 
 RIG = example_rig()

@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.board_sets import DomeOptions
-from aqualvs.calibration.bundle import PRIORS, Bundle, BundleState, TargetView, moved_target
-from aqualvs.calibration.consider import considered
-from aqualvs.calibration.distance_check import solved_by_offset
-from aqualvs.calibration.dome_problem import dome_problem
-from aqualvs.calibration.least_squares import solve
-from aqualvs.calibration.observability import observability
-from aqualvs.calibration.pose_terms import KnownDistance, SquareBoard, plane_distance
-from aqualvs.calibration.rig_priors import rig_difference
+from aqualvs.calibration.dome.checks import solved_by_offset
+from aqualvs.calibration.dome.problem import DomeOptions, dome_problem
+from aqualvs.calibration.solver.bundle import PRIORS, Bundle, BundleState, TargetView, moved_target
+from aqualvs.calibration.solver.covariance import considered, observability
+from aqualvs.calibration.solver.least_squares import solve
+from aqualvs.calibration.solver.priors import (
+    KnownDistance,
+    SquareBoard,
+    plane_distance,
+    rig_difference,
+)
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty, rig_moved_by
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from dome_cases import AIR, INTRINSICS, WATER, board_points, rail, see
 
 POSE = ("lens_x", "lens_y", "lens_z", "rotation_x", "rotation_y", "rotation_z")

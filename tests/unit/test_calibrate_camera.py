@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.camera import CameraCalibration, camera
-from aqualvs.calibration.camera_checks import COVERAGE_CELLS, coverage
-from aqualvs.calibration.camera_problem import fitted_camera, gain_of_coefficients
-from aqualvs.calibration.view import View
+from aqualvs.calibration.camera.calibrate import COVERAGE_CELLS, CameraCalibration, camera, coverage
+from aqualvs.calibration.camera.problem import fitted_camera, gain_of_coefficients
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import BareCamera

@@ -6,16 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.board_sets import BoardSet, DomeOptions
-from aqualvs.calibration.dome import dome
-from aqualvs.calibration.dome_result import DomeCalibration, HeldBack
-from aqualvs.calibration.view import View
+from aqualvs.calibration.dome.calibrate import dome
+from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
+from aqualvs.calibration.solver.result import DomeCalibration, HeldBack
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.solved import with_uncertainty
-from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from dome_cases import (
     AIR,
     INTRINSICS,

@@ -7,19 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.hold_out import fitted, leave_one_out, posture
-from aqualvs.calibration.laser_names import match_to_rig, named
-from aqualvs.calibration.laser_solve import Start, paper_plane, solve_lasers
-from aqualvs.calibration.laser_views import LaserView, place_views
-from aqualvs.calibration.lasers import LaserCalibration, LaserOptions, calibrate_lasers
-from aqualvs.calibration.stripes_on_planes import board_surface
+from aqualvs.calibration.lasers.calibrate import (
+    LaserCalibration,
+    LaserOptions,
+    calibrate_lasers,
+    fitted,
+    leave_one_out,
+    posture,
+)
+from aqualvs.calibration.lasers.checks import match_to_rig, named
+from aqualvs.calibration.lasers.solve import Start, paper_plane, solve_lasers
+from aqualvs.calibration.lasers.stripes_on_planes import board_surface
+from aqualvs.calibration.lasers.views import LaserView, place_views
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import BoolArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.rig import Laser, Rig
-from aqualvs.optics.uncertainty import moved_plane
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.rig import Laser, Rig, moved_plane
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import (
     BOARD_POSES,
     Noise,

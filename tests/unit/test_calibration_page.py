@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.app.calibration_page import (
+from aqualvs.errors import OutputError
+from aqualvs.report.calibration_page import (
     ExpectationRow,
     LaserRow,
     Overlay,
@@ -22,12 +23,11 @@ from aqualvs.app.calibration_page import (
     ResidualMap,
     Series,
     ViewRow,
+    number,
     page_html,
     write_page,
 )
-from aqualvs.app.calibration_tables import number
-from aqualvs.app.report_findings import Card
-from aqualvs.errors import OutputError
+from aqualvs.report.findings import Card
 
 NASTY = "<script>alert(1)</script>&\"'<!-- $title ${css} 水"
 NAN = float("nan")

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app.nominal import load_nominal
-from aqualvs.calibration.detection import detect_board, detect_markers
-from aqualvs.calibration.pose_files import load_poses
-from aqualvs.calibration.target_files import load_board, load_box, load_target
-from aqualvs.calibration.view import View
+from aqualvs.calibrate.common import load_nominal
+from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.targets.pose_files import load_poses
+from aqualvs.calibration.targets.target_files import load_board, load_box, load_target
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.app.calibration_maps import residual_view
-from aqualvs.app.calibration_page import ResidualMap, Series
-from aqualvs.app.calibration_svg import Axis, decimals, line_chart, num, round_step, sampled
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.report.calibration_charts import residual_view
+from aqualvs.report.calibration_page import ResidualMap, Series
+from aqualvs.report.svg import Axis, decimals, line_chart, num, round_step, sampled
 
 NASTY = "<b>&\"'</b>"
 WIDTH, HEIGHT = 720, 576

@@ -12,14 +12,15 @@ from aqualvs.simulation.cameras import (
     Development,
     Drift,
     SimulatedCamera,
+    expose,
     list_cameras,
     simulated_camera,
+    spread,
 )
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.lasers import GREEN_NM, ColourFilters, band_shares, laser_wavelength_nm
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, Sensor, WaterOptics
-from aqualvs.simulation.sensor import expose, spread
-from aqualvs.simulation.spectrum import GREEN_NM, ColourFilters, band_shares, laser_wavelength_nm
-from aqualvs.simulation.trajectory import dome_from_target
 from camera_cases import REAL, chroma, line_minus_background, wall_pictures
 
 _STILL = WaterOptics(forward_scatter=0.0)

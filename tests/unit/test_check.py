@@ -9,20 +9,22 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from aqualvs.app.check import check_rig, run_check
-from aqualvs.app.check_accuracy import index_sigma
-from aqualvs.app.check_finding import Finding, Severity
-from aqualvs.app.check_view import field_of_view
+from aqualvs.check.finding import Finding, Severity, index_sigma
+from aqualvs.check.rig import check_rig, field_of_view, run_check
 from aqualvs.errors import RigError
 from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
-from aqualvs.optics.expected_error import SIGMA_PX, ExpectedError, expected_posture_errors
+from aqualvs.optics.expected_error import (
+    SIGMA_PX,
+    ExpectedError,
+    expected_posture_errors,
+    point_per_pixel,
+    see_stripe,
+)
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, RigUncertainty, Window
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.sheet import Sheet, sheets_of
-from aqualvs.optics.stripe_view import point_per_pixel, see_stripe
-from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 
 def pinhole(*lasers: Laser) -> Rig:

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from aqualvs.app.check_compare import run_compare
+from aqualvs.check.comparison import run_compare
 from aqualvs.errors import RigError
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import with_uncertainty
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 NAMES = rig_parameter_names(example_rig())
 SIGMAS = np.array([1e-4 if name[:2] in ("fx", "fy", "cx", "cy") else 2e-5 for name in NAMES])

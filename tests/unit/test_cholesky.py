@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aqualvs.geometry.cholesky import factorise, inverse_of, solve_factorised
+from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
 
 LEAST = 1e-13
 

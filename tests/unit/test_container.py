@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from aqualvs import __version__
-from aqualvs.app.live_outputs import DASHBOARD_PORT
+from aqualvs.live.options import DASHBOARD_PORT
 
 DOCKERFILE = Path(__file__).parents[2] / "Dockerfile"
 
@@ -33,7 +33,7 @@ def test_versions_and_ports_agree_with_the_program() -> None:
 def test_the_command_is_one_that_aqualvs_has() -> None:
     from typer.testing import CliRunner
 
-    from aqualvs.app.cli import app
+    from aqualvs.cli.main import app
 
     command = DOCKERFILE.read_text().splitlines()[-1]
     told = CliRunner().invoke(app, ["live", "--help"], env={"COLUMNS": "200"}).output

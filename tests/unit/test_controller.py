@@ -8,13 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.control.controller import RangeYawController
-from aqualvs.control.controller_ramp import Ramp
-from aqualvs.control.disturbance import SwellFilter
+from aqualvs.control.controller import Ramp, RangeYawController, SwellFilter
 from aqualvs.control.gains import ControlGains
 from aqualvs.control.gains_file import VEHICLES, load_gains
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import NEUTRAL, Effort
+from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from control_cases import FRAME_S, PlanePlant, fly, overshoot_and_settling
 
 HOLD = Setpoint(0.6)

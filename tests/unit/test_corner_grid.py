@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from aqualvs.calibration.corner_grid import misfits, nothing_known, predict
+from aqualvs.calibration.detection.boards import misfits, nothing_known, predict
 from target_cases import charuco
 
 _AXES = np.array([[20.0, -3.0], [4.0, 18.0]])

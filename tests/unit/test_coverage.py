@@ -10,10 +10,9 @@ import pytest
 from aqualvs.control.autopilot import Decision
 from aqualvs.control.coverage import Across, Coverage, CoverageMap, CoverageOptions
 from aqualvs.control.follow_log import FOLLOW_COLUMNS, FollowLog
-from aqualvs.control.mission import Guidance, Stage
+from aqualvs.control.missions import Guidance, Stage
 from aqualvs.control.safety import Reason
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import Effort
+from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.scanning.posture import Reason as NoPosture
 from aqualvs.scanning.posture import Refusal

@@ -18,21 +18,18 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app import crew_plan, crew_post
-from aqualvs.app.blocks import block_length, in_blocks, read_ahead
-from aqualvs.app.crew import Crew
-from aqualvs.app.crew_messages import Ended
-from aqualvs.app.crew_plan import crew_work
-from aqualvs.app.crew_post import Receiver, Sender, SharedMemory
-from aqualvs.app.measuring import Measured, Meter
-from aqualvs.app.run import run
-from aqualvs.app.run_inputs import FrameWindow, RunRequest
 from aqualvs.errors import SourceError
-from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.pipeline import run
+from aqualvs.results.run_request import FrameWindow, RunRequest
+from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
+from aqualvs.sources import open_source
+from aqualvs.workers import channel, pool
+from aqualvs.workers.channel import Ended, Receiver, Sender, SharedMemory
+from aqualvs.workers.frame_results import Measured, Meter, block_length, in_blocks, read_ahead
+from aqualvs.workers.pool import Crew, crew_work
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 from shell_cases import destroy_frame
 
@@ -47,8 +44,8 @@ def dive(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def short_dives_are_shared(monkeypatch):
-    monkeypatch.setattr(crew_plan, "_LEAST_FRAMES", 8)
-    monkeypatch.setattr(crew_plan, "_PART_FRAMES", GROUP)
+    monkeypatch.setattr(pool, "_LEAST_FRAMES", 8)
+    monkeypatch.setattr(pool, "_PART_FRAMES", GROUP)
 
 
 @pytest.fixture
@@ -172,7 +169,7 @@ def test_without_memory_to_share_all_goes_through_the_pipe(tmp_path, dive, crews
 def test_a_process_is_copied_only_while_it_has_no_threads(threads, how):
     program = f"""
 import threading
-from aqualvs.app.crew_start import context
+from aqualvs.workers.start_method import context
 held = threading.Event()
 for _ in range({threads}):
     threading.Thread(target=held.wait, daemon=True).start()
@@ -264,7 +261,7 @@ def test_messages_arrive_as_they_were(block, ends):
 
 def test_so_do_those_that_are_too_large_for_their_place(block, ends, monkeypatch):
     sender, receiver, thread = ends
-    monkeypatch.setattr(crew_post, "_SLOT_BYTES", 4096)
+    monkeypatch.setattr(channel, "_SLOT_BYTES", 4096)
     sent = thread.submit(sender.send, block)
     assert_like(block, receiver.receive())
     sent.result(timeout=60)

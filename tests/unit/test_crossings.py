@@ -7,10 +7,9 @@ import pytest
 
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.measure import FitMethod, PostureMeter
-from aqualvs.scanning.measure_kernels import in_crossing
-from aqualvs.scanning.search import plan_searches
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.posture_estimator import FitMethod, PostureMeter, in_crossing
+from aqualvs.simulation.scenarios import example_rig
 from windowed_cases import windowed
 
 

@@ -6,13 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.design.best import best_angles
-from aqualvs.app.design.changes import changes
-from aqualvs.app.design.judge import Judge, score
-from aqualvs.app.design.mount import ring
-from aqualvs.app.design.predict import predict
-from aqualvs.app.design.settings import Design, Goals
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.design.changes import best_angles, changes
+from aqualvs.design.judge import Judge, predict, score
+from aqualvs.design.settings import Design, Goals, ring
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 DEG = math.pi / 180.0
 FAN = 68.0 * DEG

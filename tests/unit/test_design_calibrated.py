@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.design.best import best_angles
-from aqualvs.app.design.calibrated import camera_errors, lasers_by
-from aqualvs.app.design.mount import ring
-from aqualvs.app.design.settings import Design, Tolerances
+from aqualvs.design.calibrated import camera_errors, lasers_by
+from aqualvs.design.changes import best_angles
+from aqualvs.design.settings import Design, Tolerances, ring
 from aqualvs.geometry.transforms import SE3
-from aqualvs.simulation.example_rigs import bluerov2_rig
+from aqualvs.simulation.scenarios import bluerov2_rig
 
 RANGES = (0.35, 1.0)
 EXACT = Tolerances(lens=0.0, rotation=0.0, focal=0.0, dome=0.0)

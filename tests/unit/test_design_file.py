@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.app.design.file import EXAMPLE, design_from, design_of_rig, load_design
-from aqualvs.app.design.settings import Tolerances
+from aqualvs.design.file import EXAMPLE, design_from, design_of_rig, load_design
+from aqualvs.design.settings import Tolerances
 from aqualvs.errors import AqualvsError
 from aqualvs.optics.rigfile import save_rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 
 def changed(**parts):

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.design.best import best_angles
-from aqualvs.app.design.mount import ring
-from aqualvs.app.design.offset import offset_costs
-from aqualvs.app.design.settings import Design
-from aqualvs.simulation.example_rigs import bluerov2_rig
+from aqualvs.design.calibrated import offset_costs
+from aqualvs.design.changes import best_angles
+from aqualvs.design.settings import Design, ring
+from aqualvs.simulation.scenarios import bluerov2_rig
 
 RANGES = (0.35, 1.0)
 

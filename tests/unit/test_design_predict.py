@@ -8,22 +8,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.app.design.mount import Mount, mount_of_laser, ring
-from aqualvs.app.design.predict import predict
-from aqualvs.app.design.settings import Design, Noise, Tolerances, index_step
-from aqualvs.app.design.stripes import see_stripes
+from aqualvs.design.judge import predict
+from aqualvs.design.settings import (
+    Design,
+    Mount,
+    Noise,
+    Tolerances,
+    index_step,
+    mount_of_laser,
+    ring,
+)
+from aqualvs.design.stripes import see_stripes
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import parameter_names
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
-from aqualvs.optics.uncertainty import rig_moved_by
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, rig_moved_by
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.plane_fit import SharedError, fit_robust
 from aqualvs.scanning.posture import range_pitch_yaw
-from aqualvs.scanning.search import SearchAxis, plan_searches
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from scanning_cases import everywhere, lit_stripe
 
 WIDE = math.radians(160.0)

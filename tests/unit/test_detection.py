@@ -4,12 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-import aqualvs.calibration.chessboard as chessboard_module
-from aqualvs.calibration.detection import detect_board, detect_markers
-from aqualvs.calibration.saddle_corners import refine_saddles
-from aqualvs.calibration.target_files import load_board
-from aqualvs.calibration.targets import Board, BoardKind, MarkerSet
-from aqualvs.calibration.view import View
+from aqualvs.calibration.detection import boards as chessboard_module
+from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.detection.saddle_corners import refine_saddles
+from aqualvs.calibration.targets.target_files import load_board
+from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, View
 from target_cases import (
     board_cells,
     charuco,

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from aqualvs.app import doctor, doctor_autopilot
-from aqualvs.app.doctor import DoctorRequest, run_doctor
+from aqualvs.check import doctor
+from aqualvs.check import doctor as doctor_autopilot
+from aqualvs.check.doctor import DoctorRequest, run_doctor
 from aqualvs.errors import AqualvsError
 from ports import free_port
 

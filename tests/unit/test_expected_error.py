@@ -11,14 +11,15 @@ from aqualvs.optics.expected_error import (
     N_POINTS,
     SIGMA_PX,
     USUAL_RANGES,
+    StripeView,
     WallView,
     expected_posture_errors,
+    point_per_pixel,
+    see_stripe,
 )
-from aqualvs.optics.rig import Rig, Window
+from aqualvs.optics.rig import Rig, RigUncertainty, Window, rig_moved_by, rig_parameter_names
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.stripe_view import StripeView, point_per_pixel, see_stripe
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 SIGMAS = {
     "lens": 2e-4,

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.live.sources.clock import StreamClock, Unwrapper
+from aqualvs.sources.live_frames import StreamClock, Unwrapper
 
 TICK = 1 / 90_000
 

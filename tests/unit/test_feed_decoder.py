@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from av.video.frame import VideoFrame
 
-from aqualvs.live.sources.h264 import FrameNumbers
-from aqualvs.live.sources.live_decoder import LiveDecoder
-from aqualvs.live.sources.live_frames import LiveFrames
-from aqualvs.live.sources.packets import packet_with
-from aqualvs.live.sources.reception import Reception
+from aqualvs.sources.base import packet_with
+from aqualvs.sources.h264 import FrameNumbers
+from aqualvs.sources.live_frames import LiveDecoder, LiveFrames, Reception
 
 SIZE = (192, 128)
 ONE_SLICE = "sliced-threads=0:slices=1"

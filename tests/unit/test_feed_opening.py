@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.live.health import State
-from aqualvs.live.sources import ImageSource, open_feed, open_source
-from aqualvs.live.sources.camera import CameraFeed, CameraOptions, camera_device
-from aqualvs.live.sources.datagrams import UdpAddress, parse_udp
-from aqualvs.live.sources.paced import PacedFeed
-from aqualvs.live.sources.remote import RemoteFeed
-from aqualvs.live.sources.sdp import read_sdp
-from aqualvs.live.sources.udp import UdpFeed
+from aqualvs.sources import ImageSource, open_feed, open_source
+from aqualvs.sources.base import State
+from aqualvs.sources.datagrams import UdpAddress, parse_udp
+from aqualvs.sources.opening import PacedFeed
+from aqualvs.sources.remote import CameraFeed, CameraOptions, RemoteFeed, camera_device
+from aqualvs.sources.udp import UdpFeed, read_sdp
 from shell_cases import cut_after, picture, write_video
 from waiting import PATIENCE_S, until
 

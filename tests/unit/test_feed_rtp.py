@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.live.sources.h264 import START_CODE
-from aqualvs.live.sources.rtp import Ordered, RtpOrder, RtpPacket, parse_rtp
-from aqualvs.live.sources.rtp_h264 import H264Depacketizer
+from aqualvs.sources.h264 import START_CODE
+from aqualvs.sources.rtp import H264Depacketizer, Ordered, RtpOrder, RtpPacket, parse_rtp
 
 PICTURE_S = 0.04
 

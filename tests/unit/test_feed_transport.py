@@ -9,8 +9,8 @@ from av.video.frame import VideoFrame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.live.sources.inbox import BARE, RTP, TS, kind_of
-from aqualvs.live.sources.transport_stream import PACKET_BYTES, TransportStream
+from aqualvs.sources.datagrams import BARE, RTP, TS, kind_of
+from aqualvs.sources.transport_stream import PACKET_BYTES, TransportStream
 from shell_cases import grain
 
 N_PICTURES = 24

@@ -9,14 +9,13 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.figures import figures
-from aqualvs.app.net_figures import Reflections, draw_figures
 from aqualvs.errors import OptionError, OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.scanning.mesh import MeshFilterOptions, laser_frame
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.report.mesh_figures import Reflections, draw_figures, figures
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
+from aqualvs.simulation.scenarios import example_rig
 
 LASERS = {"lower": Plane.from_normal([0.0, -0.3, 0.954], -0.143)}
 LASERS["left"] = Plane.from_normal([0.96, -0.25, -0.12], -0.138)

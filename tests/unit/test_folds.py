@@ -5,12 +5,11 @@ import pytest
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.simulation.folds import folded, pack_fold
-from aqualvs.simulation.lit_points import cast
-from aqualvs.simulation.scenario_file import parse_scenario
+from aqualvs.simulation.net import folded, pack_fold
+from aqualvs.simulation.scenario import dome_from_target, parse_scenario
 from aqualvs.simulation.scene import Fold, Net, Scene
 from aqualvs.simulation.surfaces import pack_surfaces
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.truth import cast
 
 # Twine with its knots is at most so thick, in clean radii.
 _THICKEST = 1.45

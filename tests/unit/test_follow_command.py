@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from aqualvs.app.cli_follow import follow
-from aqualvs.app.follow import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, simulate_and_tell
-from aqualvs.app.follow_vehicle import listen
-from aqualvs.app.overwriting import RECORD
+from aqualvs.cli.follow import follow
 from aqualvs.control.follow_log import FOLLOW_COLUMNS
 from aqualvs.errors import OptionError
+from aqualvs.follow.command import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, simulate_and_tell
+from aqualvs.follow.vehicle import listen
+from aqualvs.results.files import RECORD
 
 PLAN = """aqualvs_plan: 1
 mission: follow

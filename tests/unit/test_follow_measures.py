@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.follow_sim_log import LoopLog, LoopRow
-from aqualvs.app.follow_sim_measures import (
+from aqualvs.follow.log import (
+    LoopLog,
+    LoopRow,
     SafetyMeasures,
     effort_measures,
     hold_measures,

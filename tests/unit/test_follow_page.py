@@ -10,18 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from aqualvs.app.follow import FOLLOW_CSV
-from aqualvs.app.follow_fast_eye import SampledEye
-from aqualvs.app.follow_rendered import RenderedEye
-from aqualvs.app.follow_sim import Eye
-from aqualvs.app.follow_sim_case import SimCase, vehicle_model
-from aqualvs.app.follow_sim_page import LoopPage
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.mission import HoldMission
-from aqualvs.control.setpoint import Setpoint, SetpointHolder
-from aqualvs.live.health import State
+from aqualvs.control.missions import HoldMission
+from aqualvs.control.vehicle import Setpoint, SetpointHolder
+from aqualvs.follow.case import SimCase, vehicle_model
+from aqualvs.follow.command import FOLLOW_CSV, LoopPage
+from aqualvs.follow.loop import Eye
+from aqualvs.follow.sensor_model import RenderedEye, SampledEye
 from aqualvs.simulation.cameras import IDEAL, simulated_camera
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.sources.base import State
 from browser import open_page
 from live_cases import Collector
 
@@ -100,7 +98,7 @@ def test_rendered_pictures_are_those_of_the_chosen_camera() -> None:
 
 
 def test_a_browser_shows_the_loop_and_moves_its_setpoint(tmp_path: Path) -> None:
-    code = "import sys; from aqualvs.app.cli import main; sys.exit(main())"
+    code = "import sys; from aqualvs.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "follow", "--sim", "--seconds", "300", "--dashboard"]
     command += ["--dashboard-address", "127.0.0.1:0", "-o", str(tmp_path / "out")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -8,20 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.app.follow_fast import random_dive
-from aqualvs.app.follow_fast_eye import Blind, Loss, PostureNoise, SampledEye
-from aqualvs.app.follow_sim import SimulatedLoop, Timing
-from aqualvs.app.follow_sim_case import SimCase, sea, tuned_gains, vehicle_model
-from aqualvs.app.follow_sim_log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
-from aqualvs.control.answer import AnswerLimits
-from aqualvs.control.mission import HoldMission
+from aqualvs.control.missions import HoldMission
+from aqualvs.control.safety import AnswerLimits
 from aqualvs.control.safety import Reason as GateReason
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import Effort
+from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError
+from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
+from aqualvs.follow.log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
+from aqualvs.follow.loop import SimulatedLoop, Timing
+from aqualvs.follow.monte_carlo import random_dive
+from aqualvs.follow.sensor_model import Blind, Loss, PostureNoise, SampledEye
 from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.simulation.net_motion import NetWall
-from aqualvs.simulation.water_motion import WaterMotion
+from aqualvs.simulation.vehicle.water_motion import WaterMotion
 
 MODEL = vehicle_model("bluerov2")
 GAINS = tuned_gains(MODEL)

@@ -8,16 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from aqualvs.app.follow import FOLLOW_CSV, Aim
-from aqualvs.app.follow_vehicle import FollowRequest, follow_and_tell
-from aqualvs.app.follow_vehicle_log import FollowLogOutput
-from aqualvs.control.mission import Guidance, Stage
+from aqualvs.control.missions import Guidance, Stage
 from aqualvs.control.safety import Reason
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import Effort, VehicleState
+from aqualvs.control.vehicle import Effort, Setpoint, VehicleState
 from aqualvs.errors import OptionError
-from aqualvs.live.health import State
-from aqualvs.live.pilot_report import PilotReport
+from aqualvs.follow.command import FOLLOW_CSV, Aim
+from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, follow_and_tell
+from aqualvs.live.pilot import PilotReport
+from aqualvs.sources.base import State
 from live_cases import demo_samples
 
 pytest.importorskip("pymavlink")

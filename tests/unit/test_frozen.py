@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.live.frozen import FrozenOptions, FrozenPicture
+from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture
 from aqualvs.scanning.scan import ImagePlane
 from live_cases import demo_frames
 

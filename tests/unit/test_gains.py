@@ -10,10 +10,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.control.controller_ramp import QuietZone
-from aqualvs.control.gains import ControlGains, Drag
+from aqualvs.control.controller import QuietZone
+from aqualvs.control.gains import ControlGains, DeadBandCrossing, Drag, Layout, ThrustMap
 from aqualvs.control.gains_file import VEHICLES, gains_text, load_gains, save_gains
-from aqualvs.control.gains_thrust import DeadBandCrossing, Layout, ThrustMap
 from aqualvs.errors import OptionError
 
 MAP = ThrustMap(forward=40.0, backward=30.0, right=35.0, dead_band=0.14, linear=0.7)

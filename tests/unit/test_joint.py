@@ -5,13 +5,12 @@ import functools
 import numpy as np
 import pytest
 
-from aqualvs.calibration.camera_doubt import CameraDoubt
-from aqualvs.calibration.laser_views import LaserView
-from aqualvs.calibration.lasers import LaserOptions, calibrate_lasers
+from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
+from aqualvs.calibration.lasers.covariance import CameraDoubt
+from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.uncertainty import LASER_PARAMETERS, RigUncertainty, rig_moved_by, tangent_basis
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.rig import LASER_PARAMETERS, Rig, RigUncertainty, rig_moved_by, tangent_basis
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import Noise, box, box_views, camera_uncertainty
 
 RIG = example_rig()

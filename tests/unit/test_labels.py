@@ -7,16 +7,16 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.candidates import Readings, read_returns
 from aqualvs.scanning.labels import label_readings
-from aqualvs.scanning.measure import Measurement
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import Reason, Refusal
-from aqualvs.scanning.readings import Readings, read_returns
+from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.scanning.search import SearchAxis, plan_searches
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from scanning_cases import Lit, behind_strands, everywhere, returns_of, strands
 
 NET = Plane.from_normal([-0.1, 1.0, 0.05], 0.45)

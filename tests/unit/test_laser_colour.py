@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.detection import FrameDetector
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
 from aqualvs.scanning.laser_colour import (
     LaserColour,
     channel_image,
@@ -19,7 +20,6 @@ from aqualvs.scanning.laser_colour import (
     useful_height,
 )
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.stripe import N_MEASURES, Returns, StripeOptions
 
 U8 = NDArray[np.uint8]

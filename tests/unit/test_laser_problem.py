@@ -5,20 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.bundle import Bundle, BundleState, TargetView
-from aqualvs.calibration.laser_problem import N_SLACK, LaserProblem, LaserState, Slack, distances_of
-from aqualvs.calibration.stripe_groups import (
+from aqualvs.calibration.lasers.problem import (
+    N_SLACK,
+    LaserProblem,
+    LaserState,
+    Slack,
+    distances_of,
+)
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    StripePoints,
+    Surfaces,
     binned,
+    board_surface,
     correlation_factor,
     with_gain,
     with_shared_error,
 )
-from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import Surfaces, board_surface
-from aqualvs.optics.rig import Rig
+from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
+from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.uncertainty import RigUncertainty
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import board_views, box, box_views, dome_from_board, dome_from_box
 from windowed_cases import windowed
 

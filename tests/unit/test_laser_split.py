@@ -5,14 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.laser_split import LaserSplit, split_lasers
-from aqualvs.calibration.laser_views import LaserView, place_views, pooled
-from aqualvs.calibration.stripe_lines import lines_on_patch
-from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import PooledStripes, Surfaces, board_surface
+from aqualvs.calibration.lasers.candidates import lines_on_patch
+from aqualvs.calibration.lasers.laser_assignment import LaserSplit, split_lasers
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    PooledStripes,
+    StripePoints,
+    Surfaces,
+    board_surface,
+)
+from aqualvs.calibration.lasers.views import LaserView, place_views, pooled
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import Noise, board_views, box, box_views, laser_error
 
 RIG = example_rig()

@@ -4,10 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from aqualvs.calibration.laser_split import LaserSplit, split_lasers
-from aqualvs.calibration.laser_verdicts import JudgedPlane, Verdict
-from aqualvs.calibration.laser_views import pooled
-from aqualvs.calibration.stripes_on_planes import board_surface, place_stripes
+from aqualvs.calibration.lasers.laser_assignment import (
+    JudgedPlane,
+    LaserSplit,
+    Verdict,
+    split_lasers,
+)
+from aqualvs.calibration.lasers.stripes_on_planes import board_surface, place_stripes
+from aqualvs.calibration.lasers.views import pooled
 from aqualvs.geometry.arrays import FloatArray
 from laser_scenes import Clutter, Scene, joined, scene
 

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.calibration.least_squares import Block, information_of, inverse, solve
-from aqualvs.calibration.losses import Loss
+from aqualvs.calibration.solver.least_squares import Block, Loss, information_of, inverse, solve
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 

@@ -14,8 +14,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink_link import LinkOptions
+from aqualvs.live.mavlink.link import LinkOptions
+from aqualvs.live.mavlink.ports import (
+    NetAddress,
+    NetKind,
+    SerialAddress,
+    check_address,
+    open_port,
+    parse_address,
+)
 from aqualvs.live.outputs.mavlink import (
     FILTERED_NAMES,
     NAMES,
@@ -25,15 +34,7 @@ from aqualvs.live.outputs.mavlink import (
     signal_quality,
     variance_cm2,
 )
-from aqualvs.live.outputs.mavlink_address import (
-    NetAddress,
-    NetKind,
-    SerialAddress,
-    parse_address,
-)
-from aqualvs.live.outputs.mavlink_ports import check_address, open_port
-from aqualvs.live.sample import LiveSample
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
 from live_cases import first_sample

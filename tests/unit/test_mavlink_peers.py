@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from aqualvs.live.mavlink_peers import MOVES_AFTER_S, PeerTable
+from aqualvs.live.mavlink.peers import MOVES_AFTER_S, PeerTable
 
 pytest.importorskip("pymavlink")
 

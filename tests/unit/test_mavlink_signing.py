@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink_signing import Signer, load_key
-from aqualvs.live.outputs.mavlink_address import AllowedPeers
+from aqualvs.live.mavlink.peers import Signer, load_key
+from aqualvs.live.mavlink.ports import AllowedPeers
 
 pytest.importorskip("pymavlink")
 

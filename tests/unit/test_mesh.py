@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from aqualvs.errors import OptionError
 from aqualvs.geometry import Plane
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.mesh import (
+from aqualvs.scanning.paper.mesh_filter import (
     MeshFilterOptions,
     laser_frame,
     laser_plane_image,

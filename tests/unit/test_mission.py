@@ -8,12 +8,22 @@ import pytest
 from aqualvs.control.autopilot import Decision, Motion, NetPilot
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.mission import Guidance, HoldMission, LossOptions, Mission, Stage
-from aqualvs.control.missions_follow import FollowMission, Leg, LegOptions, Sector
-from aqualvs.control.missions_survey import SurveyMission, SurveyOptions, Turn
+from aqualvs.control.missions import (
+    FollowMission,
+    Guidance,
+    HoldMission,
+    Leg,
+    LegOptions,
+    LossOptions,
+    Mission,
+    Sector,
+    Stage,
+    SurveyMission,
+    SurveyOptions,
+    Turn,
+)
 from aqualvs.control.safety import Reason, SafetyGate
-from aqualvs.control.setpoint import Setpoint
-from aqualvs.control.vehicle import NEUTRAL, VehicleState
+from aqualvs.control.vehicle import NEUTRAL, Setpoint, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Reason as NoPosture
 from aqualvs.scanning.posture import Refusal

@@ -8,17 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.app.net_map import draw_map
-from aqualvs.app.net_pass import write_net_files
-from aqualvs.app.net_places import place_net
-from aqualvs.app.net_report import net_cards, net_view, read_net
-from aqualvs.app.net_tables import HOLE_COLUMNS, NET_COLUMNS
-from aqualvs.app.net_wall import bands, unroll
-from aqualvs.app.net_words import net_facts, net_lines
-from aqualvs.app.outputs import NET_FILES
-from aqualvs.app.report import write_report
-from aqualvs.live.logs import VehiclePlaces
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.nets.map import draw_map
+from aqualvs.nets.places import place_net
+from aqualvs.nets.tables import HOLE_COLUMNS, NET_COLUMNS, bands, net_facts, net_lines, unroll
+from aqualvs.report.net import net_cards, net_view, read_net
+from aqualvs.report.run_page import write_report
+from aqualvs.results.folder import NET_FILES
+from aqualvs.results.net_survey import write_net_files
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.vehicle_logs import VehiclePlaces
 from net_app_cases import STRETCH_S, hole, postures, stretch, vehicle_log
 from report_cases import make_dive
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.app import net_log
-from aqualvs.app.net_log import lay_log, open_log
 from aqualvs.errors import OptionError, SourceError
+from aqualvs.nets import places as net_log
+from aqualvs.nets.places import lay_log, open_log
 from net_app_cases import postures, vehicle_log
 
 DURATION = 60.0

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from aqualvs.app.net_places import PlacedBy, place_net
-from aqualvs.live.logs import VehiclePlaces
+from aqualvs.nets.places import PlacedBy, place_net
+from aqualvs.vehicle_logs import VehiclePlaces
 from net_app_cases import STRETCH_S, hole, postures, stretch, vehicle_log
 
 SPEED = 0.2

@@ -7,12 +7,11 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from aqualvs.app import stored_scans as module
-from aqualvs.app.journal import PointsJournal
-from aqualvs.app.outputs import RunOutputs
-from aqualvs.app.points_export import export_points
-from aqualvs.app.stored_scans import check_stored, stored_scans
 from aqualvs.errors import SourceError
+from aqualvs.results import net_survey as module
+from aqualvs.results.folder import RunOutputs
+from aqualvs.results.net_survey import check_stored, stored_scans
+from aqualvs.results.points import PointsJournal, export_points
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
 

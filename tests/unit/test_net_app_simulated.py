@@ -8,20 +8,19 @@ import csv
 import numpy as np
 import pytest
 
-from aqualvs.app import simulate as body
-from aqualvs.app.cli import main
-from aqualvs.app.outputs import RunOutputs
-from aqualvs.live.logs import VehiclePlaces, read_vehicle_log
+from aqualvs.cli.main import main
+from aqualvs.experiments import simulate as body
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.scenarios import load_scenario
-from aqualvs.simulation.vehicle_log import (
+from aqualvs.results.folder import RunOutputs
+from aqualvs.simulation.dive import (
     LEAD_S,
     NET_BEARING,
     NET_DEPTH,
     write_hole_truth,
     write_vehicle_log,
 )
+from aqualvs.simulation.scenarios import example_rig, load_scenario
+from aqualvs.vehicle_logs import VehiclePlaces, read_vehicle_log
 from net_cases import NetCamera
 
 

@@ -5,13 +5,12 @@ from datetime import date
 import numpy as np
 import pytest
 
-from aqualvs.app.net_change.alignment import Shift
-from aqualvs.app.net_change.cells import Growth, history
-from aqualvs.app.net_change.comparison import compare
-from aqualvs.app.net_change.frames import WallFrame, place_survey
-from aqualvs.app.net_change.growth import common_cells
-from aqualvs.app.net_change.hole_sites import HoleState
-from aqualvs.app.net_change.words import summary_lines
+from aqualvs.net_survey.alignment import Shift
+from aqualvs.net_survey.comparison import compare
+from aqualvs.net_survey.frames import WallFrame, place_survey
+from aqualvs.net_survey.growth import Growth, common_cells, history
+from aqualvs.net_survey.hole_sites import HoleState
+from aqualvs.net_survey.tables import summary_lines
 from net_change_cases import RADIUS, Cage, dive
 
 ARC, LANES = (0.0, 70.0), (3.0, 3.4, 3.8)
@@ -130,7 +129,7 @@ def test_no_hole_is_new_or_gone_where_all_stay(pairs):
 
 def test_what_instruments_are_off_by_would_else_make_holes_new(pairs, monkeypatch):
     """Guard of the test above: without the shift most holes would be new, and as many gone."""
-    from aqualvs.app.net_change import comparison as body
+    from aqualvs.net_survey import comparison as body
 
     monkeypatch.setattr(body, "align", lambda *_: Shift.first())
     survey = pairs[0][2].surveys

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.net_change.alignment import Shift
-from aqualvs.app.net_change.frames import WallFrame, place_survey
-from aqualvs.app.net_change.hole_sites import HoleState, find_sites
-from aqualvs.app.net_change.surveys import Holes
+from aqualvs.net_survey.alignment import Shift
+from aqualvs.net_survey.frames import WallFrame, place_survey
+from aqualvs.net_survey.hole_sites import HoleState, find_sites
+from aqualvs.net_survey.surveys import Holes
 from net_change_cases import RADIUS, Cage, dive
 
 FRAME = WallFrame(True, RADIUS)

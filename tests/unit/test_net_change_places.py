@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.net_change.comparison import compare
-from aqualvs.app.net_change.dates import named_date
-from aqualvs.app.net_change.frames import WallFrame, common_frame
-from aqualvs.app.net_change.hole_sites import HoleState
-from aqualvs.app.net_change.raster import Raster, spread_over
+from aqualvs.net_survey.comparison import compare
+from aqualvs.net_survey.frames import Raster, WallFrame, common_frame, spread_over
+from aqualvs.net_survey.hole_sites import HoleState
+from aqualvs.net_survey.surveys import named_date
 from net_change_cases import RADIUS, Cage, dive
 
 LANES = (3.0, 3.4, 3.8)

@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.app.net_check import NetCheck, bar_of, strand_distance
-from aqualvs.app.report_findings import warnings_of
-from aqualvs.app.report_run import Track
-from aqualvs.app.target_file import NetFacts, target_facts
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.nets.target_file import NetCheck, NetFacts, bar_of, strand_distance, target_facts
+from aqualvs.report.findings import warnings_of
+from aqualvs.report.run_data import Track
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
 

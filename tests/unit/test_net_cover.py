@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.scanning.net_cover import LaidView, dash_kinds, measure_solidity, sound_length
-from aqualvs.scanning.net_dashes import NetView, find_dashes
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.net_lattice import NetLattice
-from aqualvs.scanning.net_lines import NetSignal
-from aqualvs.scanning.net_track import LatticeFitter
-from aqualvs.scanning.net_twine import Twine
+from aqualvs.nets.coverage import LaidView, Twine, dash_kinds, measure_solidity, sound_length
+from aqualvs.nets.dashes import NetView, find_dashes
+from aqualvs.nets.lattice import LatticeFitter, NetLattice
+from aqualvs.nets.lit_intervals import NetSignal
+from aqualvs.nets.spectrum import Mesh
 
 BAR, STEP, HALF, HEIGHT, PIXEL = 0.05, 5e-4, 0.4, 100.0, 6e-4
 NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0, np.ones(2))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from aqualvs.scanning.net_dashes import crossings_of, find_dashes
-from aqualvs.scanning.net_lines import NetSignal
+from aqualvs.nets.dashes import crossings_of, find_dashes
+from aqualvs.nets.lit_intervals import NetSignal
 
 STEP = 1e-3
 

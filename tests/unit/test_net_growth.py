@@ -5,11 +5,10 @@ import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.chunks import Chunks
-from aqualvs.scanning.net_growth import follow_net
-from aqualvs.scanning.net_mean import doubted, fit_mean
-from aqualvs.scanning.net_pieces import continues, joined_plane, seen_through
+from aqualvs.scanning.candidates import Chunks
+from aqualvs.scanning.net_surfaces import continues, doubted, fit_mean, joined_plane, seen_through
 from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.region_growing import follow_net
 
 RANGE = 0.6
 M_PER_LINE = 0.7e-3

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.scanning.net_dashes import Dashes, Gaps, NetView
-from aqualvs.scanning.net_discs import find_discs
-from aqualvs.scanning.net_holes import Hole, HoleMap, opening_area
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.net_lattice import NetLattice
-from aqualvs.scanning.net_looks import LASERS, Looks
-from aqualvs.scanning.net_strands import Strands, predicted_strands
+from aqualvs.nets.dashes import Dashes, Gaps, NetView
+from aqualvs.nets.hole_candidates import LASERS, Looks, Strands, find_discs, predicted_strands
+from aqualvs.nets.holes import Hole, HoleMap, opening_area
+from aqualvs.nets.lattice import NetLattice
+from aqualvs.nets.spectrum import Mesh
 
 BAR, HALF = 0.025, 0.2
 NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0, np.ones(2))

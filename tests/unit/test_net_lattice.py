@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.net_lattice import NetLattice, find_lattice
-from aqualvs.scanning.net_spectrum import Crossings, Spectrum
+from aqualvs.nets.lattice import NetLattice, find_lattice
+from aqualvs.nets.spectrum import Crossings, Mesh, Spectrum
 
 LINES = np.deg2rad([-4.0, -97.0, -46.0])
 HALF = 0.22

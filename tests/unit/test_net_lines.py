@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.scanning.net_lines import LineState, NetReader, NetSignal, net_from_dome
+from aqualvs.nets.lit_intervals import LineState, NetReader, NetSignal, net_from_dome
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Fish, Net, Scene, Wall
-from aqualvs.simulation.trajectory import dome_from_target
 from net_cases import NetCamera
 
 RIG = example_rig()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aqualvs.scanning.net_looks import LASERS, Looks, looks_say
+from aqualvs.nets.hole_candidates import LASERS, Looks, looks_say
 
 MIDDLE = np.zeros(2)
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.scanning import net_condition
-from aqualvs.scanning.net_condition import NetCondition, NetConditionOptions
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.net_lattice import NetLattice, find_lattice
+from aqualvs.nets import condition as net_condition
+from aqualvs.nets.condition import NetCondition, NetConditionOptions
+from aqualvs.nets.lattice import NetLattice, find_lattice
+from aqualvs.nets.spectrum import Mesh
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net
 from net_cases import NetCamera, passing
 

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.net_dashes import Dashes
-from aqualvs.scanning.net_hypotheses import Mesh
-from aqualvs.scanning.net_lattice import NetLattice
-from aqualvs.scanning.net_spectrum import Crossings
-from aqualvs.scanning.net_track import LatticeFitter, NetTrack
+from aqualvs.nets.dashes import Dashes
+from aqualvs.nets.lattice import LatticeFitter, NetLattice, NetTrack
+from aqualvs.nets.spectrum import Crossings, Mesh
 
 LINES = np.deg2rad([-4.0, -97.0, -46.0])
 HALF, FPS = 0.2, 25.0

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.scanning.net_twine import DashKind, measure_twine
+from aqualvs.nets.coverage import DashKind, measure_twine
 
 # Silhouette of a diameter, how much of it is lit and what blur adds at the usual height with search
 # lines STEP apart; widths of the sheet, lit and at half height; as `net_twine` expects them.

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from aqualvs.app.nominal import load_nominal
+from aqualvs.calibrate.common import load_nominal
 from aqualvs.errors import RigError
 from aqualvs.optics.rigfile import save_rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 
 def test_a_nominal_file(tmp_path):

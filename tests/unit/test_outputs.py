@@ -12,17 +12,20 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.append_file import AppendFile
-from aqualvs.app.cli import main
-from aqualvs.app.disk import explain
-from aqualvs.app.journal import POINTS_SCHEMA, PointsJournal, points_batch, read_journal
-from aqualvs.app.outputs import RunOutputs, prepare_folder, recover
-from aqualvs.app.overwriting import RECORD
-from aqualvs.app.points_export import PointsExport, export_points
-from aqualvs.app.posture_csv import PostureCsv, posture_row
-from aqualvs.app.runfile import Status
-from aqualvs.app.tally import tally_of
+from aqualvs.cli.main import main
 from aqualvs.errors import OutputError
+from aqualvs.results.files import RECORD, AppendFile, explain
+from aqualvs.results.folder import PostureCsv, RunOutputs, posture_row, prepare_folder, recover
+from aqualvs.results.points import (
+    POINTS_SCHEMA,
+    PointsExport,
+    PointsJournal,
+    export_points,
+    points_batch,
+    read_journal,
+)
+from aqualvs.results.run_request import Status
+from aqualvs.results.summary import tally_of
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
 from shell_cases import scan
@@ -233,7 +236,7 @@ def test_a_full_disk_is_said_by_the_journal_and_by_the_rows():
 
 def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch):
     # Groups of two frames, the last of them incomplete.
-    monkeypatch.setattr("aqualvs.app.points_export._ROWS_PER_GROUP", 100)
+    monkeypatch.setattr("aqualvs.results.points._ROWS_PER_GROUP", 100)
     scans = [scan(i, 60) for i in range(5)]
     journal = tmp_path / "points.arrows"
     with PointsJournal(journal) as writer:
@@ -279,7 +282,7 @@ def test_a_failed_export_leaves_no_half_files(tmp_path, monkeypatch):
     def fail(table):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("aqualvs.app.points_export._vertices", fail)
+    monkeypatch.setattr("aqualvs.results.points._vertices", fail)
     with pytest.raises(OSError, match="No space"):
         export_points(journal, tmp_path / "points.parquet", tmp_path / "points.ply")
     assert [p.name for p in tmp_path.iterdir()] == ["points.arrows"]

@@ -4,13 +4,13 @@ import av
 import numpy as np
 import pytest
 
-from aqualvs.app.overlay import OverlayWriter, draw_overlay, draw_points, posture_lines
-from aqualvs.app.report_words import LASER_COLOURS, bgr
 from aqualvs.errors import OutputError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.report.overlay import OverlayWriter, draw_overlay, draw_points, posture_lines
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.text import LASER_COLOURS, bgr
 
 GREY = np.full((240, 320, 3), 90, np.uint8)
 REFUSAL = Refusal(Reason.ONE_LASER)

@@ -9,16 +9,15 @@ from typing import Any
 import pytest
 import typer.main
 
-from aqualvs.app.check_compare import last_calibration
-from aqualvs.app.cli import app, main
-from aqualvs.app.outputs import RUN_FILES, prepare_folder
-from aqualvs.app.overwriting import RECORD, Claim
+from aqualvs.check.comparison import last_calibration
+from aqualvs.cli.main import app, main
 from aqualvs.errors import OutputError, RigError
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.rig_copies import dated_copies, keep_dated
-from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.rigfile import dated_copies, keep_dated, load_rig, save_rig
 from aqualvs.optics.solved import SolvedStep, with_step
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.results.files import RECORD, Claim
+from aqualvs.results.folder import RUN_FILES, prepare_folder
+from aqualvs.simulation.scenarios import example_rig
 
 TESTS = Path(__file__).parents[1]
 PRECIOUS = "somebody's own\n"

@@ -6,16 +6,23 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.calibration.detection import detect_board, detect_markers
-from aqualvs.calibration.printed import board_rectangles
-from aqualvs.calibration.targets import Board, BoardKind, MarkerSet
-from aqualvs.calibration.view import View
+from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.targets.printed import board_rectangles
+from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, View
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.simulation.calibration_targets import board_panel, squares_size
 from aqualvs.simulation.lasers import default_sources
-from aqualvs.simulation.panel_textures import (
+from aqualvs.simulation.panels import (
+    Panel,
+    PanelRenderer,
+    PanelScene,
+    RoomLight,
+    panel_sheets,
+)
+from aqualvs.simulation.scene import Sensor
+from aqualvs.simulation.textures import (
     INK,
     PAPER,
     CharucoPrint,
@@ -26,14 +33,6 @@ from aqualvs.simulation.panel_textures import (
     marker_texture,
     mottled,
 )
-from aqualvs.simulation.panels import (
-    Panel,
-    PanelRenderer,
-    PanelScene,
-    RoomLight,
-    panel_sheets,
-)
-from aqualvs.simulation.scene import Sensor
 from panel_cases import BOARD, facing, small_rig
 
 TURNS = ((0.3, -0.25, 0.1), (-0.35, 0.2, -0.3))

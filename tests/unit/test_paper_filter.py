@@ -7,14 +7,13 @@ import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.mesh import MeshFilterOptions, mesh_filter_dense
-from aqualvs.scanning.paper_filter import FilteredPoints, PaperFilter
-from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, mesh_filter_dense
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.search import plan_searches
-from aqualvs.scanning.threshold import ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 RANGE = 0.643
 LEVEL_ONLY = ScannerOptions(detector=ThresholdOptions(), mesh_filter=MeshFilterOptions())

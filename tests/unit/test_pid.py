@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.control.pid import Pid, PidOptions
+from aqualvs.control.controller import Pid, PidOptions
 from aqualvs.errors import OptionError
 
 STEP = 0.04

@@ -11,14 +11,14 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.measure import FitMethod
-from aqualvs.scanning.mesh import MeshFilterOptions
-from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.paper.detector import ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.target import TargetKind
-from aqualvs.scanning.threshold import ThresholdOptions
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from windowed_cases import windowed
 
 Lit: TypeAlias = Callable[[FloatArray], BoolArray]

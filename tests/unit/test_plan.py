@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from aqualvs.control.mission import HoldMission
-from aqualvs.control.missions_follow import FollowMission
-from aqualvs.control.missions_survey import SurveyMission
+from aqualvs.control.missions import FollowMission, HoldMission, SurveyMission
 from aqualvs.control.plan import load_plan
 from aqualvs.errors import OptionError
 

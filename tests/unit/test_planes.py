@@ -5,8 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.rays import Rays
+from aqualvs.geometry.planes import Plane, Rays
 
 COORDINATE = st.floats(-2.0, 2.0)
 VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE).map(np.array)

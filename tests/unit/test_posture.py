@@ -13,7 +13,7 @@ from aqualvs.scanning.posture import (
     posture_from_fit,
     range_pitch_yaw,
 )
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.scenario import dome_from_target
 
 POINTS = np.array([[0.0, 0.55, 0.0], [0.1, 0.5, -0.1], [-0.2, 0.5, 0.1]])
 SURE = np.diag([1e-4, 1e-4, 1e-4])

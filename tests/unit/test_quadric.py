@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.plane_fit import SharedError
-from aqualvs.scanning.quadric import (
+from aqualvs.scanning.candidates import Observations
+from aqualvs.scanning.paraboloid import (
     FLAT,
     Patch,
     fit_patch,
@@ -14,7 +14,7 @@ from aqualvs.scanning.quadric import (
     nearest_tangent,
     tangent_covariance,
 )
-from aqualvs.scanning.readings import Observations
+from aqualvs.scanning.plane_fit import SharedError
 
 BASE = Plane.from_normal([0.1, 1.0, -0.05], 0.6)
 SHARED = SharedError(shift_px=0.02, tilt_px=0.02)

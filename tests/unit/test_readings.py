@@ -6,11 +6,11 @@ import numpy as np
 
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.readings import Readings, read_returns
-from aqualvs.scanning.search import SearchAxis, plan_searches
+from aqualvs.scanning.candidates import Readings, read_returns
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import everywhere, returns_of, strands
 
 WALL = Plane(np.array([0.0, 1.0, 0.0]), 0.5)

@@ -14,10 +14,10 @@ from mcap.reader import SeekingReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.live.health import Health, PartHealth, StageDelay, State
 from aqualvs.live.outputs.base import Output
-from aqualvs.live.recorder import (
+from aqualvs.recording import (
     DiveRecording,
     PictureFormat,
     Recorder,
@@ -27,12 +27,21 @@ from aqualvs.live.recorder import (
     is_recording,
     recorder,
 )
-from aqualvs.live.recorder.cdr import CdrReader, CdrWriter
-from aqualvs.live.recorder.reader import McapFile
-from aqualvs.live.recorder.schemas import HEALTH, PICTURE, POINTS, POSTURE, RIG, STRIPES, TOPICS
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.recording.encoding import (
+    HEALTH,
+    PICTURE,
+    POINTS,
+    POSTURE,
+    RIG,
+    STRIPES,
+    TOPICS,
+    CdrReader,
+    CdrWriter,
+)
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
+from aqualvs.sources.base import Health, PartHealth, StageDelay, State
+from aqualvs.sources.mcap_file import McapFile
 from live_cases import demo_frames, demo_rig, demo_samples
 from recorder_cases import counted, read_by_mcap, read_by_rosbags
 from waiting import PATIENCE_S, until

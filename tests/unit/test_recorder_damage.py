@@ -6,15 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.run import run
-from aqualvs.app.run_inputs import RunRequest
 from aqualvs.errors import SourceError
-from aqualvs.live.recorder import DiveRecording, Recorder, RecorderOptions, Recording, is_recording
-from aqualvs.live.recorder.reader import McapFile
-from aqualvs.live.recorder.records import FOOTER_BYTES
-from aqualvs.live.recorder.rig_record import options_text, rig_exact
-from aqualvs.live.recorder.schemas import RIG, STRIPES
 from aqualvs.optics.rigfile import save_rig
+from aqualvs.pipeline import run
+from aqualvs.recording import DiveRecording, Recorder, RecorderOptions, Recording, is_recording
+from aqualvs.recording.encoding import RIG, STRIPES, options_text, rig_exact
+from aqualvs.results.run_request import RunRequest
+from aqualvs.sources.mcap_file import FOOTER_BYTES, McapFile
 from live_cases import demo_samples
 
 N_FRAMES, STEP_NS = 48, 250_000_000

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from aqualvs.live.recorder import growing_file
-from aqualvs.live.recorder.growing_file import PAGE
-from aqualvs.live.recorder.reader import McapFile
-from aqualvs.live.recorder.recording import recording_file
-from aqualvs.live.recorder.records import FOOTER_BYTES, HEAD_BYTES, Op, padding_head
-from aqualvs.live.recorder.schemas import POSTURE, TOPICS
+from aqualvs.recording import growing_file
+from aqualvs.recording.encoding import POSTURE, TOPICS
+from aqualvs.recording.growing_file import PAGE
+from aqualvs.recording.recorder import recording_file
+from aqualvs.sources.mcap_file import FOOTER_BYTES, HEAD_BYTES, McapFile, Op, padding_head
 from recorder_cases import HistoryFile, chunk_of, played, read_by_mcap, read_by_rosbags
 
 ALL = [topic.name for topic in TOPICS]

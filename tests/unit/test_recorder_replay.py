@@ -11,22 +11,16 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.cli import main
-from aqualvs.app.run import run
-from aqualvs.app.run_inputs import FrameWindow, RunRequest, Water
+from aqualvs.cli.main import main
 from aqualvs.errors import OptionError, OutputError, SourceError
-from aqualvs.live.recorder import (
-    DiveRecording,
-    PictureFormat,
-    Recorder,
-    RecorderOptions,
-    Recording,
-)
-from aqualvs.live.recorder.schemas import TOPICS
 from aqualvs.optics.rigfile import load_rig, save_rig
-from aqualvs.scanning.pipeline import Scanner, ScannerOptions
+from aqualvs.pipeline import run
+from aqualvs.recording import DiveRecording, PictureFormat, Recorder, RecorderOptions, Recording
+from aqualvs.recording.encoding import TOPICS
+from aqualvs.results.run_request import FrameWindow, RunRequest, Water
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.paper.detector import ThresholdOptions
 from aqualvs.scanning.target import TargetKind
-from aqualvs.scanning.threshold import ThresholdOptions
 from live_cases import demo_rig, demo_samples
 
 FEW = FrameWindow(0, 12)
@@ -182,7 +176,7 @@ def test_frames_that_were_lost_stay_lost(demo, tmp_path):
     again(demo / "dive.mp4", tmp_path / "video", demo / "rig.yaml", frames=FEW, mcap=True)
     recording = DiveRecording(tmp_path / "video" / "dive.mcap")
     assert recording.n_frames == 12
-    from aqualvs.app.run_frames import _lost
+    from aqualvs.workers.run_frames import _lost
 
     lost = replace(samples[1], scan=_lost(1, 0.04, 1.3333), returns={}, frame=None)
     kept = Recording(path, RecorderOptions())

@@ -16,18 +16,17 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from pyarrow import parquet
 
-from aqualvs.app.overlay import OverlayWriter
-from aqualvs.app.report import write_report
-from aqualvs.app.report_frames import choose_pictures, choose_samples, decode_frames
-from aqualvs.app.report_html import embedded_json
-from aqualvs.app.report_points import summarize_points
-from aqualvs.app.report_rig import lasers_of
-from aqualvs.app.report_run import Track, read_track
-from aqualvs.app.report_series import breaks, merged, stretches, thin
-from aqualvs.app.report_words import LABEL_COLOURS, LABEL_WORDS, REASON_WORDS, reason_words
 from aqualvs.errors import OutputError, SourceError
+from aqualvs.report.charts import breaks, merged, stretches, thin
+from aqualvs.report.frames import choose_pictures, choose_samples, decode_frames
+from aqualvs.report.html import embedded_json
+from aqualvs.report.overlay import OverlayWriter
+from aqualvs.report.points import summarize_points
+from aqualvs.report.run_data import Track, lasers_of, read_track
+from aqualvs.report.run_page import write_report
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
+from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, REASON_WORDS, reason_words
 from report_cases import COLUMNS, FPS, LASERS, NASTY, NASTY_LASER, Dive, make_dive, write_truth
 from shell_cases import write_video
 

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.app.reproduce.dome_boards import read_with_errors
-from aqualvs.app.reproduce.laser_box import angle_between, matched, plane_error, remaining
-from aqualvs.app.reproduce.rig_table import band_shares, bending
-from aqualvs.app.reproduce.water_index import decentred, paper_index
-from aqualvs.calibration.laser_report import LaserFigures
-from aqualvs.calibration.pose_files import BoardPose
-from aqualvs.calibration.view import View
+from aqualvs.calibration.lasers.report import LaserFigures
+from aqualvs.calibration.targets.pose_files import BoardPose
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, RigError
+from aqualvs.experiments.dome_boards import read_with_errors
+from aqualvs.experiments.laser_box import angle_between, matched, plane_error, remaining
+from aqualvs.experiments.rig_table import band_shares, bending
+from aqualvs.experiments.water_index import decentred, paper_index
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.uncertainty import moved_plane
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.rig import moved_plane
+from aqualvs.simulation.scenarios import example_rig
 
 RIG = example_rig()
 PIXELS = np.array([[20.0, 30.0], [369.0, 282.0], [700.0, 560.0]])

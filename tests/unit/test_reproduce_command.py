@@ -5,15 +5,21 @@ import json
 import numpy as np
 import pytest
 
-from aqualvs.app.overwriting import RECORD, Claim
-from aqualvs.app.progress import hidden_progress, progress
-from aqualvs.app.reproduce import catalogue, records
-from aqualvs.app.reproduce.command import ReproduceRequest, reproduce
-from aqualvs.app.reproduce.experiment import Experiment, Finding, Outcome, Picture, Series
-from aqualvs.app.reproduce.page import PAGE
-from aqualvs.app.reproduce.progress_bar import TYPICAL_S, TimeLeft, left_in_words
-from aqualvs.app.reproduce.style import new_figure
 from aqualvs.errors import OptionError, OutputError
+from aqualvs.experiments import experiment as catalogue
+from aqualvs.experiments import page as records
+from aqualvs.experiments.command import (
+    TYPICAL_S,
+    ReproduceRequest,
+    TimeLeft,
+    left_in_words,
+    reproduce,
+)
+from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.page import PAGE
+from aqualvs.report.figure_style import new_figure
+from aqualvs.results.files import RECORD, Claim
+from aqualvs.terminal import hidden_progress, progress
 
 
 def chart():

@@ -3,19 +3,13 @@
 import numpy as np
 import pytest
 
-from aqualvs.app.reproduce.dome_or_not import Distances, _calibrated_without, distances, level_laser
-from aqualvs.app.reproduce.laboratory import Laboratory, Measured
-from aqualvs.app.reproduce.point_truth import (
-    LitTruth,
-    judge_pixels,
-    judge_reflections,
-    mean_judged,
-)
-from aqualvs.app.reproduce.variants import Variant, told
-from aqualvs.scanning.paper_filter import FilteredPoints
+from aqualvs.experiments.dome_or_not import Distances, _calibrated_without, distances, level_laser
+from aqualvs.experiments.laboratory import Laboratory, Measured, Variant, told
+from aqualvs.experiments.mesh_filter import LitTruth, judge_pixels, judge_reflections, mean_judged
+from aqualvs.scanning.paper.detector import FilteredPoints
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
-from aqualvs.simulation.scenario_file import parse_scenario
+from aqualvs.simulation.scenario import parse_scenario
 
 
 def stripe(n=20, laser=0, v=100.0):
@@ -66,7 +60,7 @@ def test_reflections_count_as_most_of_their_pixels_do():
 
 
 def test_the_mean_leaves_out_what_nothing_is_said_of():
-    from aqualvs.app.reproduce.point_truth import Judged
+    from aqualvs.experiments.mesh_filter import Judged
 
     found = mean_judged([Judged(1.0, 0.4), Judged(np.nan, 0.0)])
     assert found == (1.0, 0.2)

@@ -6,10 +6,9 @@ from html.parser import HTMLParser
 
 import pytest
 
-from aqualvs.app.reproduce.experiment import Finding
-from aqualvs.app.reproduce.page import duration, page_html, write_page
-from aqualvs.app.reproduce.records import Record, Shown
 from aqualvs.errors import OutputError
+from aqualvs.experiments.experiment import Finding
+from aqualvs.experiments.page import Record, Shown, duration, page_html, write_page
 
 NASTY = '<script>alert("1")</script> & $css'
 

@@ -15,7 +15,7 @@ from aqualvs.geometry import rotvec_from_rotation
 from aqualvs.optics.camera import BareCamera, DomeCamera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "rig_from_sample_truth.py"
 

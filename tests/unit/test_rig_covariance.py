@@ -9,22 +9,25 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.optics.assumed import FOCAL_SHARE, assumptions, completed_uncertainty
-from aqualvs.optics.rig import Rig, Window
+from aqualvs.optics.expected_error import see_stripe
+from aqualvs.optics.rig import Rig, RigUncertainty, Window, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.solved import with_exact_numbers, with_uncertainty
-from aqualvs.optics.stripe_view import see_stripe
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
+from aqualvs.optics.solved import (
+    FOCAL_SHARE,
+    assumptions,
+    completed_uncertainty,
+    with_exact_numbers,
+    with_uncertainty,
+)
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
-from aqualvs.scanning.pipeline import Scanner
 from aqualvs.scanning.posture import Posture, range_pitch_yaw
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import Label
 from aqualvs.simulation.truth import visible_fit
 

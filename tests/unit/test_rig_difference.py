@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from aqualvs.check.comparison import rig_difference
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.rig_difference import rig_difference
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
+from aqualvs.simulation.scenarios import example_rig
 
 NONE = RigUncertainty.none()
 RIG = example_rig()

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from aqualvs.live.health import State
-from aqualvs.live.outputs.dds_types import dds_types
+from aqualvs.live.outputs.dds import dds_types
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, to_ros2
 from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
-from aqualvs.live.sample import LiveSample
+from aqualvs.recording.sample import LiveSample
+from aqualvs.sources.base import State
 from live_cases import demo_samples
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,28 +13,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
-from aqualvs.live.health import Health, PartHealth, StageDelay, State
-from aqualvs.live.outputs.axes import FLU_FROM_DOME, plane_pose
-from aqualvs.live.outputs.dds_types import dds_types, type_hash
-from aqualvs.live.outputs.ros1_messages import ROS1_TYPES, to_ros1
+from aqualvs.live.outputs.dds import dds_types, type_hash
+from aqualvs.live.outputs.ros1_links import ROS1_TYPES, to_ros1
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, range_has_variance, to_ros2
 from aqualvs.live.outputs.ros_messages import (
+    FLU_FROM_DOME,
     POINT_FIELDS,
     POINT_TYPE,
     CloudMessage,
+    DiagnosticsMessage,
+    Level,
     Message,
     MessageMaker,
     PoseMessage,
     RangeMessage,
     RosOptions,
+    Status,
     Topic,
+    plane_pose,
 )
-from aqualvs.live.outputs.ros_messages_diagnostics import DiagnosticsMessage, Level, Status
-from aqualvs.live.sample import LiveSample
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
+from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 from live_cases import demo_samples
 
 STORES = {

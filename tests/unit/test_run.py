@@ -12,14 +12,20 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from aqualvs.app.run import run, summary_lines
-from aqualvs.app.run_inputs import FrameWindow, RunRequest, Water, prepared_rig, scanner_options
-from aqualvs.app.stopping import StopSignals
-from aqualvs.app.truth import compare_with_truth
 from aqualvs.errors import AqualvsError, OptionError, OutputError, SourceError
-from aqualvs.live.sources import open_source
 from aqualvs.optics.water import seawater_index_vacuum
-from aqualvs.scanning.pipeline import ScannerOptions
+from aqualvs.pipeline import run, summary_lines
+from aqualvs.results.run_request import (
+    FrameWindow,
+    RunRequest,
+    Water,
+    prepared_rig,
+    scanner_options,
+)
+from aqualvs.results.summary import compare_with_truth
+from aqualvs.scanner import ScannerOptions
+from aqualvs.sources import open_source
+from aqualvs.terminal import StopSignals
 from shell_cases import (
     LumaScanner,
     all_key_frames,
@@ -198,7 +204,7 @@ def test_memory_stays_flat(request_for, tmp_path, monkeypatch):
     import tracemalloc
 
     # What waits for its row group is bounded: here by ten frames.
-    monkeypatch.setattr("aqualvs.app.points_export._ROWS_PER_GROUP", 600)
+    monkeypatch.setattr("aqualvs.results.points._ROWS_PER_GROUP", 600)
     path = write_video(tmp_path / "long.mp4", 60)
     traced = []
 

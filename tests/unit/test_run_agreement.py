@@ -7,19 +7,17 @@ import pytest
 import yaml
 
 from agreement_cases import Diver, Target
-from aqualvs.app.outputs import RunOutputs, prepare_folder
-from aqualvs.app.report import write_report
-from aqualvs.app.run import run, summary_lines
-from aqualvs.app.run_agreement import agreement_of
-from aqualvs.app.run_inputs import RunRequest
-from aqualvs.app.tally import Tally
 from aqualvs.errors import RigError
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rigfile import rig_to_mapping, save_rig
 from aqualvs.optics.solved import with_uncertainty
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by, rig_parameter_names
+from aqualvs.pipeline import agreement_of, run, summary_lines
+from aqualvs.report.run_page import write_report
+from aqualvs.results.folder import RunOutputs, prepare_folder
+from aqualvs.results.run_request import RunRequest
+from aqualvs.results.summary import Tally
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from report_cases import make_dive
 from shell_cases import write_video
 

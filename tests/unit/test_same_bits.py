@@ -4,10 +4,10 @@ from dataclasses import astuple
 
 import numpy as np
 
-from aqualvs.app.demo import bundled_dive
-from aqualvs.live.sources import open_source
+from aqualvs.demo import bundled_dive
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
+from aqualvs.sources import open_source
 
 ROUNDS = 12
 

@@ -5,18 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.simulation.benchmark_dive import TRUTH_COLUMNS, render_with_visible, truth_cells
-from aqualvs.simulation.benchmark_scenarios import (
+from aqualvs.simulation.benchmark import (
     BENCHMARK_NAME,
     LEVELS,
     N_FRAMES,
+    TRUTH_COLUMNS,
     benchmark_checksum,
     benchmark_dives,
     benchmark_rig,
+    render_with_visible,
+    truth_cells,
 )
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scene import Net, Scene, Wall, WaterOptics
-from aqualvs.simulation.trajectory import dome_from_target
 
 DIVES = {dive.name: dive for dive in benchmark_dives()}
 _CLEAR = WaterOptics()

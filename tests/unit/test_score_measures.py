@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.app.score_measures import bars_against, compare, pooled, score
-from aqualvs.app.score_results import Answers
-from aqualvs.app.score_set import DiveTruth
+from aqualvs.experiments.benchmark.measures import bars_against, compare, pooled, score
+from aqualvs.experiments.benchmark.set import Answers, DiveTruth
 
 NAN = math.nan
 

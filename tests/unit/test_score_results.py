@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.app.score_results import read_system
-from aqualvs.app.score_set import BenchmarkSet, DiveTruth, load_set
 from aqualvs.errors import AqualvsError, SourceError
+from aqualvs.experiments.benchmark.set import BenchmarkSet, DiveTruth, load_set, read_system
 
 
 def truth(name, n=3):

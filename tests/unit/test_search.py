@@ -10,9 +10,9 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch, plan_searches
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.scanning.laser_bands import SLOPE_CELL, SearchAxis, StripeSearch, plan_searches
 from aqualvs.simulation.lasers import default_sources
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from windowed_cases import windowed
 
 RIGS = [example_rig, bluerov2_rig]

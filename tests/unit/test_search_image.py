@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from aqualvs.scanning.detection import FrameDetector
+from aqualvs.scanning.detection import FrameDetector, SearchLines
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.search import SearchAxis, plan_searches
-from aqualvs.scanning.search_image import SearchLines
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.simulation.example_rigs import bluerov2_rig
+from aqualvs.simulation.scenarios import bluerov2_rig
 
 U8 = NDArray[np.uint8]
 

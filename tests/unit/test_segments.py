@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.scanning.search import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import CHUNK_LINES, Segments, link_segments
 from aqualvs.scanning.stripe import Returns
 

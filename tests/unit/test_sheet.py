@@ -7,13 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.rays import Rays
-from aqualvs.optics.rig import Laser, Window
-from aqualvs.optics.sheet import Sheet, packed_sheets, sheet_in, sheets_of
-from aqualvs.optics.sheet_kernels import COLUMNS, START
-from aqualvs.optics.uncertainty import moved_plane, tangent_basis
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.geometry.planes import Plane, Rays
+from aqualvs.optics.rig import Laser, Window, moved_plane, tangent_basis
+from aqualvs.optics.sheet import COLUMNS, START, Sheet, packed_sheets, sheet_in, sheets_of
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from optics_cases import central_difference
 from windowed_cases import windowed
 

@@ -9,9 +9,8 @@ import pytest
 
 from aqualvs.errors import OutputError
 from aqualvs.simulation.dive import simulate_dive
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.simulation.scenarios import load_scenario
-from aqualvs.simulation.trajectory import Course, Trajectory
+from aqualvs.simulation.scenario import Course, Trajectory
+from aqualvs.simulation.scenarios import example_rig, load_scenario
 
 # As in the independently rendered samples.
 _COLUMNS = (

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from aqualvs.simulation.lit_points import cast
+from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scene import Label, Net, Scene
 from aqualvs.simulation.surfaces import pack_surfaces
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.truth import cast
 
 # Grooves swing the radius between 1 - 2 * 0.07 and 1 of the clean one, a knot adds up to 0.45.
 _THINNEST, _THICKEST = 0.86, 1.45

@@ -9,14 +9,12 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser
 from aqualvs.simulation import render as render_module
-from aqualvs.simulation.culling import TileMembers, tile_members
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.lasers import default_sources, light_on_points, pack_sheets
-from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import load_scenario
+from aqualvs.simulation.render import Renderer, TileMembers, tile_members
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import Box, Net, Scene, Wall, WaterOptics
-from aqualvs.simulation.sensor import expose, spread
-from aqualvs.simulation.trajectory import dome_from_target
 
 _NO_DIMMING, _DIMMING = (0.0, 0.0, 0.0), (0.3, 0.3, 0.3)
 _CLEAR = WaterOptics(attenuation=(0.0, 0.0, 0.0), sheet_scatter=0.0, forward_scatter=0.0)

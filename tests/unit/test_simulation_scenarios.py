@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.simulation.random_scenes import random_scene
-from aqualvs.simulation.scenarios import list_scenarios, load_scenario
+from aqualvs.simulation.scenarios import list_scenarios, load_scenario, random_scene
 
 
 @pytest.mark.parametrize("name", list_scenarios())

@@ -5,10 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.simulation.lit_points import cast
+from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scene import Box, Bubble, Fish, Label, Scene, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
-from aqualvs.simulation.trajectory import dome_from_target
+from aqualvs.simulation.truth import cast
 
 _AHEAD = dome_from_target(0.6, 0.0, 0.0)
 angle = st.floats(-0.6, 0.6)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
-from aqualvs.simulation.trajectory import Course, Trajectory, dome_from_target
+from aqualvs.simulation.scenario import Course, Trajectory, dome_from_target
 
 
 @given(

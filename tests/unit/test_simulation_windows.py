@@ -9,12 +9,12 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.lasers import Sheets, default_sources, light_on_points, pack_sheets
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from aqualvs.simulation.scene import Box, Label, Net, Scene, Wall, WaterOptics
 from aqualvs.simulation.shading import crossing_sheet
-from aqualvs.simulation.trajectory import dome_from_target
 from windowed_cases import windowed
 
 RIGS = [windowed(example_rig()), windowed(bluerov2_rig())]

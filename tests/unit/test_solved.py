@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_parameter_names
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.solved import (
     SolvedStep,
@@ -22,8 +22,7 @@ from aqualvs.optics.solved import (
     with_step,
     with_uncertainty,
 )
-from aqualvs.optics.uncertainty import RigUncertainty, rig_parameter_names
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 
 def random_covariance(rng: np.random.Generator, n: int, smallest: float) -> FloatArray:

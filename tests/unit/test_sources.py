@@ -12,9 +12,9 @@ import pytest
 from av.video.frame import VideoFrame
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.live.sources import ImageSource, VideoSource, open_source
-from aqualvs.live.sources.planes import planes_of
 from aqualvs.scanning.scan import planes_of_image
+from aqualvs.sources import ImageSource, VideoSource, open_source
+from aqualvs.sources.base import planes_of
 from shell_cases import (
     all_key_frames,
     cut_after,

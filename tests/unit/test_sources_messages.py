@@ -14,10 +14,9 @@ import pyarrow as pa
 import pytest
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.live.recorder.reader import decompressed
-from aqualvs.live.sources import bag_images, open_feed, open_source
-from aqualvs.live.sources.image_messages import ImageMessage, planes_of_message
-from aqualvs.live.sources.image_schemas import protobuf_fields
+from aqualvs.sources import bags, open_feed, open_source
+from aqualvs.sources.image_messages import ImageMessage, planes_of_message, protobuf_fields
+from aqualvs.sources.mcap_file import decompressed
 from shell_cases import luma_level, picture
 
 mcap_writer = pytest.importorskip("mcap.writer")
@@ -268,8 +267,8 @@ def test_packed_bags_are_read_and_never_unpacked_without_bound(tmp_path, monkeyp
     path = PACKED[kind](tmp_path)
     check(open_source(path))
     # A picture has 6 kB.
-    monkeypatch.setattr(bag_images, "MAX_BYTES", 3_000)
-    monkeypatch.setattr(bag_images, "_FREE_BYTES", 1 << 60)
+    monkeypatch.setattr(bags, "MAX_BYTES", 3_000)
+    monkeypatch.setattr(bags, "_FREE_BYTES", 1 << 60)
     with pytest.raises(SourceError, match="unpacked") as fault:
         list(open_source(path))
     assert str(path) in str(fault.value)

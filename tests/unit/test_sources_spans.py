@@ -4,10 +4,16 @@ import av
 import numpy as np
 import pytest
 
-from aqualvs.live.sources import open_source
-from aqualvs.live.sources.nal_units import unit_reader
-from aqualvs.live.sources.span_frames import UnlikeSurveyError, VideoParts, image_frames
-from aqualvs.live.sources.spans import Span, SpanKind, video_spans
+from aqualvs.sources import open_source
+from aqualvs.sources.h264 import unit_reader
+from aqualvs.sources.spans import (
+    Span,
+    SpanKind,
+    UnlikeSurveyError,
+    VideoParts,
+    image_frames,
+    video_spans,
+)
 from shell_cases import cut_after, damage_frame, destroy_frame, grain, packets, write_video
 
 SIZE = (96, 64)

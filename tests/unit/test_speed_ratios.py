@@ -18,12 +18,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import bench_mesh, bench_optics
 from benchmarks.bench_optics import CAMERA
 
-from aqualvs.app.demo import bundled_dive
+from aqualvs.demo import bundled_dive
 from aqualvs.geometry import Plane
-from aqualvs.live.sources import open_source
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.mesh import mesh_filter
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.paper.mesh_filter import mesh_filter
+from aqualvs.sources import open_source
 
 Pair = tuple[Callable[[], object], Callable[[], object]]
 

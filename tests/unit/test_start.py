@@ -5,19 +5,19 @@ import subprocess
 import sys
 from pathlib import Path
 
-from aqualvs.app.demo import bundled_dive
-from aqualvs.app.importing import importing
-from aqualvs.app.progress import progress
+from aqualvs.cli.command import importing
+from aqualvs.demo import bundled_dive
+from aqualvs.terminal import progress
 
 # SciPy's linear algebra is missing here, because compiling a kernel for the first time imports it.
 NOT_FOR_A_RUN = {
     *("scipy.fft", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.special"),
-    *("matplotlib", "pyarrow.compute", "rich", "aqualvs.live.logs", "aqualvs.live.recorder"),
-    *("aqualvs.calibration.index_estimator", "aqualvs.scanning.net_condition"),
+    *("matplotlib", "pyarrow.compute", "rich", "aqualvs.vehicle_logs", "aqualvs.recording"),
+    *("aqualvs.calibration.water_index.estimator", "aqualvs.nets.condition"),
 }
 PROGRAM = """
 import sys
-from aqualvs.app.cli import main
+from aqualvs.cli.main import main
 code = main(sys.argv[1:])
 print(code, *sys.modules)
 """
@@ -34,7 +34,7 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     )
     code, *modules = done.stdout.splitlines()[-1].split()
     assert code == "0"
-    assert {"numba", "pyarrow.parquet", "aqualvs.app.report"} <= set(modules)
+    assert {"numba", "pyarrow.parquet", "aqualvs.report.run_page"} <= set(modules)
     assert not NOT_FOR_A_RUN & set(modules)
 
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aqualvs.control.sticks import PARAMETERS, StickChannel, StickShaping, shaping_of
-from aqualvs.control.tune_model import shaping_of_model
+from aqualvs.control.tune import shaping_of_model
 from aqualvs.control.vehicle import NEUTRAL, Effort
-from aqualvs.simulation.vehicle_models import BLUEROV2, Sticks
+from aqualvs.simulation.vehicle.models import BLUEROV2, Sticks
 
 SHARES = st.floats(-1.0, 1.0)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.stretch_shape import StretchShapes, stretch_shapes
+from aqualvs.scanning.segments import StretchShapes, stretch_shapes
 
 _PX = 0.7e-3  # a pixel on the target, in metres
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.detection import FrameDetector
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.search import SearchAxis, StripeSearch, plan_searches
 from aqualvs.scanning.stripe import Returns, StripeOptions
-from aqualvs.simulation.example_rigs import bluerov2_rig
+from aqualvs.simulation.scenarios import bluerov2_rig
 
 U8 = NDArray[np.uint8]
 Chroma = tuple[U8, U8]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from aqualvs.calibration.stripe_points import StripePoints
-from aqualvs.calibration.stripes_on_planes import (
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    StripePoints,
     Surfaces,
     board_surface,
     box_surfaces,
@@ -12,10 +12,9 @@ from aqualvs.calibration.stripes_on_planes import (
     solve_on_surface,
 )
 from aqualvs.errors import CalibrationError
-from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.rays import Rays
+from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.geometry.transforms import SE3
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 from laser_cases import BOX_PLANES, box, box_corners, dome_from_box
 
 

@@ -9,13 +9,13 @@ import pytest
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.readings import Readings, read_returns
-from aqualvs.scanning.search import SearchAxis, plan_searches
+from aqualvs.scanning.candidates import Readings, read_returns
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import Lit, everywhere, returns_of, strands
 
 NOISE_PX = 0.15

@@ -2,12 +2,17 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.calibration.detection import detect_markers
-from aqualvs.calibration.markers import read_markers
-from aqualvs.calibration.tag_corners import marker_cells, refine_tags
-from aqualvs.calibration.tag_model import N_UNKNOWNS, _coverage, tag_sums
-from aqualvs.calibration.target_files import load_box, load_target
-from aqualvs.calibration.view import View
+from aqualvs.calibration.detection.boards import read_markers
+from aqualvs.calibration.detection.detection import detect_markers
+from aqualvs.calibration.detection.tag_corners import (
+    N_UNKNOWNS,
+    _coverage,
+    marker_cells,
+    refine_tags,
+    tag_sums,
+)
+from aqualvs.calibration.targets.target_files import load_box, load_target
+from aqualvs.calibration.targets.targets import View
 from target_cases import homography, picture, seen, striped, tag_cells
 
 _FAMILY = "DICT_APRILTAG_36h11"

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from aqualvs.app.target_file import target_facts
 from aqualvs.errors import OptionError
-from aqualvs.scanning.mesh import MeshFilterOptions
+from aqualvs.nets.target_file import target_facts
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.target import TargetKind
 
 

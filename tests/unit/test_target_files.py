@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from aqualvs.calibration.target_files import (
+from aqualvs.calibration.targets.target_files import (
     load_board,
     load_box,
     load_target,
     save_board,
     save_markers,
 )
-from aqualvs.calibration.targets import BoardKind, MarkerSet
+from aqualvs.calibration.targets.targets import BoardKind, MarkerSet
 from aqualvs.errors import CalibrationError, OutputError
 from aqualvs.geometry.planes import Plane
 from target_cases import charuco, chessboard

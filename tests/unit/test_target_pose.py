@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 
-from aqualvs.calibration.start import square_rotation, start_pose, thinned, turned_square
-from aqualvs.calibration.target_pose import TargetPose, target_pose
-from aqualvs.calibration.view import View
+from aqualvs.calibration.solver.initial_pose import (
+    TargetPose,
+    square_rotation,
+    start_pose,
+    target_pose,
+    thinned,
+    turned_square,
+)
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from dome_cases import AIR, WATER, board_points, pose_difference, see
 
 BOARD = board_points(10, 7, 0.024)

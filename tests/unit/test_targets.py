@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.calibration.targets import (
+from aqualvs.calibration.targets.targets import (
     DICTIONARIES,
     Board,
     BoardKind,

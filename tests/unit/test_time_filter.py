@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from aqualvs.control.time_filter import FilteredPosture, PostureFilter, PostureFilterOptions
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.time_filter import FilteredPosture, PostureFilter, PostureFilterOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 
 NOTHING = Refusal(Reason.NO_STRIPES)

@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from aqualvs.live.logs import (
+from aqualvs.vehicle_logs import (
     Interpolation,
     OffsetRefusal,
     PostureTrack,

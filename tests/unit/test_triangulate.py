@@ -12,8 +12,8 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.triangulate import Triangulation, Triangulator
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
 from aqualvs.simulation.lasers import default_sources
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from windowed_cases import windowed
 
 RIGS = [example_rig, bluerov2_rig]

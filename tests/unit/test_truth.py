@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from aqualvs.app.truth import read_truth
+from aqualvs.results.summary import read_truth
 
 _LIT = "visible_fit_range_mm,visible_fit_pitch_deg,visible_fit_yaw_deg"
 

@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.app.tune import TuneRequest, tune_and_tell
 from aqualvs.control.gains_file import VEHICLES as PACKAGED
 from aqualvs.control.gains_file import gains_text, load_gains
-from aqualvs.control.tune import Tuned, TuneOptions, tune, usable_gains
-from aqualvs.control.tune_margins import Loop, margins
-from aqualvs.control.tune_model import facts_of
-from aqualvs.control.tune_step import StepOptions, simulate_step
+from aqualvs.control.tune import Loop, Tuned, TuneOptions, facts_of, margins, tune, usable_gains
 from aqualvs.errors import OptionError
-from aqualvs.simulation.vehicle_models import BLUEROV2, BLUEROV2_HEAVY, VEHICLES, VIDEORAY
+from aqualvs.follow.tune import StepOptions, TuneRequest, simulate_step, tune_and_tell
+from aqualvs.simulation.vehicle.models import BLUEROV2, BLUEROV2_HEAVY, VEHICLES, VIDEORAY
 
 
 @pytest.fixture(scope="module")

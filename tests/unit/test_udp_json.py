@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aqualvs.app.posture_csv import POSTURE_COLUMNS, posture_row
+from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
-from aqualvs.live.health import Health, State
-from aqualvs.live.outputs.udp_json import UdpJsonOutput
-from aqualvs.live.outputs.udp_json_line import json_fields, json_line
-from aqualvs.live.sample import LiveSample
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.live.outputs.udp_json import UdpJsonOutput, json_fields, json_line
+from aqualvs.recording.sample import LiveSample
+from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
 from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.sources.base import Health, State
 from live_cases import first_sample
 from ports import free_port
 from waiting import PATIENCE_S, until

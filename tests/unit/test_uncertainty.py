@@ -7,10 +7,10 @@ import pytest
 
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import rotvec_from_rotation
-from aqualvs.optics.rig import Laser, Window
-from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.uncertainty import (
+from aqualvs.optics.rig import (
+    Laser,
     RigUncertainty,
+    Window,
     combined,
     laser_parameter_names,
     merged,
@@ -19,7 +19,8 @@ from aqualvs.optics.uncertainty import (
     rig_parameter_names,
     tangent_basis,
 )
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.simulation.scenarios import example_rig
 
 A, B, C = "fx", "fy", "k1"
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.control.tune_model import facts_of, shaping_of_model
+from aqualvs.control.tune import facts_of, shaping_of_model
 from aqualvs.control.vehicle import Effort
 from aqualvs.errors import OptionError
-from aqualvs.simulation.vehicle import SimulatedVehicle, level_pose
-from aqualvs.simulation.vehicle_autopilot import mix_inputs, pack_pilot, thrust_of
-from aqualvs.simulation.vehicle_models import (
+from aqualvs.simulation.vehicle.dynamics import mix_inputs, pack_pilot, thrust_of
+from aqualvs.simulation.vehicle.models import (
     BLUEROV2,
     BLUEROV2_HEAVY,
     VEHICLES,
@@ -20,8 +19,8 @@ from aqualvs.simulation.vehicle_models import (
     ThrustCurve,
     VehicleModel,
 )
-from aqualvs.simulation.vehicle_sensors import Sensor, Sensors
-from aqualvs.simulation.water_motion import WaterMotion, Waves
+from aqualvs.simulation.vehicle.vehicle import Sensor, Sensors, SimulatedVehicle, level_pose
+from aqualvs.simulation.vehicle.water_motion import WaterMotion, Waves
 
 MODELS = pytest.mark.parametrize("model", VEHICLES.values(), ids=VEHICLES)
 VECTORED = pytest.mark.parametrize("model", [BLUEROV2_HEAVY, BLUEROV2], ids=["heavy", "standard"])

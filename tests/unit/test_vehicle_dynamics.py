@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.simulation.vehicle import pack_body, pose_of, state_at
-from aqualvs.simulation.vehicle_kernels import N_STATE, Body, coast, make_work
-from aqualvs.simulation.vehicle_models import (
+from aqualvs.simulation.vehicle.dynamics import N_STATE, Body, coast, make_work
+from aqualvs.simulation.vehicle.models import (
     BLUEROV2,
     BLUEROV2_HEAVY,
     VEHICLES,
@@ -19,7 +18,8 @@ from aqualvs.simulation.vehicle_models import (
     Thruster,
     VehicleModel,
 )
-from aqualvs.simulation.water_motion import Flow, Tether, WaterMotion, Waves
+from aqualvs.simulation.vehicle.vehicle import pack_body, pose_of, state_at
+from aqualvs.simulation.vehicle.water_motion import Flow, Tether, WaterMotion, Waves
 
 MODELS = pytest.mark.parametrize("model", VEHICLES.values(), ids=VEHICLES)
 STEP = 1.0 / 400.0

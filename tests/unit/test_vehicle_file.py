@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.live.ardusub_link_commands import Command
-from aqualvs.live.vehicle_file import VehicleSetup, load_vehicle
+from aqualvs.live.mavlink.ardusub_commands import Command
+from aqualvs.live.options import VehicleSetup, load_vehicle
 
 
 def write(folder: Path, text: str) -> Path:

@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.live.logs import Interpolation, Signal, VehicleLog, VehiclePlaces, read_vehicle_log
-from aqualvs.live.logs.place import ned_from_dome_of
-from aqualvs.live.logs.signals import bearing_of, wrap
+from aqualvs.vehicle_logs import Interpolation, Signal, VehicleLog, VehiclePlaces, read_vehicle_log
+from aqualvs.vehicle_logs.vehicle_log import bearing_of, ned_from_dome_of, wrap
 
 TABLE = "time_s,depth_m,heading_deg\n0,1,350\n1,2,10\n2,3,30\n"
 

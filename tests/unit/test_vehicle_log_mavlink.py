@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import SourceError
-from aqualvs.live.logs import VehicleLog, read_vehicle_log
-from aqualvs.live.logs.mavlink_frames import MESSAGES, read_frames
+from aqualvs.vehicle_logs import VehicleLog, read_vehicle_log
+from aqualvs.vehicle_logs.mavlink_frames import MESSAGES, read_frames
 
 START_US = 1_700_000_000_000_000
 SEEDS = {0: 50, 30: 39, 33: 104, 74: 20, 137: 195}

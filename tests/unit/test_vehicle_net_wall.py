@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.scanning.paraboloid import Patch, flat_patch, nearest_tangent
 from aqualvs.scanning.posture import range_pitch_yaw
-from aqualvs.scanning.quadric import Patch, flat_patch, nearest_tangent
-from aqualvs.simulation.example_rigs import example_rig
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Box, Fish, Fold, Net, Scene, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
 

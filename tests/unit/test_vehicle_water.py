@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
-from aqualvs.simulation.vehicle import pack_body, state_at
-from aqualvs.simulation.vehicle_kernels import coast, make_work
-from aqualvs.simulation.vehicle_models import BLUEROV2_HEAVY
-from aqualvs.simulation.water_motion import GRAVITY, Tether, WaterMotion, Waves
+from aqualvs.simulation.vehicle.dynamics import coast, make_work
+from aqualvs.simulation.vehicle.models import BLUEROV2_HEAVY
+from aqualvs.simulation.vehicle.vehicle import pack_body, state_at
+from aqualvs.simulation.vehicle.water_motion import GRAVITY, Tether, WaterMotion, Waves
 
 SEEDS = st.integers(0, 1000)
 SEA = Waves(amplitude=0.4, period=5.0, direction=0.7, n=6)

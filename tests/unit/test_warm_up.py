@@ -2,10 +2,10 @@
 
 import pytest
 
-from aqualvs.live.warm_up import warm_up
+from aqualvs.live.runner import warm_up
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
-from aqualvs.simulation.example_rigs import bluerov2_rig, example_rig
+from aqualvs.scanner import Scanner
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
 
 @pytest.mark.parametrize("rig", [example_rig(), bluerov2_rig()], ids=["576", "1080"])

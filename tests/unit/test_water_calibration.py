@@ -6,21 +6,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.index_estimator import IndexEstimator
-from aqualvs.calibration.index_frame import MOST_POINTS, Frame
-from aqualvs.calibration.index_prior import IndexPrior
-from aqualvs.calibration.index_reading import IndexOptions, IndexReading
-from aqualvs.calibration.index_steps import StepTest
-from aqualvs.calibration.pose_steps import moved_target
-from aqualvs.calibration.view import View
-from aqualvs.calibration.water import N_WATER, calibrate_water
+from aqualvs.calibration.solver.bundle import moved_target
+from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.water_index.estimator import (
+    N_WATER,
+    IndexEstimator,
+    StepTest,
+    calibrate_water,
+)
+from aqualvs.calibration.water_index.filter import MOST_POINTS, Frame
+from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexReading
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.uncertainty import RigUncertainty, rig_moved_by
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.water import seawater_index_vacuum
-from aqualvs.simulation.example_rigs import example_rig
+from aqualvs.simulation.scenarios import example_rig
 
 FPS = 25.0
 RIG = example_rig()

@@ -20,13 +20,13 @@ from typing import Any
 import pytest
 
 import aqualvs
-from aqualvs.app.demo import bundled_dive
-from aqualvs.app.run import run
-from aqualvs.app.run_inputs import FrameWindow, RunRequest
-from aqualvs.live.sources import open_source
+from aqualvs.demo import bundled_dive
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.pipeline import run
+from aqualvs.results.run_request import FrameWindow, RunRequest
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame
+from aqualvs.sources import open_source
 
 DIVE = Path(str(bundled_dive() / "dive.mp4"))
 RIG = Path(str(bundled_dive() / "rig.yaml"))
@@ -175,7 +175,7 @@ def test_decoded_pictures_are_not_copied() -> None:
 
 def test_memory_of_a_run_is_flat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Points wait for a row group of Parquet to be full: of a hundred frames, and here of three.
-    monkeypatch.setattr("aqualvs.app.points_export._ROWS_PER_GROUP", 1 << 12)
+    monkeypatch.setattr("aqualvs.results.points._ROWS_PER_GROUP", 1 << 12)
     # Tables are written as they come: a run of twice the frames holds no more, once all that
     # is read ahead is there. The 80 more frames would bring 4 MiB if only their points were kept.
     measure(tmp_path / "out", 10)

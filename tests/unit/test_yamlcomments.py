@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import RigError
 from aqualvs.optics.rigfile import load_rig, save_rig
-from aqualvs.simulation.example_rigs import example_rig
-from aqualvs.yamlcomments import carry_comments
-from aqualvs.yamlfile import parse_yaml
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.yamlfile import carry_comments, parse_yaml
 
 HAND_WRITTEN = """\
 # Camera no. 4, new dome since May.

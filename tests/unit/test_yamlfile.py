@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 import yaml
 
-from aqualvs.app.batch.dive_lists import read_list
-from aqualvs.app.design.file import load_design
-from aqualvs.app.nominal import load_nominal
-from aqualvs.app.report_run import read_run_file
-from aqualvs.app.runfile import read_run_yaml
-from aqualvs.app.score_set import SET_FILE, load_set
-from aqualvs.app.target_file import target_facts
-from aqualvs.calibration.target_files import load_board, load_box, load_target
+from aqualvs.batch.dives import read_list
+from aqualvs.calibrate.common import load_nominal
+from aqualvs.calibration.targets.target_files import load_board, load_box, load_target
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.plan import load_plan
+from aqualvs.design.file import load_design
 from aqualvs.errors import AqualvsError, RigError
+from aqualvs.experiments.benchmark.set import SET_FILE, load_set
+from aqualvs.nets.target_file import target_facts
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.simulation.scenario_file import read_scenario
+from aqualvs.report.run_data import read_run_file
+from aqualvs.results.run_request import read_run_yaml
+from aqualvs.simulation.scenario import read_scenario
 from aqualvs.yamlfile import MAX_BYTES, MAX_DEPTH, MAX_VALUES, parse_yaml, read_text, read_yaml
 
 SOURCES = Path(__file__).parents[2] / "src" / "aqualvs"

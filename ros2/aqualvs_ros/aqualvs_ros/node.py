@@ -9,13 +9,13 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
+from aqualvs.control.time_filter import PostureFilter
 from aqualvs.errors import AqualvsError
 from aqualvs.live.outputs.ros_messages import RosOptions
 from aqualvs.live.runner import FixedScanner, LiveRunner
-from aqualvs.live.sources.opening import open_feed
-from aqualvs.live.time_filter import PostureFilter
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.scanner import Scanner
+from aqualvs.sources.opening import open_feed
 from aqualvs_ros.output import RclpyOutput
 
 PARAMETERS: dict[str, Any] = {

@@ -4,10 +4,10 @@ import array
 import importlib
 from typing import Any
 
-from aqualvs.live.health import PartHealth, State
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, to_ros2
 from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
-from aqualvs.live.sample import LiveSample
+from aqualvs.recording.sample import LiveSample
+from aqualvs.sources.base import PartHealth, State
 
 _DEPTH = 5
 _PARTS = (

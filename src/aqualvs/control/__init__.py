@@ -1,1 +1,4 @@
-"""Closing the loop: controllers, missions and the rules that keep vehicle and net whole."""
+"""Control of the vehicle: controllers, missions, gains and safety.
+
+Imports the scanner; knows no link and no thread.
+"""

@@ -3,10 +3,9 @@
 import math
 from dataclasses import dataclass
 
-from aqualvs.control.answer import AnswerWatch
 from aqualvs.control.controller import RangeYawController
-from aqualvs.control.mission import Guidance, Mission, Stage
-from aqualvs.control.safety import Reason, SafetyGate
+from aqualvs.control.missions import Guidance, Mission, Stage
+from aqualvs.control.safety import AnswerWatch, Reason, SafetyGate
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture, Refusal

@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 
 from aqualvs.control.autopilot import Decision
-from aqualvs.control.missions_follow import bearing_of
+from aqualvs.control.missions import bearing_of
 from aqualvs.control.vehicle import VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray

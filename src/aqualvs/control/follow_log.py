@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from aqualvs.control.autopilot import Decision
-from aqualvs.control.missions_follow import bearing_of
+from aqualvs.control.missions import bearing_of
 from aqualvs.control.vehicle import VehicleState
 from aqualvs.errors import OutputError
 from aqualvs.scanning.posture import Posture, Refusal

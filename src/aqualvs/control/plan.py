@@ -7,12 +7,20 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from aqualvs.control.mission import HoldMission, LossOptions, Mission
-from aqualvs.control.missions_follow import FollowMission, LegOptions, Sector
-from aqualvs.control.missions_survey import SurveyMission, SurveyOptions, Turn
+from aqualvs.control.gains_file import NotNegative, Number, Part, Positive, load_settings
+from aqualvs.control.missions import (
+    FollowMission,
+    HoldMission,
+    LegOptions,
+    LossOptions,
+    Mission,
+    Sector,
+    SurveyMission,
+    SurveyOptions,
+    Turn,
+)
 from aqualvs.control.safety import SafetyLimits
-from aqualvs.control.setpoint import Setpoint, SetpointHolder
-from aqualvs.control.settings_text import NotNegative, Number, Part, Positive, load_settings
+from aqualvs.control.vehicle import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
 
 VERSION = 1

@@ -19,28 +19,243 @@ Yaw: the autopilot keeps turning rates with a lag, that of its shaping, its rate
 thrusters; L(s) = (kp s + ki) / s² / (lag s + 1) exp(-delay s) with ki = 0.15 kp², and kp the
 greatest for the same margin, the rate loop being as calculated or, in the thrusters' dead band,
 several times slower.
+
+What a controller should know of a simulated vehicle.
+
+How far a loop is from instability: the delay and the gain that may still be added to it.
 """
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.control.gains import (
     ControlGains,
+    Drag,
+    Layout,
     RangeGains,
+    ThrustMap,
     VehicleFacts,
     YawGains,
     gain_schedule,
 )
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.tune_margins import Loop, Margins, margins, worst
-from aqualvs.control.tune_model import Turning, facts_of, tidy, turning_of
+from aqualvs.control.sticks import StickChannel, StickShaping
 from aqualvs.errors import OptionError
-from aqualvs.simulation.vehicle_models import VehicleModel
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.simulation.vehicle.models import FORWARD, RIGHT, YAW, VehicleModel
+
+
+def facts_of(model: VehicleModel) -> VehicleFacts:
+    """Return what a controller should know of a simulated vehicle, its pilot gain included."""
+    sticks, shaping = model.sticks, shaping_of_model(model)
+    return VehicleFacts(
+        name=model.name,
+        mass=tidy(model.mass + model.added_mass[0]),
+        forward_drag=Drag(model.linear_drag[0], model.quadratic_drag[0]),
+        right_drag=Drag(model.linear_drag[1], model.quadratic_drag[1]),
+        thrust=_thrust_map(model),
+        turning_rate=math.radians(tidy(math.degrees(sticks.turning_rate * shaping.turning_share))),
+        climb_rate=tidy(sticks.climb_rate * shaping.climbing_share),
+        dome_forward=model.dome_position[0],
+    )
+
+
+def shaping_of_model(model: VehicleModel) -> StickShaping:
+    """Return what a link must take out of a simulated vehicle's sticks."""
+    sticks, own = model.sticks, StickShaping()
+    yaw, forward, right = sticks.trims
+    return StickShaping(
+        gain=sticks.gain,
+        throttle_dead_zone=sticks.throttle_dead_zone,
+        throttle=own.throttle,
+        yaw=StickChannel(trim=yaw, dead_zone=sticks.yaw_dead_zone),
+        forward=StickChannel(trim=forward),
+        right=StickChannel(trim=right),
+    )
+
+
+def _thrust_map(model: VehicleModel) -> ThrustMap:
+    """Return thrust over effort: the thrusters' curve, as far as the pilot gain lets it."""
+    curve, gain = model.curve, model.sticks.gain
+    travel = (gain - curve.dead_band) / (1.0 - curve.dead_band)
+    if not travel > 0.0:
+        raise OptionError(
+            f"vehicle {model.name}: pilot gain {gain:g} stays in the thrusters' dead band "
+            f"{curve.dead_band:g}; raise the gain"
+        )
+    straight = curve.linear * travel
+    bent = (1.0 - curve.linear) * travel * travel
+    along, mixing = model.allocation(), model.mixing()
+    askew = bool(np.any((mixing[:, FORWARD] != 0.0) & (mixing[:, RIGHT] != 0.0)))
+
+    def most(axis: int, column: int, sign: float) -> float:
+        drive = sign * along[axis] * mixing[:, column]
+        runs_forward = sign * mixing[:, column] > 0.0
+        each = np.where(runs_forward, curve.forward, curve.reverse)
+        return tidy(float(np.sum(np.abs(drive) * each)) * (straight + bent))
+
+    return ThrustMap(
+        forward=most(0, FORWARD, 1.0),
+        backward=most(0, FORWARD, -1.0),
+        right=most(1, RIGHT, 1.0),
+        dead_band=tidy(curve.dead_band / gain),
+        linear=tidy(straight / (straight + bent)),
+        layout=Layout.VECTORED if askew else Layout.STRAIGHT,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Turning:
+    """How late a vehicle's own autopilot follows a turning rate, in seconds.
+
+    The shaping of the stick, the thrusters' lag, and the rate loop: inertia over the moment that it
+    gives for a rate.
+
+    Attributes
+    ----------
+    shaping, thrusters, rate_loop : float
+    """
+
+    shaping: float
+    thrusters: float
+    rate_loop: float
+
+    def lag(self, slower: float = 1.0) -> float:
+        """Return the whole, with a rate loop that is so many times slower."""
+        return self.shaping + self.thrusters + slower * self.rate_loop
+
+
+def turning_of(model: VehicleModel) -> Turning:
+    """Return how late a model's autopilot follows a turning rate."""
+    curve = model.curve
+    lever = float(np.abs(model.allocation()[5] @ model.mixing()[:, YAW]))
+    each = 0.5 * (curve.forward + curve.reverse) * curve.linear / (1.0 - curve.dead_band)
+    inertia = model.inertia[2] + model.added_mass[5]
+    rate_loop = inertia / (model.autopilot.rate[2] * lever * each)
+    return Turning(model.autopilot.input_time, curve.lag, rate_loop)
+
+
+def tidy(value: float) -> float:
+    """Return a number rounded to what a file for people should hold: four digits."""
+    return float(f"{value:.4g}")
+
+
+ComplexArray: TypeAlias = NDArray[np.complex128]
+
+# From a slow drift to what thrusters no longer follow, in rad/s.
+_OMEGA = np.geomspace(1e-2, 1e2, 1600)
+_PADE = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """An open loop: numerator over denominator, polynomials in s, and a delay.
+
+    Attributes
+    ----------
+    above, below : array
+        Coefficients, highest power first.
+    delay : float
+        In seconds.
+    """
+
+    above: FloatArray
+    below: FloatArray
+    delay: float
+
+    def at(self, omega: FloatArray) -> ComplexArray:
+        """Return the response at frequencies in rad/s, shape (N,)."""
+        s = 1j * omega
+        ratio = np.polyval(self.above, s) / np.polyval(self.below, s)
+        return np.asarray(ratio * np.exp(-self.delay * s), dtype=np.complex128)
+
+    def poles(self) -> ComplexArray:
+        """Return the poles of the closed loop, the delay as a Padé approximant of order 4.
+
+        That approximant's phase is right within a degree up to 4 rad / delay; crossovers lie below.
+        """
+        lag = _pade(self.delay)
+        lead = lag * (-1.0) ** np.arange(len(lag) - 1, -1, -1)
+        closed = np.polyadd(np.polymul(self.below, lag), np.polymul(self.above, lead))
+        return np.asarray(np.roots(closed), dtype=np.complex128)
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Of one loop.
+
+    Attributes
+    ----------
+    stable : bool
+        The others mean nothing where it is False.
+    crossover : float
+        Highest frequency at which the loop's gain is 1, in rad/s; NaN if there is none.
+    phase : float
+        Least phase that may still be lost at such a frequency, in radians.
+    gain : float
+        Factor by which the gain may grow.
+    delay : float
+        That may be added, in seconds.
+    modulus : float
+        Least distance of the loop from -1; 1 / modulus is the greatest amplification of a
+        disturbance.
+    """
+
+    stable: bool
+    crossover: float
+    phase: float
+    gain: float
+    delay: float
+    modulus: float
+
+
+def margins(loop: Loop) -> Margins:
+    """Return the margins of a loop."""
+    along = loop.at(_OMEGA)
+    size = np.abs(along)
+    # Phase beyond -180 degrees, 0 to 2 pi: what is left where the gain is 1.
+    left = np.mod(np.angle(along) + math.pi, 2.0 * math.pi)
+    ones = np.flatnonzero((size[:-1] > 1.0) != (size[1:] > 1.0))
+    return Margins(
+        stable=bool(loop.poles().real.max() < 0.0),
+        crossover=float(_OMEGA[ones[-1]]) if len(ones) else math.nan,
+        phase=min((float(left[k]) for k in ones), default=math.inf),
+        gain=_gain_margin(along),
+        delay=min((float(left[k] / _OMEGA[k]) for k in ones), default=math.inf),
+        modulus=float(np.min(np.abs(1.0 + along))),
+    )
+
+
+def worst(of: Iterable[Margins]) -> Margins:
+    """Return the margins that are nearest to instability."""
+    return min(of, key=lambda one: (one.stable, one.modulus))
+
+
+def _gain_margin(along: ComplexArray) -> float:
+    """Return the least factor above 1 that brings the curve to -1."""
+    turns = np.flatnonzero((along.imag[:-1] < 0.0) != (along.imag[1:] < 0.0))
+    crossings = -along.real[turns]
+    factors = 1.0 / crossings[(crossings > 0.0) & (crossings < 1.0)]
+    return float(factors.min()) if len(factors) else math.inf
+
+
+def _pade(delay: float) -> FloatArray:
+    """Return the denominator of exp(-delay s); the numerator is that of -s."""
+    n = _PADE
+    terms = [
+        math.factorial(2 * n - k) / (math.factorial(k) * math.factorial(n - k)) * delay**k
+        for k in range(n, -1, -1)
+    ]
+    # A vanishing delay leaves zeros in front, which are no powers of s.
+    return np.trim_zeros(np.array(terms) / terms[-1], "f")
+
 
 _POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.3, 0.25, 0.15
 _SWELL = 1.2

@@ -1,7 +1,6 @@
 """Rigid transforms, rays and planes."""
 
-from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.rays import Rays
+from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 
 __all__ = ["SE3", "Plane", "Rays", "rotation_from_rotvec", "rotvec_from_rotation"]

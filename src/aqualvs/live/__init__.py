@@ -1,1 +1,4 @@
-"""Sources of frames and outputs of posture."""
+"""The live loop, its health, outputs, MAVLink and the pilot's page.
+
+Imports sources, control, recording and results.
+"""

@@ -1,27 +1,187 @@
-"""The output that closes the loop: each sample becomes an effort, or none."""
+"""The output that closes the loop: each sample becomes an effort, or none.
+
+Stops the thrusters when the loop that steers them does not come round.
+
+What the pilot's page and the health list show of the pilot that aqualvs is.
+"""
 
 import logging
+import math
 import threading
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from aqualvs.control.autopilot import Decision, Motion, NetPilot
-from aqualvs.control.mission import HoldMission
+from aqualvs.control.missions import Guidance, HoldMission
 from aqualvs.control.safety import Reason
-from aqualvs.control.setpoint import SetpointHolder
-from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleLink, VehicleState
+from aqualvs.control.time_filter import FilteredPosture
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, SetpointHolder, VehicleLink, VehicleState
 from aqualvs.errors import OptionError
-from aqualvs.live.health import PartHealth, State
-from aqualvs.live.pilot_report import PilotReport, words_of
-from aqualvs.live.pilot_watchdog import Watchdog
-from aqualvs.live.sample import LiveSample
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.posture import Reason as NoPosture
+from aqualvs.sources.base import PartHealth, State
+
+_LOOK_S = 0.02
+_log = logging.getLogger(__name__)
+
+
+class Watchdog:
+    """Passes efforts on, and sends neutral after one that nobody renews.
+
+    Neither a frame that takes seconds to measure nor a controller that hangs must leave thrust
+    standing; the vehicle's own fail-safe comes later, and does not act while others send it sticks.
+
+    Parameters
+    ----------
+    vehicle : VehicleLink
+    patience_s : float
+        So long an effort may stand.
+
+    Attributes
+    ----------
+    n_barks : int
+        How often it had to act.
+    """
+
+    def __init__(self, vehicle: VehicleLink, patience_s: float) -> None:
+        self._vehicle, self._patience_s = vehicle, patience_s
+        # Only ever held for a call that returns at once, so that nothing can keep neutral back.
+        self._sending = threading.Lock()
+        self._known_s = float("-inf")
+        self._thrusting = threading.Event()
+        self._closing = threading.Event()
+        self.n_barks = 0
+        self._thread = threading.Thread(target=self._run, name="pilot watchdog", daemon=True)
+        self._thread.start()
+
+    def send(self, effort: Effort, known_s: float) -> Effort:
+        """Send an effort, or neutral in its place if it is too old already; return what was sent.
+
+        Parameters
+        ----------
+        effort : Effort
+        known_s : float
+            When what it rests on was known, by `time.monotonic`.
+
+        Raises
+        ------
+        OSError, ValueError
+            As `VehicleLink.send`.
+        """
+        with self._sending:
+            if time.monotonic() - known_s > self._patience_s:
+                effort = NEUTRAL
+            self._known_s = known_s
+            # Before it is sent: one that went out in spite of an error is stopped all the same.
+            if effort == NEUTRAL:
+                self._thrusting.clear()
+            else:
+                self._thrusting.set()
+            self._vehicle.send(effort)
+        return effort
+
+    def close(self) -> None:
+        """End the thread; further calls do nothing."""
+        self._closing.set()
+        self._thrusting.set()
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        self._thrusting.wait()
+        while not self._closing.wait(_LOOK_S):
+            self._look()
+            self._thrusting.wait()
+
+    def _look(self) -> None:
+        """Stop the thrusters if their effort has stood for too long."""
+        with self._sending:
+            late_s = time.monotonic() - self._known_s
+            if not self._thrusting.is_set() or late_s <= self._patience_s:
+                return
+            try:
+                self._vehicle.send(NEUTRAL)
+            except OSError:
+                # Tried again in a moment.
+                return
+            self._thrusting.clear()
+            self.n_barks += 1
+        _log.warning("no new posture for %.2f s: neutral", late_s)
+
+
+_TELL_MODE = (
+    Reason.PILOT_MODE,
+    Reason.NO_STATION,
+    Reason.IGNORED,
+    Reason.CONFLICT,
+    Reason.UNKNOWN_MODE,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PilotReport:
+    """One step of the pilot.
+
+    Attributes
+    ----------
+    at_ns : int
+        By `time.monotonic_ns`.
+    frame : int
+        Number of the frame that it rests on; the last one's where the stream is silent.
+    engaged : bool
+        Whether efforts go out.
+    effort : Effort
+        What was sent; neutral where nothing was.
+    reason : Reason or None
+        Why it is not what the controller asked for.
+    guidance : Guidance
+        What the mission wants.
+    state : VehicleState
+        What the vehicle told.
+    """
+
+    at_ns: int
+    frame: int
+    engaged: bool
+    effort: Effort
+    reason: Reason | None
+    guidance: Guidance
+    state: VehicleState
+
+    @property
+    def words(self) -> str:
+        """What it does, or why it does not, in one line."""
+        told = words_of(self.reason, self.state) if self.reason else _aim(self.guidance)
+        return f"{told}; {self.state.doubt}" if self.engaged and self.state.doubt else told
+
+    @property
+    def colour(self) -> State:
+        """How it is, for the health list."""
+        if not self.engaged:
+            return State.OFF
+        return State.WARN if self.reason or self.state.doubt else State.OK
+
+
+def words_of(reason: Reason, state: VehicleState) -> str:
+    """Return why efforts do not pass, with what the vehicle says of it."""
+    told = state.mode_name if reason in _TELL_MODE else ""
+    if reason is Reason.CONFLICT and state.mode is not Mode.CONFLICT:
+        told = state.rival
+    return f"{reason.words} ({told})" if told else reason.words
+
+
+def _aim(guidance: Guidance) -> str:
+    """Return what a mission aims at."""
+    setpoint = guidance.setpoint
+    if setpoint is None:
+        return guidance.stage.value.replace("_", " ")
+    aim = f"{setpoint.range:.2f} m, yaw {math.degrees(setpoint.yaw):.0f} deg"
+    sway = f", {guidance.sway:+.2f} m/s to the right" if guidance.sway else ""
+    return f"{guidance.stage.value.replace('_', ' ')}: {aim}{sway}"
+
 
 # Datagrams may be lost. A pilot who holds his sticks is not to be disturbed: one will do.
 _GOODBYES, _GOODBYES_TO_STICKS = 3, 1
-_log = logging.getLogger(__name__)
 
 
 class Pilot:

@@ -1,32 +1,321 @@
-"""The live loop: the latest frame in, a sample to every output; nothing stops it but its owner."""
+"""The live loop: the latest frame in, a sample to every output; nothing stops it but its owner.
+
+Making a scanner ready, so that the first frame of a stream does not wait for it.
+
+Runs one output so that whatever happens to it disturbs nothing else.
+
+Handing frames from the thread that decodes to the one that measures, without adding delay.
+
+The thread that moves frames from a feed to the mailbox.
+"""
 
 import logging
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Protocol, Self
 
+import cv2
+import numpy as np
+
+from aqualvs.control.time_filter import PostureFilter
 from aqualvs.errors import AqualvsError
-from aqualvs.live.frame_reader import FrameReader
-from aqualvs.live.frozen import FrozenOptions, FrozenPicture
-from aqualvs.live.health import Health
-from aqualvs.live.health_monitor import HealthMonitor
-from aqualvs.live.mailbox import Arrival, Mailbox
-from aqualvs.live.output_worker import OutputWorker
+from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture, HealthMonitor
 from aqualvs.live.outputs.base import Output
-from aqualvs.live.sample import Instants, LiveSample
-from aqualvs.live.sources.feed import Feed
-from aqualvs.live.time_filter import PostureFilter
+from aqualvs.optics.expected_error import see_stripe
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.pipeline import Scanner
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.recording.sample import Instants, LiveSample
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
-from aqualvs.scanning.search import SearchAxis
 from aqualvs.scanning.stripe import Returns
+from aqualvs.sources.base import Feed, Health, PartHealth, State
+
+_GREY, _LIGHT, _THICK_PX, _BLUR_PX = 30, 150, 3, 1.2
+_ROUNDS = 2
+
+
+def warm_up(scanner: Scanner) -> Scan:
+    """Let a scanner measure made-up pictures, which loads its compiled kernels.
+
+    Returns
+    -------
+    scan : Scan
+        Of a wall in the middle of the working range, square to the vehicle.
+    """
+    frame = wall_frame(scanner.rig)
+    for _ in range(_ROUNDS):
+        scan = scanner.process(frame)
+    return scan
+
+
+def wall_frame(rig: Rig) -> Frame:
+    """Return a picture of the stripes on a wall in the middle of the working range."""
+    camera = rig.camera()
+    width, height = rig.size_px
+    luma = np.full((height, width), _GREY, np.uint8)
+    for sheet in sheets_of(rig):
+        stripe = see_stripe(camera, sheet, 0.5 * sum(rig.working_range))
+        # OpenCV takes fixed-point coordinates, here in 1/16 px.
+        pixels = np.rint(16.0 * stripe.pixels).astype(np.int32)
+        cv2.polylines(luma, [pixels], False, _LIGHT, _THICK_PX, cv2.LINE_AA, shift=4)
+    luma = np.asarray(cv2.GaussianBlur(luma, (0, 0), _BLUR_PX), np.uint8)
+    half = (-(-width // 2), -(-height // 2))
+    lit = cv2.resize(luma, half, interpolation=cv2.INTER_AREA).astype(np.float64) - _GREY
+    u = np.clip(120.0 - 0.4 * lit, 0.0, 255.0).astype(np.uint8)
+    return Frame(0, 0.0, luma, (u, np.full_like(u, 110)))
+
+
+# Samples that a recorder may be behind, which keep their pictures: 300 MB at 1920x1080.
+_QUEUE = 100
+_PATIENCE_S = 5.0
+_log = logging.getLogger(__name__)
+
+
+class OutputWorker:
+    """Hands samples to an output, in a thread of its own unless the output never waits.
+
+    Parameters
+    ----------
+    output : Output
+        Owned from here on.
+    """
+
+    def __init__(self, output: Output) -> None:
+        self._output = output
+        self._trouble = ""
+        self._n_dropped = 0
+        self._waiting: deque[LiveSample] = deque()
+        self._room = _QUEUE if output.keeps_all else 1
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        if not output.inline:
+            self._thread = threading.Thread(target=self._work, name=output.name, daemon=True)
+            self._thread.start()
+
+    @property
+    def name(self) -> str:
+        """Name of the output."""
+        return self._output.name
+
+    def offer(self, sample: LiveSample) -> None:
+        """Pass a sample on; returns at once."""
+        if self._thread is None:
+            self._send(sample)
+            return
+        with self._changed:
+            if len(self._waiting) >= self._room:
+                self._waiting.popleft()
+                self._n_dropped += 1
+            self._waiting.append(sample)
+            self._changed.notify()
+
+    def health(self) -> PartHealth:
+        """Return how the output is, with what could not be handed to it."""
+        try:
+            found = self._output.health()
+        except Exception as fault:
+            return PartHealth(self.name, State.FAULT, f"{fault}", self._n_dropped)
+        trouble = self._trouble
+        if trouble:
+            found = PartHealth(found.name, State.FAULT, trouble, found.n_dropped)
+        elif self._output.keeps_all and self._n_dropped and found.state is State.OK:
+            found = replace(found, state=State.WARN)
+        return replace(found, n_dropped=found.n_dropped + self._n_dropped)
+
+    def close(self) -> None:
+        """Let what waits go out, for a few seconds at most, and close the output."""
+        if self._thread is not None:
+            with self._changed:
+                self._closing = True
+                self._changed.notify()
+            self._thread.join(_PATIENCE_S)
+            if self._thread.is_alive():
+                _log.warning("%s: did not end in time", self.name)
+        try:
+            self._output.close()
+        except Exception:
+            _log.exception("%s: closing failed", self.name)
+
+    def _work(self) -> None:
+        while (sample := self._next()) is not None:
+            self._send(sample)
+
+    def _next(self) -> LiveSample | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closing)
+            return self._waiting.popleft() if self._waiting else None
+
+    def _send(self, sample: LiveSample) -> None:
+        try:
+            self._output.send(sample)
+        except Exception as fault:
+            told = f"{fault}" or type(fault).__name__
+            if told != self._trouble:
+                _log.warning("%s: %s", self.name, told)
+            self._trouble = told
+        else:
+            self._trouble = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A frame and when it came.
+
+    Attributes
+    ----------
+    frame : Frame
+    arrived_ns : int
+        By `time.monotonic_ns`.
+    utc_ns : int
+        By the system clock.
+    """
+
+    frame: Frame
+    arrived_ns: int
+    utc_ns: int
+
+
+class Mailbox:
+    """Room for one frame: the latest.
+
+    Parameters
+    ----------
+    keep_every : bool
+        Let the writer wait until its frame has been taken, instead of replacing one that has not.
+
+    Attributes
+    ----------
+    n_dropped : int
+        Frames that were replaced by a newer one before anybody took them.
+    """
+
+    def __init__(self, *, keep_every: bool = False) -> None:
+        self.n_dropped = 0
+        self._keep_every = keep_every
+        self._changed = threading.Condition()
+        self._waiting: Arrival | None = None
+        self._closed = False
+
+    def put(self, frame: Frame) -> None:
+        """Leave a frame; after `close` it is thrown away."""
+        arrival = Arrival(frame, time.monotonic_ns(), time.time_ns())
+        with self._changed:
+            if self._keep_every:
+                self._changed.wait_for(lambda: self._waiting is None or self._closed)
+            if self._closed:
+                return
+            self.n_dropped += self._waiting is not None
+            self._waiting = arrival
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> Arrival | None:
+        """Take the frame that is there, or wait for one; None if there is none in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting is not None or self._closed, timeout_s)
+            arrival, self._waiting = self._waiting, None
+            self._changed.notify_all()
+        return arrival
+
+    def close(self) -> None:
+        """No more frames come; one that waits can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no frame waits and none will come."""
+        with self._changed:
+            return self._closed and self._waiting is None
+
+
+# A feed promises to end within a second of being closed.
+_READER_PATIENCE_S = 3.0
+# After a fault that nobody foresaw the feed is begun again.
+_AGAIN_S = 1.0
+
+
+class FrameReader:
+    """Reads a feed in a thread of its own; a context manager.
+
+    Parameters
+    ----------
+    feed : Feed
+    mailbox : Mailbox
+        Closed when the feed ends.
+
+    Attributes
+    ----------
+    n_lost : int
+        Frames that the feed could not decode, by the gaps in their numbers.
+    fault : AqualvsError or None
+        What ended the feed, if it did not end by itself.
+    """
+
+    def __init__(self, feed: Feed, mailbox: Mailbox) -> None:
+        self.n_lost = 0
+        self.fault: AqualvsError | None = None
+        self._feed, self._mailbox = feed, mailbox
+        self._trouble = ""
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._read, name="frames", daemon=True)
+
+    def health(self) -> PartHealth:
+        """Return how the feed is."""
+        if self.fault is not None:
+            return PartHealth(self._feed.name, State.FAULT, str(self.fault))
+        if self._trouble:
+            return PartHealth(self._feed.name, State.FAULT, self._trouble)
+        return self._feed.health()
+
+    def __enter__(self) -> Self:
+        """Begin to read."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the feed and the thread."""
+        self._closing.set()
+        self._feed.close()
+        self._mailbox.close()
+        self._thread.join(_READER_PATIENCE_S)
+        if self._thread.is_alive():
+            _log.warning("%s: did not end in time", self._feed.name)
+
+    def _read(self) -> None:
+        try:
+            while not self._closing.is_set():
+                try:
+                    return self._move()
+                except AqualvsError as fault:
+                    self.fault = fault
+                    return None
+                except Exception as fault:
+                    # The thread must not die without a word: the pilot would see an old picture.
+                    _log.exception("%s: reading failed; trying again", self._feed.name)
+                    self._trouble = f"{type(fault).__name__}: {fault}"
+                    self._closing.wait(_AGAIN_S)
+        finally:
+            self._mailbox.close()
+
+    def _move(self) -> None:
+        expected = None
+        for frame in self._feed:
+            if expected is not None:
+                self.n_lost += max(0, frame.index - expected)
+            expected = frame.index + 1
+            self._trouble = ""
+            self._mailbox.put(frame)
+
 
 # How often a silent stream is told to the outputs, and a request to stop is looked for.
 _SILENT_EVERY_S, _LOOK_EVERY_S, _HEALTH_EVERY_S = 0.1, 0.05, 0.1
-_log = logging.getLogger(__name__)
 
 
 class ScannerSupply(Protocol):

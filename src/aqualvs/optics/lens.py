@@ -1,5 +1,16 @@
-"""The lens: pixels to directions in `cam` and back, with OpenCV's two distortion models."""
+"""The lens: pixels to directions in `cam` and back, with OpenCV's two distortion models.
 
+Batch kernels of the lens: rows of pixels to rows of directions and back.
+
+Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`.
+
+The hot kernels work in blocks: rows of coordinates are copied into one flat scratch array, each
+quantity in a row of its own, and loops of constant length without branches run over it. One array
+and constant offsets let LLVM prove that nothing overlaps and use vector instructions; whatever
+needs a branch is done lane by lane in between.
+"""
+
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -8,10 +19,218 @@ from numpy.typing import ArrayLike
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
-from aqualvs.optics import lens_batch
-from aqualvs.optics.lens_fisheye import fisheye_limits
-from aqualvs.optics.lens_opencv import opencv_limits
-from aqualvs.optics.lens_params import LensParams
+from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.optics.lens_kernels import (
+    ROUNDS,
+    LensParams,
+    fisheye_direction,
+    fisheye_distort,
+    fisheye_limits,
+    lens_direction_jacobian,
+    lens_pixel,
+    lens_pixel_jacobian,
+    opencv_limits,
+    opencv_undistort_guarded,
+    opencv_undistort_round,
+    opencv_undistort_start,
+)
+
+# Lanes a block holds: enough to drown the loop's overhead, few enough to stay in the first cache.
+BLOCK = 128
+# Rows of the scratch array of `directions_block`: distorted coordinates in, unit direction and a
+# sign (positive where valid) out.
+XD, YD, DX, DY, DZ, LENS_OK = (i_row * BLOCK for i_row in range(6))
+N_LENS_ROWS = 6
+
+
+@inline_kernel
+def load_pixels(
+    lens: LensParams, pixels: FloatArray, start: int, count: int, w: FloatArray
+) -> None:
+    """Write the distorted coordinates of `count` pixels from row `start` into the scratch `w`."""
+    inverse_x, inverse_y = 1.0 / lens.fx, 1.0 / lens.fy
+    for j in range(count):
+        w[XD + j] = (pixels[start + j, 0] - lens.cx) * inverse_x
+        w[YD + j] = (pixels[start + j, 1] - lens.cy) * inverse_y
+
+
+@inline_kernel
+def directions_block(lens: LensParams, count: int, w: FloatArray) -> None:
+    """Turn distorted coordinates into unit directions, all lanes of a block at once.
+
+    Lanes from `count` on hold leftovers: computed, because a fixed length vectorises, and ignored.
+    """
+    if lens.fisheye:
+        for j in range(count):
+            ok, w[DX + j], w[DY + j], w[DZ + j] = fisheye_direction(lens, w[XD + j], w[YD + j])
+            w[LENS_OK + j] = 1.0 if ok else -1.0
+        return
+    undistort_block(lens, count, w)
+    for j in range(BLOCK):
+        x, y = w[DX + j], w[DY + j]
+        z = 1.0 / math.sqrt(1.0 + x * x + y * y)
+        w[DX + j], w[DY + j], w[DZ + j] = x * z, y * z, z
+
+
+@inline_kernel
+def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
+    """Turn distorted into normalised coordinates in DX, DY, all lanes of a block."""
+    for j in range(BLOCK):
+        xd, yd = w[XD + j], w[YD + j]
+        w[DX + j], w[DY + j] = opencv_undistort_start(lens, xd, yd)
+        w[LENS_OK + j] = 0.0 if xd * xd + yd * yd <= lens.limit_distorted else -1.0
+    n_open = count
+    for _ in range(ROUNDS):
+        if n_open == 0:
+            return
+        for j in range(BLOCK):
+            x, y, solved = opencv_undistort_round(lens, w[XD + j], w[YD + j], w[DX + j], w[DY + j])
+            w[DX + j], w[DY + j] = x, y
+            w[LENS_OK + j] = 1.0 if solved & (w[LENS_OK + j] >= 0.0) else w[LENS_OK + j]
+        n_open = 0
+        for j in range(count):
+            n_open += w[LENS_OK + j] == 0.0
+    for j in range(count):
+        if w[LENS_OK + j] == 0.0:
+            ok, w[DX + j], w[DY + j] = opencv_undistort_guarded(lens, w[XD + j], w[YD + j])
+            w[LENS_OK + j] = 1.0 if ok else -1.0
+
+
+@kernel
+def directions_all(
+    lens: LensParams, pixels: FloatArray, directions: FloatArray, valid: BoolArray
+) -> None:
+    """Write directions (N, 3) of pixels (N, 2)."""
+    w = np.zeros(N_LENS_ROWS * BLOCK)
+    for start in range(0, pixels.shape[0], BLOCK):
+        count = min(BLOCK, pixels.shape[0] - start)
+        load_pixels(lens, pixels, start, count, w)
+        directions_block(lens, count, w)
+        for j in range(count):
+            ok = w[LENS_OK + j] > 0.0
+            valid[start + j] = ok
+            directions[start + j, 0] = w[DX + j] if ok else np.nan
+            directions[start + j, 1] = w[DY + j] if ok else np.nan
+            directions[start + j, 2] = w[DZ + j] if ok else np.nan
+
+
+@kernel
+def directions_jacobian_all(
+    lens: LensParams,
+    pixels: FloatArray,
+    directions: FloatArray,
+    valid: BoolArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write directions (N, 3) of pixels (N, 2) with their Jacobians (N, 3, 2)."""
+    for i in range(pixels.shape[0]):
+        ok, d, d_u, d_v = lens_direction_jacobian(lens, pixels[i, 0], pixels[i, 1])
+        valid[i] = ok
+        for k in range(3):
+            directions[i, k] = d[k] if ok else np.nan
+            jacobian[i, k, 0] = d_u[k] if ok else np.nan
+            jacobian[i, k, 1] = d_v[k] if ok else np.nan
+
+
+@kernel
+def pixels_all(
+    lens: LensParams, directions: FloatArray, pixels: FloatArray, valid: BoolArray
+) -> None:
+    """Write pixels (N, 2) of directions (N, 3)."""
+    for i in range(directions.shape[0]):
+        ok, u, v = lens_pixel(lens, directions[i, 0], directions[i, 1], directions[i, 2])
+        valid[i] = ok
+        pixels[i, 0] = u if ok else np.nan
+        pixels[i, 1] = v if ok else np.nan
+
+
+@kernel
+def pixels_jacobian_all(
+    lens: LensParams,
+    directions: FloatArray,
+    pixels: FloatArray,
+    valid: BoolArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write pixels (N, 2) of directions (N, 3) with their Jacobians (N, 2, 3)."""
+    for i in range(directions.shape[0]):
+        ok, u, v, u_d, v_d = lens_pixel_jacobian(
+            lens, directions[i, 0], directions[i, 1], directions[i, 2]
+        )
+        valid[i] = ok
+        pixels[i, 0] = u if ok else np.nan
+        pixels[i, 1] = v if ok else np.nan
+        for k in range(3):
+            jacobian[i, 0, k] = u_d[k] if ok else np.nan
+            jacobian[i, 1, k] = v_d[k] if ok else np.nan
+
+
+@kernel
+def intrinsics_jacobian_all(
+    lens: LensParams, directions: FloatArray, valid: BoolArray, jacobian: FloatArray
+) -> None:
+    """Write derivatives (N, 2, 4 + n) of pixels by fx, fy, cx, cy and n distortion coefficients."""
+    for i in range(directions.shape[0]):
+        if valid[i]:
+            write_intrinsics_jacobian(
+                lens, directions[i, 0], directions[i, 1], directions[i, 2], jacobian[i]
+            )
+        else:
+            jacobian[i] = np.nan
+
+
+@inline_kernel
+def write_intrinsics_jacobian(
+    lens: LensParams, x: float, y: float, z: float, jacobian: FloatArray
+) -> None:
+    """Write d(u, v) / d(fx, fy, cx, cy, distortion...) of one direction into (2, 4 + n)."""
+    jacobian[:] = 0.0
+    if lens.fisheye:
+        _write_fisheye(lens, x, y, z, jacobian)
+    else:
+        _write_opencv(lens, x / z, y / z, jacobian)
+    jacobian[0, 2] = 1.0
+    jacobian[1, 3] = 1.0
+
+
+@inline_kernel
+def _write_opencv(lens: LensParams, x: float, y: float, jacobian: FloatArray) -> None:
+    q = x * x + y * y
+    inverse = 1.0 / (1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6)))
+    f = (1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))) * inverse
+    cross = 2.0 * (lens.p1 * y + lens.p2 * x)
+    jacobian[0, 0] = x * (f + cross) + lens.p2 * q
+    jacobian[1, 1] = y * (f + cross) + lens.p1 * q
+    # Order of OpenCV: k1 k2 p1 p2 k3 k4 k5 k6.
+    by_coefficient = (
+        (x * q * inverse, y * q * inverse),
+        (x * q * q * inverse, y * q * q * inverse),
+        (2.0 * x * y, q + 2.0 * y * y),
+        (q + 2.0 * x * x, 2.0 * x * y),
+        (x * q * q * q * inverse, y * q * q * q * inverse),
+        (-x * f * q * inverse, -y * f * q * inverse),
+        (-x * f * q * q * inverse, -y * f * q * q * inverse),
+        (-x * f * q * q * q * inverse, -y * f * q * q * q * inverse),
+    )
+    for k in range(jacobian.shape[1] - 4):
+        jacobian[0, 4 + k] = lens.fx * by_coefficient[k][0]
+        jacobian[1, 4 + k] = lens.fy * by_coefficient[k][1]
+
+
+@inline_kernel
+def _write_fisheye(lens: LensParams, x: float, y: float, z: float, jacobian: FloatArray) -> None:
+    radius = math.sqrt(x * x + y * y)
+    theta = math.atan2(radius, z)
+    value, _ = fisheye_distort(lens, theta)
+    ex = x / radius if radius > 0.0 else 0.0
+    ey = y / radius if radius > 0.0 else 0.0
+    jacobian[0, 0], jacobian[1, 1] = value * ex, value * ey
+    power = theta
+    for k in range(jacobian.shape[1] - 4):
+        power = power * theta * theta
+        jacobian[0, 4 + k] = lens.fx * power * ex
+        jacobian[1, 4 + k] = lens.fy * power * ey
+
 
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
@@ -103,9 +322,7 @@ class Lens:
         """
         p = as_vectors(pixels, 2, "pixels")
         directions, valid = _empty(p, 3), np.empty(p.shape[:-1], dtype=np.bool_)
-        lens_batch.directions_all(
-            self.params, p.reshape(-1, 2), directions.reshape(-1, 3), valid.reshape(-1)
-        )
+        directions_all(self.params, p.reshape(-1, 2), directions.reshape(-1, 3), valid.reshape(-1))
         return directions, valid
 
     def directions_with_jacobian(
@@ -115,7 +332,7 @@ class Lens:
         p = as_vectors(pixels, 2, "pixels")
         directions, valid = _empty(p, 3), np.empty(p.shape[:-1], dtype=np.bool_)
         jacobian = _empty(p, 3, 2)
-        lens_batch.directions_jacobian_all(
+        directions_jacobian_all(
             self.params,
             p.reshape(-1, 2),
             directions.reshape(-1, 3),
@@ -141,9 +358,7 @@ class Lens:
         """
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
         pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
-        lens_batch.pixels_all(
-            self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1)
-        )
+        pixels_all(self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
 
     def pixels_with_jacobian(
@@ -153,7 +368,7 @@ class Lens:
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
         pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
         jacobian = _empty(d, 2, 3)
-        lens_batch.pixels_jacobian_all(
+        pixels_jacobian_all(
             self.params,
             d.reshape(-1, 3),
             pixels.reshape(-1, 2),
@@ -178,7 +393,7 @@ class Lens:
         pixels, valid, jacobian = self.pixels_with_jacobian(d)
         n_parameters = 4 + len(self.distortion)
         by_parameter = _empty(d, 2, n_parameters)
-        lens_batch.intrinsics_jacobian_all(
+        intrinsics_jacobian_all(
             self.params,
             d.reshape(-1, 3),
             valid.reshape(-1),

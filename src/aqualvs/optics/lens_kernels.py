@@ -1,11 +1,314 @@
-"""Scalar kernels of a lens of either model, with exact Jacobians."""
+"""Scalar kernels of a lens of either model, with exact Jacobians.
+
+A lens as compiled kernels take it.
+
+The distortion of OpenCV's fisheye model (Kannala and Brandt 2006) and its inverse.
+
+The distortion of OpenCV's pinhole model, its exact Jacobian and its inverse.
+
+"Normalised" coordinates are x/z and y/z of a direction in `cam`, "distorted" ones are those after
+the distortion: (u - cx)/fx and (v - cy)/fy.
+"""
 
 import math
+from typing import NamedTuple, TypeAlias
 
-from aqualvs.geometry.compiled import inline_kernel
-from aqualvs.optics.lens_fisheye import fisheye_distort, fisheye_undistort
-from aqualvs.optics.lens_opencv import opencv_distort, opencv_undistort
-from aqualvs.optics.lens_params import LensParams, Vector
+from aqualvs.geometry.compiled import inline_kernel, kernel
+
+Vector: TypeAlias = tuple[float, float, float]
+"""A vector as scalar kernels take and return it."""
+
+
+class LensParams(NamedTuple):
+    """Numbers of a lens; `Lens.params` makes it.
+
+    Attributes
+    ----------
+    fisheye : bool
+        Model: equidistant fisheye, else the rational model of OpenCV.
+    fx, fy, cx, cy : float
+        Pixels.
+    k1, k2, p1, p2, k3, k4, k5, k6 : float
+        Distortion; the fisheye model uses k1 to k4.
+    limit : float
+        Where the distortion stops being monotone: squared normalised radius (opencv), angle to
+        the axis in radians (fisheye).
+    limit_distorted : float
+        Squared distorted radius that nothing inside `limit` exceeds.
+    """
+
+    fisheye: bool
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+    k3: float
+    k4: float
+    k5: float
+    k6: float
+    limit: float
+    limit_distorted: float
+
+
+_STEPS_AT_MOST = 60
+# A Newton step below this leaves an error of its square.
+_STEP_SOLVED = 1e-9
+
+
+@inline_kernel
+def fisheye_distort(lens: LensParams, theta: float) -> tuple[float, float]:
+    """Return the distorted angle and its derivative with respect to theta."""
+    q = theta * theta
+    value = theta * (1.0 + q * (lens.k1 + q * (lens.k2 + q * (lens.k3 + q * lens.k4))))
+    slope = 1.0 + q * (
+        3.0 * lens.k1 + q * (5.0 * lens.k2 + q * (7.0 * lens.k3 + q * 9.0 * lens.k4))
+    )
+    return value, slope
+
+
+@inline_kernel
+def fisheye_undistort(lens: LensParams, radius: float) -> tuple[bool, float, float]:
+    """Solve fisheye_distort(theta) = radius; returns (valid, theta, slope there).
+
+    Newton's method kept inside a bracket: the map is monotone up to `limit`.
+    """
+    low, high = 0.0, lens.limit
+    if not radius * radius < lens.limit_distorted:
+        return False, 0.0, 1.0
+    theta = min(radius, 0.5 * high)
+    for _ in range(_STEPS_AT_MOST):
+        value, slope = fisheye_distort(lens, theta)
+        error = radius - value
+        if error > 0.0:
+            low = theta
+        else:
+            high = theta
+        following = theta + error / slope
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        done = abs(following - theta) <= _STEP_SOLVED
+        theta = following
+        if done:
+            break
+    value, slope = fisheye_distort(lens, theta)
+    return True, theta, slope
+
+
+@kernel
+def fisheye_limits(lens: LensParams) -> tuple[float, float]:
+    """Return `LensParams.limit`, at most pi, and `limit_distorted`."""
+    inside, outside = 0.0, math.pi
+    for i_step in range(1, 1025):
+        outside = math.pi * i_step / 1024.0
+        if not fisheye_distort(lens, outside)[1] > 0.0:
+            break
+        inside = outside
+    while outside - inside > 1e-15:
+        middle = 0.5 * (inside + outside)
+        if not inside < middle < outside:
+            break
+        if fisheye_distort(lens, middle)[1] > 0.0:
+            inside = middle
+        else:
+            outside = middle
+    widest, _ = fisheye_distort(lens, inside)
+    return inside, widest * widest
+
+
+# The last of three steps uses the slopes of the second, so its error is the product of the last
+# two: a step below this leaves less than a rounding.
+STEP_SOLVED = 1e-11
+# Rounds of three steps: one is enough for ordinary lenses, two for the corners of wide ones.
+ROUNDS = 2
+_HALVINGS_AT_MOST = 40
+# Residual, in distorted coordinates near 1, at which a guarded solution counts: some roundings.
+_RESIDUAL_SOLVED = 1e-14
+_SPOKES = 32
+# The distorted radius between two spokes may exceed that on both, by tangential terms.
+_BETWEEN_SPOKES = 1.02
+
+
+@inline_kernel
+def opencv_distort(
+    lens: LensParams, x: float, y: float
+) -> tuple[float, float, float, float, float]:
+    """Return the distorted (xd, yd) and the symmetric Jacobian (j_xx, j_xy, j_yy) at (x, y)."""
+    q = x * x + y * y
+    numerator = 1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))
+    numerator_slope = lens.k1 + q * (2.0 * lens.k2 + q * 3.0 * lens.k3)
+    inverse = 1.0 / (1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6)))
+    denominator_slope = lens.k4 + q * (2.0 * lens.k5 + q * 3.0 * lens.k6)
+    f = numerator * inverse
+    two_slope = 2.0 * (numerator_slope - f * denominator_slope) * inverse
+    cross = 2.0 * (lens.p1 * y + lens.p2 * x)
+    xd = x * (f + cross) + lens.p2 * q
+    yd = y * (f + cross) + lens.p1 * q
+    j_xx = f + x * x * two_slope + cross + 4.0 * lens.p2 * x
+    j_xy = x * y * two_slope + 2.0 * (lens.p1 * x + lens.p2 * y)
+    j_yy = f + y * y * two_slope + cross + 4.0 * lens.p1 * y
+    return xd, yd, j_xx, j_xy, j_yy
+
+
+@inline_kernel
+def opencv_pull(lens: LensParams, xd: float, yd: float, x: float, y: float) -> tuple[float, float]:
+    """Return (distort(x, y) - (xd, yd)) times the denominator of the rational model."""
+    q = x * x + y * y
+    numerator = 1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))
+    denominator = 1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6))
+    cross = 2.0 * (lens.p1 * y + lens.p2 * x)
+    return (
+        x * numerator + (cross * x + lens.p2 * q - xd) * denominator,
+        y * numerator + (cross * y + lens.p1 * q - yd) * denominator,
+    )
+
+
+@inline_kernel
+def _newton(
+    lens: LensParams, xd: float, yd: float, x: float, y: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return (x, y) after a Newton step on `opencv_pull` and the inverse slopes it used."""
+    q = x * x + y * y
+    numerator = 1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))
+    denominator = 1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6))
+    a = 2.0 * lens.k1 + q * (4.0 * lens.k2 + q * 6.0 * lens.k3)
+    b = 2.0 * lens.k4 + q * (4.0 * lens.k5 + q * 6.0 * lens.k6)
+    cross = 2.0 * (lens.p1 * y + lens.p2 * x)
+    tx, ty = cross * x + lens.p2 * q - xd, cross * y + lens.p1 * q - yd
+    gx, gy = x * numerator + tx * denominator, y * numerator + ty * denominator
+    ax, ay = a * x + b * tx, a * y + b * ty
+    shear = 2.0 * (lens.p1 * x + lens.p2 * y) * denominator
+    g_xx = numerator + x * ax + (cross + 4.0 * lens.p2 * x) * denominator
+    g_yy = numerator + y * ay + (cross + 4.0 * lens.p1 * y) * denominator
+    g_xy, g_yx = y * ax + shear, x * ay + shear
+    inverse = 1.0 / (g_xx * g_yy - g_xy * g_yx)
+    i_xx, i_xy, i_yx, i_yy = g_yy * inverse, -g_xy * inverse, -g_yx * inverse, g_xx * inverse
+    return x - (i_xx * gx + i_xy * gy), y - (i_yx * gx + i_yy * gy), i_xx, i_xy, i_yx, i_yy
+
+
+@inline_kernel
+def opencv_undistort_start(lens: LensParams, xd: float, yd: float) -> tuple[float, float]:
+    """Return (xd, yd) without its own radial factor, where that is not far from one."""
+    q = xd * xd + yd * yd
+    numerator = 1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))
+    denominator = 1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6))
+    scale = denominator / numerator if numerator > 0.5 * denominator else 1.0
+    return xd * scale, yd * scale
+
+
+@inline_kernel
+def opencv_undistort_round(
+    lens: LensParams, xd: float, yd: float, x: float, y: float
+) -> tuple[float, float, bool]:
+    """Return (x, y, solved) after two Newton steps and one more with the slopes of the second.
+
+    No branches. Solved means to machine precision and inside the limit.
+    """
+    x, y, _, _, _, _ = _newton(lens, xd, yd, x, y)
+    x, y, i_xx, i_xy, i_yx, i_yy = _newton(lens, xd, yd, x, y)
+    gx, gy = opencv_pull(lens, xd, yd, x, y)
+    sx, sy = i_xx * gx + i_xy * gy, i_yx * gx + i_yy * gy
+    x, y = x - sx, y - sy
+    return x, y, (abs(sx) + abs(sy) < STEP_SOLVED) & (x * x + y * y < lens.limit)
+
+
+@kernel
+def opencv_undistort_guarded(lens: LensParams, xd: float, yd: float) -> tuple[bool, float, float]:
+    """Solve distort(x, y) = (xd, yd) inside the limit, slowly and surely.
+
+    Newton's method from the image centre; every step that leaves the limit or does not lower the
+    residual is halved. Returns (found, x, y).
+    """
+    x, y = 0.0, 0.0
+    residual = math.hypot(xd, yd)
+    if not residual * residual <= lens.limit_distorted or residual == math.inf:
+        return False, x, y
+    solved = _RESIDUAL_SOLVED * (1.0 + residual)
+    ax, ay, j_xx, j_xy, j_yy = opencv_distort(lens, x, y)
+    for _ in range(_STEPS_AT_MOST):
+        inverse = 1.0 / (j_xx * j_yy - j_xy * j_xy)
+        ex, ey = xd - ax, yd - ay
+        sx, sy = (j_yy * ex - j_xy * ey) * inverse, (j_xx * ey - j_xy * ex) * inverse
+        better = False
+        for _half in range(_HALVINGS_AT_MOST):
+            tx, ty = x + sx, y + sy
+            if tx * tx + ty * ty < lens.limit:
+                ax, ay, j_xx, j_xy, j_yy = opencv_distort(lens, tx, ty)
+                trial = math.hypot(xd - ax, yd - ay)
+                better = trial < residual
+                if better or residual <= solved:
+                    break
+            sx, sy = 0.5 * sx, 0.5 * sy
+        if not better:
+            break
+        x, y, residual = tx, ty, trial
+    return residual <= solved, x, y
+
+
+@inline_kernel
+def opencv_undistort(lens: LensParams, xd: float, yd: float) -> tuple[bool, float, float]:
+    """Solve distort(x, y) = (xd, yd) to machine precision; returns (valid, x, y)."""
+    x, y = opencv_undistort_start(lens, xd, yd)
+    for _ in range(ROUNDS):
+        x, y, solved = opencv_undistort_round(lens, xd, yd, x, y)
+        if solved:
+            return True, x, y
+    return opencv_undistort_guarded(lens, xd, yd)
+
+
+@inline_kernel
+def _determinant(lens: LensParams, x: float, y: float) -> float:
+    _, _, j_xx, j_xy, j_yy = opencv_distort(lens, x, y)
+    # Beyond two sign changes the determinant is positive again, the trace is not.
+    return j_xx * j_yy - j_xy * j_xy if j_xx + j_yy > 0.0 else -1.0
+
+
+@kernel
+def opencv_limits(lens: LensParams) -> tuple[float, float]:
+    """Return `LensParams.limit` and `limit_distorted`.
+
+    The first is the squared radius of the largest disc round the image centre with a positive
+    Jacobian determinant, searched along spokes in steps of a quarter of a degree and by halving.
+    """
+    limit = math.inf
+    for i_spoke in range(_SPOKES):
+        phi = 2.0 * math.pi * i_spoke / _SPOKES
+        limit = min(limit, _limit_on_spoke(lens, math.cos(phi), math.sin(phi), limit))
+    if limit == math.inf:
+        return limit, limit
+    widest = 0.0
+    for i_spoke in range(_SPOKES):
+        phi, radius = 2.0 * math.pi * i_spoke / _SPOKES, math.sqrt(limit)
+        xd, yd, _, _, _ = opencv_distort(lens, radius * math.cos(phi), radius * math.sin(phi))
+        widest = max(widest, xd * xd + yd * yd)
+    return limit, _BETWEEN_SPOKES * widest
+
+
+@inline_kernel
+def _limit_on_spoke(lens: LensParams, ex: float, ey: float, limit: float) -> float:
+    """Return the squared radius of the first sign change along (ex, ey), at most `limit`."""
+    inside = 0.0
+    for i_step in range(1, 360):
+        outside = math.tan(i_step * math.pi / 720.0)
+        last = outside * outside >= limit
+        if last:
+            outside = math.sqrt(limit)
+        if _determinant(lens, outside * ex, outside * ey) > 0.0:
+            inside = outside
+            if last:
+                return limit
+            continue
+        for _ in range(60):
+            middle = 0.5 * (inside + outside)
+            if _determinant(lens, middle * ex, middle * ey) > 0.0:
+                inside = middle
+            else:
+                outside = middle
+        return inside * inside
+    return math.inf
 
 
 @inline_kernel

@@ -1,6 +1,9 @@
-"""The rig: one camera, its housing, the water and the lasers, in SI units."""
+"""The rig: one camera, its housing, the water and the lasers, in SI units.
 
-from collections.abc import Mapping
+How well a rig is known: the joint covariance of its numbers, and how a rig moves by them.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,7 +12,16 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.camera import BareCamera, Camera, Dome, DomeCamera
+from aqualvs.optics.camera import (
+    DOME_PARAMETERS,
+    POSE_PARAMETERS,
+    BareCamera,
+    Camera,
+    DomeCamera,
+    moved_lens,
+    moved_pose,
+)
+from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
 
 DOME_FROM_CAM_NOMINAL: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -124,3 +136,183 @@ class Rig:
     def in_water(self, n_water: float) -> "Rig":
         """Return the same rig in a medium of another index."""
         return replace(self, n_water=n_water)
+
+
+LASER_PARAMETERS = ("tilt_1", "tilt_2", "offset")
+"""Small changes of a laser plane: rotations of its normal towards `tangent_basis` (radians), and
+of its offset (metres)."""
+LASER_WINDOW_PARAMETERS = (
+    "window_tilt_1",
+    "window_tilt_2",
+    "window_offset",
+    "source_1",
+    "source_2",
+)
+"""The same of a laser's window, and shifts (metres) of the source along the `tangent_basis` of the
+laser plane's normal."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigUncertainty:
+    """Joint covariance of some of a rig's numbers.
+
+    Attributes
+    ----------
+    names : tuple of str
+        As `parameter_names(camera)` has them, and `<laser's name>:tilt_1`, `:tilt_2`, `:offset`
+        for lasers, see `laser_parameter_names`. Numbers that are not named are taken as exact.
+    covariance : array, shape (P, P)
+        SI units and radians.
+    """
+
+    names: tuple[str, ...]
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(set(self.names)) != n:
+            raise ValueError(f"names repeat in {self.names}")
+        if self.covariance.shape != (n, n):
+            raise ValueError(f"{self.covariance.shape=} but expected {(n, n)}")
+
+    @classmethod
+    def none(cls) -> "RigUncertainty":
+        """Return the uncertainty of a rig whose numbers are all exact."""
+        return cls((), np.zeros((0, 0)))
+
+    @classmethod
+    def independent(cls, sigmas: Mapping[str, float]) -> "RigUncertainty":
+        """Return the uncertainty of numbers that are known one by one, such as tolerances."""
+        return cls(tuple(sigmas), np.diag(np.array([*sigmas.values()], np.float64) ** 2))
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation of every number, SI units and radians."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def of(self, names: Sequence[str]) -> FloatArray:
+        """Return the covariance (Q, Q) of the named numbers; zero for those not known here."""
+        covariance = np.zeros((len(names), len(names)))
+        known = [(i, self.names.index(name)) for i, name in enumerate(names) if name in self.names]
+        if known:
+            here, there = map(list, zip(*known, strict=True))
+            covariance[np.ix_(here, here)] = self.covariance[np.ix_(there, there)]
+        return covariance
+
+    def only(self, names: Sequence[str]) -> "RigUncertainty":
+        """Return the uncertainty of those of the named numbers that are known here."""
+        kept = tuple(name for name in self.names if name in names)
+        return RigUncertainty(kept, self.of(kept))
+
+
+def merged(old: RigUncertainty, new: RigUncertainty) -> RigUncertainty:
+    """Return what is known of a rig after a calibration has solved some of its numbers anew.
+
+    The numbers of `new` replace those of `old`; the others keep their covariance with each other.
+    Between the two there is none: the new numbers come from new pictures, and whatever else they
+    were solved from must be among `new.names` itself. A solve that rests on numbers known before
+    (planes of lasers on a dome, say) therefore has to return the joint covariance of both; numbers
+    that it took as they are, and whose errors it passed on, would else look independent of them.
+    """
+    kept = old.only([name for name in old.names if name not in new.names])
+    return combined(new, kept)
+
+
+def combined(one: RigUncertainty, other: RigUncertainty) -> RigUncertainty:
+    """Return what two independent sources say together, such as a prior and a tolerance.
+
+    Numbers that only one of them knows are taken over with their covariance; numbers that both
+    know are known better, and so is what is correlated with them. The names of `one` come first.
+    """
+    shared = [name for name in one.names if name in other.names]
+    n = len(one.names)
+    both = np.zeros((n + len(other.names),) * 2)
+    both[:n, :n], both[n:, n:] = one.covariance, other.covariance
+    # Both mean the same number: their difference is measured to be zero (a Kalman update).
+    difference = np.zeros((len(shared), len(both)))
+    for row, name in enumerate(shared):
+        difference[row, one.names.index(name)] = 1.0
+        difference[row, n + other.names.index(name)] = -1.0
+    reach = both @ difference.T
+    variance = difference @ reach
+    size = np.sqrt(np.diag(variance))
+    size[size == 0.0] = 1.0
+    reach /= size
+    both -= reach @ np.linalg.pinv(variance / np.outer(size, size), hermitian=True) @ reach.T
+    own = [i for i, name in enumerate(other.names) if name not in shared]
+    rows = [*range(n), *(n + i for i in own)]
+    names = one.names + tuple(other.names[i] for i in own)
+    return RigUncertainty(names, both[np.ix_(rows, rows)])
+
+
+def tangent_basis(normal: FloatArray) -> FloatArray:
+    """Return two unit vectors (2, 3) at right angles to a unit normal (3,) and to each other.
+
+    The first is normal x the axis of the normal's smallest component, the second normal x the
+    first: a fixed choice, so that covariances in it can be stored.
+    """
+    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
+
+
+def moved_plane(plane: Plane, tilt_1: float, tilt_2: float, offset: float) -> Plane:
+    """Return the plane with its normal turned towards `tangent_basis` and its offset changed."""
+    normal = plane.normal + np.array([tilt_1, tilt_2]) @ tangent_basis(plane.normal)
+    return Plane(normal / np.linalg.norm(normal), plane.offset + offset)
+
+
+def laser_parameter_names(laser: Laser) -> tuple[str, ...]:
+    """Return the names of a laser's numbers in a `RigUncertainty`, its window's last."""
+    window = () if laser.window is None else LASER_WINDOW_PARAMETERS
+    return tuple(f"{laser.name}:{name}" for name in LASER_PARAMETERS + window)
+
+
+def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
+    """Return the names of all numbers of a rig that a `RigUncertainty` may hold.
+
+    The dome's are among them whether or not the rig has one: the same rig may be used without.
+    """
+    lasers = (name for laser in rig.lasers for name in laser_parameter_names(laser))
+    return (*POSE_PARAMETERS, *DOME_PARAMETERS, *rig.lens.parameter_names, *lasers)
+
+
+def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
+    """Return the rig with `step` (P,) added to the named numbers.
+
+    Raises
+    ------
+    RigError
+        If the moved rig cannot exist.
+    """
+    values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
+    pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}
+    lens = {name: values.get(name, 0.0) for name in rig.lens.parameter_names}
+    shell = {name: values.get(name, 0.0) for name in DOME_PARAMETERS}
+    dome = rig.dome
+    if dome is not None:
+        dome = Dome(
+            dome.inner_radius + shell["inner_radius"],
+            dome.thickness + shell["thickness"],
+            dome.n_acrylic + shell["n_acrylic"],
+        )
+    return replace(
+        rig,
+        dome_from_cam=moved_pose(rig.dome_from_cam, pose),
+        lens=moved_lens(rig.lens, lens),
+        dome=dome,
+        n_air=rig.n_air + shell["n_air"],
+        n_water=rig.n_water + shell["n_water"],
+        lasers=tuple(_moved_laser(laser, values) for laser in rig.lasers),
+    )
+
+
+def _moved_laser(laser: Laser, values: dict[str, float]) -> Laser:
+    step = [values.get(name, 0.0) for name in laser_parameter_names(laser)]
+    if not any(step):
+        return laser
+    window = laser.window
+    if window is not None:
+        shift = np.array(step[6:]) @ tangent_basis(laser.plane.normal)
+        window = Window(moved_plane(window.face, *step[3:6]), window.source + shift)
+    return replace(laser, plane=moved_plane(laser.plane, *step[:3]), window=window)

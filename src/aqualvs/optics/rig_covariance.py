@@ -17,13 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.cholesky import factorise, solve_factorised
 from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 from aqualvs.optics.camera import Camera, parameter_names
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import packed_sheets, sheets_of
-from aqualvs.optics.sheet_kernels import sheet_distance, sheet_tangent
-from aqualvs.optics.uncertainty import RigUncertainty
+from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.optics.sheet import packed_sheets, sheet_distance, sheet_tangent, sheets_of
 
 # Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
 _LATTICE = (33, 25)

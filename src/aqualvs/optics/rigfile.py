@@ -2,11 +2,15 @@
 
 Files speak millimetres and degrees, `Rig` metres and radians. Whatever was loaded from a file is
 written back bit for bit; a rotation is written to 1e-12 degrees. docs/rig.md explains every key.
+
+Dated copies of files that are about to be replaced: `rig.2026-11-23T141503.yaml`, in UTC.
 """
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +23,73 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_r
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
-from aqualvs.optics.rig_copies import keep_dated
 from aqualvs.optics.rigschema import VERSION, LaserPart, RigFile, WaterPart, parse_rig
-from aqualvs.optics.rigtext import rig_text
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
-from aqualvs.yamlcomments import carry_comments
-from aqualvs.yamlfile import parse_yaml, read_text, read_yaml
+from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, read_yaml, rig_text
+
+_STAMP = re.compile(r"\.(\d{4}-\d\d-\d\dT\d{6})(?:-(\d+))?")
+
+
+def keep_dated(path: Path, now: datetime | None = None) -> Path:
+    """Copy a file beside itself, under a name with the time that no other file has.
+
+    Parameters
+    ----------
+    path : Path
+    now : datetime, optional
+        With a time zone; the current time if left out.
+
+    Returns
+    -------
+    copy : Path
+
+    Raises
+    ------
+    OutputError
+        If it cannot be copied.
+    """
+    stamp = (now or datetime.now(UTC)).astimezone(UTC).strftime("%Y-%m-%dT%H%M%S")
+    number = 1
+    while True:
+        again = f"-{number}" if number > 1 else ""
+        copy = path.with_name(f"{path.stem}.{stamp}{again}{path.suffix}")
+        number += 1
+        try:
+            content = path.read_bytes()
+            file = copy.open("xb")
+        except FileExistsError:
+            continue
+        except OSError as fault:
+            raise _uncopied(path, fault) from fault
+        try:
+            with file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as fault:
+            copy.unlink(missing_ok=True)
+            raise _uncopied(path, fault) from fault
+        return copy
+
+
+def dated_copies(path: Path) -> list[Path]:
+    """Return the dated copies of a file, the newest first."""
+    found = []
+    for copy in path.parent.glob("*"):
+        middle = copy.name.removeprefix(path.stem).removesuffix(path.suffix)
+        stamp = _STAMP.fullmatch(middle)
+        if stamp is not None and copy.name == f"{path.stem}{middle}{path.suffix}":
+            found.append((stamp[1], int(stamp[2] or 1), copy))
+    return [copy for _, _, copy in sorted(found, reverse=True)]
+
+
+def _uncopied(path: Path, fault: OSError) -> OutputError:
+    return OutputError(
+        f"{path}: cannot be kept as a dated copy ({fault.strerror}), so it is not replaced; free "
+        "the disk or choose another place"
+    )
+
 
 __all__ = ["check_rig_place", "load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
 

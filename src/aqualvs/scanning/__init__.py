@@ -1,1 +1,4 @@
-"""From a frame to stripes, points and posture."""
+"""From a frame to stripe peaks, surfaces and posture.
+
+Imports optics and geometry. `aqualvs.scanner` puts the stages together.
+"""

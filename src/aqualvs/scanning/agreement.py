@@ -6,24 +6,446 @@ turn, the target's own plane takes three numbers), but a sheet that has moved ha
 same three numbers in all frames, at every range and angle of the target, and no bulge of a net or
 fish in front of it follows that pattern. So each laser in turn is taken for the one that has moved,
 and it is named if that explains all frames, and no other does.
+
+Where each laser's stripe runs in one frame, in a few robust numbers, whatever its label.
+
+A laser that has drifted leaves the target's plane, and its points are then labelled as clutter or
+as another surface; here they count all the same.
+
+The fit behind `LaserAgreement`: flat targets of many frames, and one laser that may have moved.
+
+Every frame has a target plane m·X = 1 of its own. One laser's sheet, the same in all frames, may
+have turned and shifted by a small step of three numbers; the planes are eliminated from the normal
+equations (Schur complement), and weights are Tukey's.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import sheets_of
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.planes import Rays
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.rig import LASER_PARAMETERS, Rig
+from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.optics.solved import rig_uncertainty
-from aqualvs.optics.uncertainty import LASER_PARAMETERS
-from aqualvs.scanning.agreement_fit import Explanation, SeenStripes, explain
-from aqualvs.scanning.scan import Scan
-from aqualvs.scanning.search import SearchAxis, plan_searches
-from aqualvs.scanning.stripe_bins import bin_stripes
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.scan import Scan, ScanPoints
+
+N_BINS = 12
+"""Pieces of a stripe, from one border of the picture to the other."""
+
+# Points farther from the target's plane than this share of the range belong to something else: two
+# degrees of a laser are a quarter of the range at worst.
+_GATE = 0.4
+# In a piece, points within three times the typical scatter of the median are the stripe, but no
+# fewer than those within the first of these shares of the range and no more than the second.
+_NEAR, _FAR = 0.003, 0.02
+_SCATTER = 4.4  # three sigmas in median absolute deviations
+_MIN_POINTS = 4
+_MIN_SHARE = 0.6
+
+
+def bin_stripes(
+    points: ScanPoints, m: FloatArray, along_x: IntArray, size_px: tuple[int, int]
+) -> FloatArray:
+    """Return the middle of the light in each piece of each laser's stripe.
+
+    Parameters
+    ----------
+    points : ScanPoints
+        Of one frame.
+    m : array, shape (3,)
+        The target's plane m·X = 1 in `dome`, roughly.
+    along_x : int array, shape (L,)
+        1 for lasers whose stripe is searched along x, and so runs along y.
+    size_px : (int, int)
+        Image width and height.
+
+    Returns
+    -------
+    array, shape (L, N_BINS, 2)
+        In `image`; NaN where a piece shows no stripe, or too much beside it.
+    """
+    middle = np.full((len(along_x), N_BINS, 2), np.nan)
+    _bin_stripes(
+        points.laser,
+        points.pixels,
+        points.points_in_dome,
+        points.intensity,
+        points.width,
+        m,
+        along_x,
+        float(size_px[0]),
+        float(size_px[1]),
+        middle,
+    )
+    return middle
+
+
+@kernel
+def _bin_stripes(
+    laser: NDArray[np.int8],
+    pixels: FloatArray,
+    points: FloatArray,
+    intensity: FloatArray,
+    width: FloatArray,
+    m: FloatArray,
+    along_x: IntArray,
+    size_x: float,
+    size_y: float,
+    middle: FloatArray,
+) -> None:
+    n = laser.shape[0]
+    n_cells = middle.shape[0] * N_BINS
+    cell, off = np.empty(n, np.int64), np.empty(n)
+    start = np.zeros(n_cells + 1, np.int64)
+    for i in range(n):
+        a = laser[i]
+        off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
+        share = pixels[i, 1] / size_y if along_x[a] else pixels[i, 0] / size_x
+        piece = min(max(int(share * N_BINS), 0), N_BINS - 1)
+        cell[i] = a * N_BINS + piece if abs(off[i]) < _GATE else -1
+        if cell[i] >= 0:
+            start[cell[i] + 1] += 1
+    for c in range(n_cells):
+        start[c + 1] += start[c]
+    order, fill = np.empty(start[n_cells], np.int64), start[:-1].copy()
+    for i in range(n):
+        if cell[i] >= 0:
+            order[fill[cell[i]]] = i
+            fill[cell[i]] += 1
+    for c in range(n_cells):
+        rows = order[start[c] : start[c + 1]]
+        if rows.shape[0] >= _MIN_POINTS:
+            _middle(rows, off, pixels, intensity, width, middle[c // N_BINS, c % N_BINS])
+
+
+@kernel
+def _middle(
+    rows: IntArray,
+    off: FloatArray,
+    pixels: FloatArray,
+    intensity: FloatArray,
+    width: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the middle of the light of those points that lie together."""
+    values = off[rows]
+    median = np.median(values)
+    near_by = min(max(_SCATTER * np.median(np.abs(values - median)), _NEAR), _FAR)
+    total, x, y = 0.0, 0.0, 0.0
+    near = 0
+    for i in rows:
+        if abs(off[i] - median) < near_by:
+            light = intensity[i] * width[i]
+            near += 1
+            total += light
+            x += light * pixels[i, 0]
+            y += light * pixels[i, 1]
+    if near >= _MIN_POINTS and near >= _MIN_SHARE * rows.shape[0]:
+        out[0], out[1] = x / total, y / total
+
+
+CUT = 4.0
+"""Residuals beyond so many sigmas cost as much as this and no more."""
+
+# Error of a piece of stripe that stays from frame to frame: texture, strands, the glow beside the
+# sheet, in pixels; and what a target may be uneven, as a share of the range.
+_SIGMA_PX, _UNEVEN = 0.25, 7e-4
+# A laser that was knocked has turned rather than shifted; and hardly by more.
+_PRIOR = np.array([np.deg2rad(1.5), np.deg2rad(1.5), 0.005])
+# Steps are not followed beyond this; no laser of which anything is seen is so far off.
+_FARTHEST = np.array([0.2, 0.2, 0.05])
+_STEP_PX = 0.25
+_TUKEY = 4.685  # 95 % efficiency for normal errors
+_ITERATIONS, _UNWEIGHTED = 12, 2
+_SMALL, _SETTLED = 1e-5, 1e-3
+_LEAST, _RIDGE = 1e-6, 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class SeenStripes:
+    """What was seen of flat-looking targets, as rays; F frames, L lasers, K pieces.
+
+    Attributes
+    ----------
+    origins, directions : array, shape (L, F, K, 3)
+        Of the rays, in `dome`.
+    beside : array, shape (L, F, K, 3, 2)
+        Origins and directions of the rays that pass `_STEP_PX` beside, across the stripe.
+    seen : bool array, shape (L, F, K)
+    """
+
+    origins: FloatArray
+    directions: FloatArray
+    beside: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, middles: Sequence[FloatArray], camera: Camera, along_x: IntArray) -> "SeenStripes":
+        """Trace the pieces of stripes (L, K, 2) of several frames, NaN where unseen."""
+        pixels = np.stack(middles, axis=1)
+        step = np.where(along_x[:, None] == 1, [_STEP_PX, 0.0], [0.0, _STEP_PX])
+        rays = camera.rays(np.nan_to_num(pixels))
+        beside = camera.rays(np.nan_to_num(pixels) + step[:, None, None])
+        return cls(
+            rays.origins,
+            rays.directions,
+            np.stack([beside.origins, beside.directions], axis=-1),
+            np.isfinite(pixels[..., 0]) & rays.valid & beside.valid,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """How well the frames are explained, by one laser that has moved or by none.
+
+    Attributes
+    ----------
+    laser : int or None
+        The one that may have moved.
+    step : array, shape (3,)
+        Its step as `moved_plane` takes it: tilts (rad) and offset (m).
+    cost : float
+        Mean square residual in sigmas, none counted beyond `CUT`.
+    inliers : float
+        Share of residuals below `CUT`.
+    effect : float
+        Root mean square distance of that laser's stripe from the targets, as a share of range.
+    information : array, shape (3 L, 3 L)
+        Of the steps of all lasers, from a typical frame: what is wrong with a stripe is so in all
+        frames, so more of them do not tell more.
+    """
+
+    laser: int | None
+    step: FloatArray
+    cost: float
+    inliers: float
+    effect: float
+    information: FloatArray
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance (3, 3) of `step`, with what is known of it beforehand."""
+        own = self._own()
+        total = self.information[own, own] + np.diag(_PRIOR**-2.0)
+        return np.asarray(np.linalg.inv(total), dtype=np.float64)
+
+    def spill(self) -> FloatArray:
+        """Return what a step of any laser (3 L) does to `step`, shape (3, 3 L)."""
+        spill: FloatArray = self.covariance() @ self.information[self._own()]
+        return spill
+
+    def _own(self) -> slice:
+        if self.laser is None:
+            raise ValueError("no laser has moved, so there is no step")
+        return slice(3 * self.laser, 3 * self.laser + 3)
+
+
+def explain(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> Explanation:
+    """Fit a plane to every frame, and a step of one laser, or of none, to all of them.
+
+    Parameters
+    ----------
+    stripes : SeenStripes
+    sheets : sequence of Sheet
+        One for each laser, as the rig has them.
+    laser : int or None
+        The one that may have moved.
+    """
+    step = np.zeros(3)
+    view = _View.of(stripes, sheets)
+    weight = view.seen.astype(np.float64)
+    for i in range(_ITERATIONS):
+        fit, last = _Fit.of(view, weight), step
+        if laser is not None:
+            step = np.clip(step - _toward(fit, view, laser, step), -_FARTHEST, _FARTHEST)
+            view = view.with_laser(stripes, laser, _moved(sheets[laser], step))
+        if i >= _UNWEIGHTED:
+            before, weight = weight, fit.tukey(view.seen)
+            if np.abs(step - last).max() < _SMALL and np.abs(weight - before).mean() < _SETTLED:
+                break
+    fit = _Fit.of(view, weight)
+    z = np.abs(fit.z[view.seen])
+    return Explanation(
+        laser=laser,
+        step=step,
+        cost=float(np.mean(np.minimum(z, CUT) ** 2)),
+        inliers=float(np.mean(z < CUT)),
+        effect=0.0 if laser is None else fit.effect(view, laser, step),
+        information=fit.normal_equations(view, _spread(fit.slopes(view)))[0],
+    )
+
+
+def _toward(fit: "_Fit", view: "_View", laser: int, step: FloatArray) -> FloatArray:
+    """Newton's step, to be subtracted, for the step of one laser."""
+    slope = np.zeros((*view.seen.shape, 3))
+    mine = _pieces(laser)
+    slope[:, mine] = fit.slopes(view)[:, mine]
+    information, right = fit.normal_equations(view, slope)
+    prior = _PRIOR**-2.0
+    toward = np.linalg.solve(information + np.diag(prior), right + prior * step)
+    return np.asarray(toward, dtype=np.float64)
+
+
+def _pieces(laser: int) -> slice:
+    return slice(N_BINS * laser, N_BINS * (laser + 1))
+
+
+def _moved(sheet: Sheet, step: FloatArray) -> Sheet:
+    rest = np.zeros(len(sheet.parameter_names) - len(step))
+    return sheet.moved_by(np.concatenate([step, rest]))
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """Points of stripes on the sheets as they are assumed; frames first, lasers' pieces in one.
+
+    Attributes
+    ----------
+    points : array, shape (F, L K, 3)
+    per_px : array, shape (F, L K, 3)
+        Derivative of the points by a pixel across the stripe.
+    by_step : array, shape (F, L K, 3, 3)
+        Derivative of the points by a step of their own laser.
+    seen : bool array, shape (F, L K)
+    """
+
+    points: FloatArray
+    per_px: FloatArray
+    by_step: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, stripes: SeenStripes, sheets: Sequence[Sheet]) -> "_View":
+        """Return the points on all sheets."""
+        parts = [_on_sheet(stripes, i, sheet) for i, sheet in enumerate(sheets)]
+        return cls(
+            np.concatenate([part.points for part in parts], axis=1),
+            np.concatenate([part.per_px for part in parts], axis=1),
+            np.concatenate([part.by_step for part in parts], axis=1),
+            np.concatenate([part.seen for part in parts], axis=1),
+        )
+
+    def with_laser(self, stripes: SeenStripes, laser: int, sheet: Sheet) -> "_View":
+        """Return the same view with another sheet of one laser."""
+        changed = _View(
+            self.points.copy(), self.per_px.copy(), self.by_step.copy(), self.seen.copy()
+        )
+        mine, part = _pieces(laser), _on_sheet(stripes, laser, sheet)
+        changed.points[:, mine], changed.per_px[:, mine] = part.points, part.per_px
+        changed.by_step[:, mine], changed.seen[:, mine] = part.by_step, part.seen
+        return changed
+
+
+def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
+    """Return the points of one laser, K pieces of it."""
+    shape = stripes.seen.shape[1:]
+    origins, directions = stripes.origins[laser], stripes.directions[laser]
+    rays = Rays(origins, directions, stripes.seen[laser])
+    points, seen = sheet.intersect(rays)
+    points = np.where(seen[..., None], points, 0.0)
+    _, normal, by_parameter = sheet.signed_distance_with_parameter_jacobian(points)
+    normal, by_parameter = normal.reshape(*shape, 3), by_parameter[:, :3].reshape(*shape, 3)
+    approach = np.einsum("fki,fki->fk", normal, directions)
+    by_step = -directions[..., None] * (by_parameter / approach[..., None])[..., None, :]
+    # The ray beside meets the sheet's tangent plane.
+    origin, direction = stripes.beside[laser, ..., 0], stripes.beside[laser, ..., 1]
+    reach = np.einsum("fki,fki->fk", normal, points - origin)
+    reach /= np.einsum("fki,fki->fk", normal, direction)
+    per_px = (origin + reach[..., None] * direction - points) / _STEP_PX
+    return _View(points, per_px, by_step, seen)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Planes of all frames, and residuals.
+
+    Attributes
+    ----------
+    m : array, shape (F, 3)
+    weight, residual, z : array, shape (F, L K)
+        Weights by errors and outliers; residuals of m·X = 1, and the same in sigmas.
+    inverse : array, shape (F, 3, 3)
+        Of the planes' normal equations.
+    """
+
+    m: FloatArray
+    weight: FloatArray
+    residual: FloatArray
+    z: FloatArray
+    inverse: FloatArray
+
+    @classmethod
+    def of(cls, view: _View, weight: FloatArray) -> "_Fit":
+        """Fit a plane to each frame; `weight` tells outliers from the rest."""
+        x = view.points
+        # A frame all of whose pieces are outliers keeps some plane, which says nothing.
+        least = _LEAST * view.seen
+        m, _ = _planes(x, weight + least)
+        per_px = np.abs(np.einsum("fbi,fi->fb", view.per_px, m))
+        sigma = np.hypot(_SIGMA_PX * per_px, _UNEVEN)
+        w = (weight + least) / sigma**2
+        m, inverse = _planes(x, w)
+        residual = np.where(view.seen, np.einsum("fbi,fi->fb", x, m) - 1.0, 0.0)
+        return cls(m, w, residual, residual / sigma, inverse)
+
+    def slopes(self, view: _View) -> FloatArray:
+        """Return the derivative (F, L K, 3) of the residuals by their own laser's step."""
+        slopes: FloatArray = np.einsum("fbij,fi->fbj", view.by_step, self.m)
+        return slopes
+
+    def normal_equations(self, view: _View, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return matrix (C, C) and right side (C,) of parameters with derivatives (F, L K, C).
+
+        Means over the frames, with the planes eliminated.
+        """
+        weighed = self.weight[..., None] * slope
+        across = np.swapaxes(view.points, 1, 2) @ weighed
+        eliminated = self.inverse @ across
+        matrix = np.swapaxes(slope, 1, 2) @ weighed - np.swapaxes(across, 1, 2) @ eliminated
+        right = np.einsum("fbc,fb->fc", weighed, self.residual)
+        # The planes are at their minimum, so that the residuals' pull on them is zero.
+        return matrix.mean(axis=0), right.mean(axis=0)
+
+    def tukey(self, seen: BoolArray) -> FloatArray:
+        """Return the weights that the residuals deserve."""
+        scale = max(1.0, 1.4826 * float(np.median(np.abs(self.z[seen]))))
+        weight: FloatArray = np.maximum(1.0 - (self.z / (_TUKEY * scale)) ** 2, 0.0) ** 2 * seen
+        return weight
+
+    def effect(self, view: _View, laser: int, step: FloatArray) -> float:
+        """Share of the range by which a step takes its laser's stripe off the targets."""
+        mine = _pieces(laser)
+        off = self.slopes(view)[:, mine] @ step
+        return float(np.sqrt(np.mean(off[view.seen[:, mine]] ** 2)))
+
+
+def _planes(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fit m·X = 1, shape (F, 3), to weighted points; the inverse normal matrices come along."""
+    weighed = w[..., None] * x
+    normal = np.swapaxes(x, 1, 2) @ weighed
+    # Points of one laser alone would leave the plane to turn about their line.
+    ridge = _RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.asarray(np.linalg.inv(normal + ridge), dtype=np.float64)
+    return (inverse @ weighed.sum(axis=1)[..., None])[..., 0], inverse
+
+
+def _spread(slope: FloatArray) -> FloatArray:
+    """Give every laser columns of its own: (F, L K, 3) to (F, L K, 3 L)."""
+    n_frames, n, _ = slope.shape
+    n_lasers = n // N_BINS
+    spread = np.zeros((n_frames, n_lasers, N_BINS, n_lasers, 3))
+    own = np.arange(n_lasers)
+    spread[:, own, :, own] = np.moveaxis(slope.reshape(n_frames, n_lasers, N_BINS, 3), 1, 0)
+    return spread.reshape(n_frames, n, 3 * n_lasers)
+
 
 # Frames judged; when there are twice as many, every other one goes.
 _MAX_FRAMES = 24

@@ -40,13 +40,12 @@ from aqualvs.scanning.assignment_kernels import (
     light_left,
     seen_of,
 )
-from aqualvs.scanning.chunks import Chunks
-from aqualvs.scanning.measure import Measurement
-from aqualvs.scanning.net_mean import doubted
+from aqualvs.scanning.candidates import Chunks, Readings
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.net_surfaces import doubted
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
-from aqualvs.scanning.readings import Readings
-from aqualvs.scanning.search import SearchAxis, StripeSearch
+from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 

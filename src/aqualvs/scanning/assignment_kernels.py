@@ -6,7 +6,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
-from aqualvs.geometry.symmetric import solve_symmetric
+from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.plane_search import (
     JX,
     JY,

@@ -1,4 +1,7 @@
-"""Labels: what each stripe point was found to be."""
+"""Labels: what each stripe point was found to be.
+
+The arithmetic of `label_readings`: what lies on which surface, and what is told by its shape.
+"""
 
 from collections.abc import Sequence
 
@@ -6,14 +9,279 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.label_kernels import copy_points, label_loose, label_other, label_target
-from aqualvs.scanning.measure import Measurement
-from aqualvs.scanning.patch import packed_plane
+from aqualvs.geometry.quantile import element_at
+from aqualvs.scanning.candidates import Readings
+from aqualvs.scanning.patch import height_over, packed_plane
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.readings import Readings
-from aqualvs.scanning.scan import ScanPoints
-from aqualvs.scanning.surfaces import Surface
+from aqualvs.scanning.posture_estimator import Measurement
+from aqualvs.scanning.region_growing import recruit
+from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.scanning.segments import StretchShapes, is_bent, is_round, is_straight
+from aqualvs.scanning.surfaces import Surface, lit_cells, number_cells
+
+# Position error of the best returns there are: quality 1.
+_BEST_SIGMA_PX = 0.1
+# A surface is a fish if this share of its light lies in bent stretches.
+_MOSTLY = 0.5
+# The frame's bright returns are higher than this share of them.
+_BRIGHT_SHARE = 0.9
+# Compiled code takes numbers more easily than members of an enumeration.
+_NET, _SOLID, _FISH = np.uint8(Label.NET), np.uint8(Label.SOLID), np.uint8(Label.FISH)
+_BUBBLE, _BACKGROUND = np.uint8(Label.BUBBLE), np.uint8(Label.BACKGROUND)
+_CLUTTER, _AMBIGUOUS = np.uint8(Label.CLUTTER), np.uint8(Label.AMBIGUOUS)
+_OUT_OF_RANGE = np.uint8(Label.OUT_OF_RANGE)
+
+
+@kernel
+def label_other(
+    members: BoolArray,
+    is_mesh: bool,
+    chunk_index: IntArray,
+    stretch: IntArray,
+    points: FloatArray,
+    shapes: StretchShapes,
+    target: FloatArray,
+    explained: BoolArray,
+    label: NDArray[np.uint8],
+) -> None:
+    """Label the light on a surface that is not the target, and mark it as explained.
+
+    Parameters
+    ----------
+    members : bool array, shape (C,)
+        Chunks on the surface.
+    is_mesh : bool
+        As in `Surface`.
+    chunk_index, stretch : int array, shape (N,), points : array, shape (N, 3), shapes
+        Of the readings.
+    target : array, shape (16,)
+        The target as `Patch.packed` gives it; empty where there is none.
+    explained : bool array, shape (N,), label : uint8 array, shape (N,)
+        Completed in place.
+    """
+    n, n_bent, n_behind = 0, 0, 0
+    # Nearest places to the target on either side: they decide where half lie behind it.
+    nearest_before, nearest_behind = -np.inf, np.inf
+    for i in range(points.shape[0]):
+        if not members[chunk_index[i]]:
+            continue
+        n += 1
+        n_bent += is_bent(shapes, stretch[i])
+        if target.shape[0]:
+            behind = height_over(target, points[i, 0], points[i, 1], points[i, 2])
+            if behind > 0.0:
+                n_behind += 1
+                nearest_behind = min(nearest_behind, behind)
+            else:
+                nearest_before = max(nearest_before, behind)
+    is_behind = 2 * n_behind > n
+    if n > 0 and 2 * n_behind == n:
+        is_behind = nearest_before + nearest_behind > 0.0
+    kind = _BACKGROUND
+    if not is_behind:
+        kind = _NET if is_mesh else _FISH if n_bent > _MOSTLY * n else _SOLID
+    for i in range(points.shape[0]):
+        if members[chunk_index[i]]:
+            label[i] = kind
+            explained[i] = True
+
+
+@kernel
+def label_target(
+    members: BoolArray,
+    is_mesh: bool,
+    chunk_index: IntArray,
+    source: IntArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    target: FloatArray,
+    rests_on: BoolArray,
+    whole: BoolArray,
+    explained: BoolArray,
+    label: NDArray[np.uint8],
+) -> None:
+    """Label the light on the target, on a net also what the search left out; mark it as explained.
+
+    Parameters
+    ----------
+    members : bool array, shape (C,)
+        Chunks on the target.
+    is_mesh : bool
+        As in `Surface`.
+    chunk_index, source : int array, shape (N,), points, sensitivity : array, shape (N, 3)
+        Of the readings.
+    target : array, shape (16,)
+        As `Patch.packed` gives it.
+    rests_on, whole : bool array, shape (N,)
+        As in `Measurement`; the second empty where there is none.
+    explained : bool array, shape (N,)
+        Readings on other surfaces; completed in place.
+    label : uint8 array, shape (N,)
+        Completed in place.
+    """
+    n = source.shape[0]
+    on_target = np.empty(n, np.bool_)
+    for i in range(n):
+        on_target[i] = members[chunk_index[i]]
+    if is_mesh:
+        taken = _of_same_return(source, explained, explained)
+        n_chunks = members.shape[0]
+        recruit(points, sensitivity, chunk_index, n_chunks, target, explained, taken, on_target)
+    for i in range(n):
+        on_target[i] |= rests_on[i]
+    if whole.shape[0]:
+        elsewhere = _of_same_return(source, explained, on_target)
+        for i in range(n):
+            on_target[i] |= whole[i] and not elsewhere[i]
+    for i in range(n):
+        if on_target[i]:
+            label[i] = _NET if is_mesh else _SOLID
+            explained[i] = True
+
+
+@kernel
+def _of_same_return(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArray:
+    """Mark every reading of the returns that have a reading marked in one of two ways."""
+    known = np.zeros(_n_sources(source), np.bool_)
+    for i in range(source.shape[0]):
+        if one[i] or other[i]:
+            known[source[i]] = True
+    same = np.empty(source.shape[0], np.bool_)
+    for i in range(source.shape[0]):
+        same[i] = known[source[i]]
+    return same
+
+
+@borrowing_kernel
+def _n_sources(source: IntArray) -> int:
+    n = 0
+    for i in range(source.shape[0]):
+        n = max(n, source[i] + 1)
+    return n
+
+
+@kernel
+def label_loose(
+    source: IntArray,
+    stretch: IntArray,
+    pixels: FloatArray,
+    points: FloatArray,
+    height: FloatArray,
+    shapes: StretchShapes,
+    target: FloatArray,
+    working_range: tuple[float, float],
+    explained: BoolArray,
+    label: NDArray[np.uint8],
+    rows: IntArray,
+) -> int:
+    """Label what lies on no surface by its shape; write the readings to list, and count them.
+
+    Parameters
+    ----------
+    source, stretch, pixels, points, height, shapes
+        Of N readings.
+    target : array, shape (16,)
+        As `Patch.packed` gives it; empty where there is none.
+    working_range : (float, float)
+        Distances from the dome's centre beyond which clutter is out of range, in metres.
+    explained : bool array, shape (N,)
+        Readings on surfaces. Others of the same light are not listed.
+    label : uint8 array, shape (N,)
+        Completed in place, for what is listed.
+    rows : int array, shape (N,)
+        Written.
+    """
+    n = _list_kept(source, pixels, explained, rows)
+    readings_of = np.zeros(_n_sources(source), np.int64)
+    for k in range(n):
+        readings_of[source[rows[k]]] += 1
+    bright = np.nan
+    for k in range(n):
+        i = rows[k]
+        if explained[i]:
+            continue
+        s = stretch[i]
+        label[i] = _AMBIGUOUS
+        if readings_of[source[i]] == 1:
+            label[i] = _kind_of(points, i, is_straight(shapes, s), target, working_range)
+        if is_round(shapes, s, 0.0) and bright != bright:
+            bright = element_at(height, _BRIGHT_SHARE)
+        if is_round(shapes, s, bright):
+            label[i] = _BUBBLE
+        elif is_bent(shapes, s):
+            label[i] = _FISH
+    return n
+
+
+@kernel
+def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows: IntArray) -> int:
+    """List the explained readings, and those whose light no surface explains."""
+    cell = np.empty(source.shape[0], np.int64)
+    n_cells, n_columns = number_cells(pixels, cell)
+    lit = lit_cells(cell, explained, n_cells, n_columns)
+    n = 0
+    for i in range(source.shape[0]):
+        rows[n] = i
+        n += explained[i] or lit[cell[i]] == 0
+    return n
+
+
+@borrowing_kernel
+def _kind_of(
+    points: FloatArray,
+    i: int,
+    straight: bool,
+    target: FloatArray,
+    working_range: tuple[float, float],
+) -> np.uint8:
+    """Return what a reading is that is the only one of its return."""
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    if straight:
+        if target.shape[0] and height_over(target, x, y, z) > 0.0:
+            return _BACKGROUND
+        return _SOLID
+    distance = np.sqrt(x * x + y * y + z * z)
+    outside = distance < working_range[0] or distance > working_range[1]
+    return _OUT_OF_RANGE if outside else _CLUTTER
+
+
+@borrowing_kernel
+def copy_points(
+    rows: IntArray,
+    laser: IntArray,
+    pixels: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    label: NDArray[np.uint8],
+    used: BoolArray,
+    out_laser: NDArray[np.int8],
+    out_pixels: FloatArray,
+    out_points: FloatArray,
+    out_measures: FloatArray,
+    out_label: NDArray[np.uint8],
+    out_used: BoolArray,
+) -> None:
+    """Write some readings as `ScanPoints` has them.
+
+    `out_measures`, shape (4, len(rows)), gets sigma, intensity, width and quality.
+    """
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        out_laser[k], out_label[k], out_used[k] = laser[i], label[i], used[i]
+        out_pixels[k, 0], out_pixels[k, 1] = pixels[i, 0], pixels[i, 1]
+        square = 0.0
+        for axis in range(3):
+            out_points[k, axis] = points[i, axis]
+            square += sensitivity[i, axis] * sensitivity[i, axis]
+        out_measures[0, k] = sigma_px[i] * np.sqrt(square)
+        out_measures[1, k], out_measures[2, k] = height[i], width[i]
+        out_measures[3, k] = min(_BEST_SIGMA_PX / sigma_px[i], 1.0)
+
 
 # What kernels are given where there is no target, and no net.
 _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)

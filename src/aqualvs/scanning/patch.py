@@ -1,26 +1,148 @@
-"""Patches: pieces of paraboloids over a plane, and the point of them nearest to the vehicle."""
+"""Patches: pieces of paraboloids over a plane, and the point of them nearest to the vehicle.
+
+The arithmetic of `Patch`: heights over it, and its point nearest to the vehicle.
+
+A patch is 16 numbers: normal and offset of its base, the two unit vectors along u and v, and the
+coefficients a, b, c, p, q, r of the height.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
-from aqualvs.scanning.patch_kernels import (
-    COEFFICIENTS,
-    PACKED,
-    RIGHT,
-    SIGMA_CURVATURE,
-    SIGMA_TWIST,
-    UP,
-    carry_to_tangent,
-    heights_over,
-    tangent_jacobian,
-    write_flat,
-    write_tangent,
-    write_terms,
-)
+
+NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
+"""Where what begins, and how many numbers there are."""
+
+SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
+"""What is expected of nets before looking, in 1/m: bent by a metre's radius, hardly twisted."""
+
+# The nearest point is looked for in so many Newton steps, and only where they are downhill.
+_FOOT_STEPS = 12
+_LEAST_CURVED = 0.05
+
+
+@borrowing_kernel
+def write_flat(normal: FloatArray, offset: float, patch: FloatArray) -> None:
+    """Write a plane as a patch (16,): u to the right, v upward."""
+    a, b, c = normal[0], normal[1], normal[2]
+    level = np.sqrt(a * a + b * b)
+    right, ahead = b / level, -a / level
+    patch[0], patch[1], patch[2], patch[OFFSET] = a, b, c, offset
+    patch[4], patch[5], patch[6] = right, ahead, 0.0
+    patch[7], patch[8], patch[9] = ahead * c, -right * c, right * b - ahead * a
+    for k in range(COEFFICIENTS, PACKED):
+        patch[k] = 0.0
+
+
+@inline_borrowing_kernel
+def height_over(patch: FloatArray, x: float, y: float, z: float) -> float:
+    """Return by how much a point lies behind a patch (16,), along its base's normal, in metres."""
+    u = patch[4] * x + patch[5] * y + patch[6] * z
+    v = patch[7] * x + patch[8] * y + patch[9] * z
+    height = patch[10] + patch[11] * u + patch[12] * v
+    height += 0.5 * (patch[13] * u * u + patch[15] * v * v) + patch[14] * u * v
+    return float(patch[0] * x + patch[1] * y + patch[2] * z - patch[OFFSET] - height)
+
+
+@borrowing_kernel
+def heights_over(points: FloatArray, patch: FloatArray, off: FloatArray) -> None:
+    """Write by how much points (N, 3) lie behind a patch (16,)."""
+    for i in range(points.shape[0]):
+        off[i] = height_over(patch, points[i, 0], points[i, 1], points[i, 2])
+
+
+@borrowing_kernel
+def share_near(points: FloatArray, patch: FloatArray, gate: float) -> float:
+    """Return the share of points (N, 3) less than `gate` metres off a patch (16,)."""
+    n = 0
+    for i in range(points.shape[0]):
+        n += abs(height_over(patch, points[i, 0], points[i, 1], points[i, 2])) < gate
+    return float(n / points.shape[0])
+
+
+@borrowing_kernel
+def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
+    """Write m = n/d of the tangent plane at the point nearest to the origin; False without one."""
+    a, b, c, p, q, r = patch[10], patch[11], patch[12], patch[13], patch[14], patch[15]
+    u, v, h, slope_u, slope_v = 0.0, 0.0, 0.0, 0.0, 0.0
+    for _ in range(_FOOT_STEPS):
+        h = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
+        slope_u, slope_v = b + p * u + q * v, c + q * u + r * v
+        # Half the squared distance is (u² + v² + (d + h)²) / 2.
+        reach = patch[OFFSET] + h
+        by_u, by_v = u + reach * slope_u, v + reach * slope_v
+        uu, vv = 1.0 + slope_u * slope_u + reach * p, 1.0 + slope_v * slope_v + reach * r
+        uv = slope_u * slope_v + reach * q
+        determinant = uu * vv - uv * uv
+        if determinant <= _LEAST_CURVED or uu <= _LEAST_CURVED:
+            return False
+        u -= (vv * by_u - uv * by_v) / determinant
+        v -= (uu * by_v - uv * by_u) / determinant
+    along = 0.0
+    for k in range(3):
+        normal, right, up = patch[k], patch[RIGHT + k], patch[UP + k]
+        m[k] = normal - slope_u * right - slope_v * up
+        along += m[k] * (u * right + v * up + (patch[OFFSET] + h) * normal)
+    for k in range(3):
+        m[k] /= along
+    return True
+
+
+@kernel
+def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: FloatArray) -> bool:
+    """Write the derivatives (3, 6) of m by the coefficients, by differences; False without any.
+
+    `sigma`, shape (6,), are the coefficients' standard deviations.
+    """
+    moved, other = patch.copy(), np.empty(3)
+    for k in range(6):
+        step = 1e-4 * max(sigma[k], 1e-6)
+        moved[COEFFICIENTS + k] = patch[COEFFICIENTS + k] + step
+        if not write_tangent(moved, other):
+            return False
+        moved[COEFFICIENTS + k] = patch[COEFFICIENTS + k]
+        for j in range(3):
+            out[j, k] = (other[j] - m[j]) / step
+    return True
+
+
+@kernel
+def carry_to_tangent(
+    patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
+) -> None:
+    """Write the covariance (3, 3) of m by differences of the coefficients; infinite without one.
+
+    `covariance`, shape (6, 6), is that of the coefficients.
+    """
+    jacobian = np.empty((3, 6))
+    if not tangent_jacobian(patch, np.sqrt(np.diag(covariance)), m, jacobian):
+        out[:] = np.inf
+        return
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(6):
+                for n in range(6):
+                    total += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
+            out[i, j] = total
+
+
+@borrowing_kernel
+def write_terms(points: FloatArray, patch: FloatArray, terms: FloatArray) -> None:
+    """Write what a patch's coefficients are multiplied by at points (N, 3), shape (N, 6)."""
+    for i in range(points.shape[0]):
+        u, v = 0.0, 0.0
+        for k in range(3):
+            u += patch[RIGHT + k] * points[i, k]
+            v += patch[UP + k] * points[i, k]
+        terms[i, 0], terms[i, 1], terms[i, 2] = 1.0, u, v
+        terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v
+
 
 FLAT = np.zeros(6)
 """Coefficients (a, b, c, p, q, r) of a plane."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.geometry.symmetric import invert_symmetric, solve_symmetric
+from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 
 
 @dataclass(frozen=True, slots=True)

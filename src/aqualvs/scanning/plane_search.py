@@ -19,7 +19,7 @@ from aqualvs.geometry.compiled import (
     inline_kernel,
     kernel,
 )
-from aqualvs.geometry.symmetric import solve_symmetric
+from aqualvs.geometry.linear_algebra import solve_symmetric
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), voice (search lines)."""

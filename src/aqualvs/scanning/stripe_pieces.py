@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
 from aqualvs.scanning.laser_colour import (
     RATIO_EXPECTED,
     RATIO_LEAST,
@@ -28,7 +29,6 @@ from aqualvs.scanning.laser_colour import (
     full_size,
 )
 from aqualvs.scanning.scan import Frame, ImagePlane
-from aqualvs.scanning.search import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
 from aqualvs.scanning.stripe import N_MEASURES, POSITION, PeakFinder, Returns, SearchImage

@@ -7,10 +7,9 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.optics.camera import Camera, CameraParams
-from aqualvs.optics.rays_batch import rays_all
+from aqualvs.optics.camera_kernels import rays_all
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import packed_sheets
-from aqualvs.optics.sheet_kernels import START, WINDOWED, meet_sheet
+from aqualvs.optics.sheet import START, WINDOWED, meet_sheet, packed_sheets
 
 # Step of the one-sided difference, in pixels; the second derivative of a point by the pixel is
 # about 1e-2 of the first, so the error stays below 1 % of a sensitivity.

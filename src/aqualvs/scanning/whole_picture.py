@@ -8,9 +8,9 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.scanning.laser_bands import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
-from aqualvs.scanning.search import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
 from aqualvs.scanning.stripe import Returns
 from aqualvs.scanning.stripe_pieces import (
     LENGTH,

@@ -16,12 +16,11 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
-from aqualvs.simulation import calibration_views as views
+from aqualvs.simulation import calibration_targets as views
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
-from aqualvs.simulation.scenario import Scenario
-from aqualvs.simulation.scenario_file import parse_scenario
+from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import jpeg
 
 _LASER_POWER = 8.0

@@ -5,24 +5,91 @@ tangent plane at the crossing stands in for it). A ray that crosses the plane be
 lateral distance w meets that strand's cylinder where, in the cross-section of the strand,
 (w + q tau)² + (z tau)² = r²; only the nearest strand of each family can be met, because the
 distance from an axis is w times the same cosine for all of them.
+
+Folds and slack: a height over a net's surface, and where rays cross it.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
+from aqualvs.geometry.linear_algebra import (
+    Vec,
+    along,
+    combine,
+    cross,
+    dot,
+    minus,
+    row3,
+    scaled,
+    unit,
+)
 from aqualvs.geometry.transforms import SE3
-from aqualvs.simulation.folds import fold_limits, folded
-from aqualvs.simulation.scene import Net
+from aqualvs.simulation.scene import Fold, Net
 from aqualvs.simulation.textures import Tiles, sample, white_at
-from aqualvs.simulation.vectors import Vec, along, combine, cross, dot, minus, row3, scaled, unit
+
+NET, DIRECTION_U, DIRECTION_V, PLACE, HEIGHT, WIDTH, PERIOD, FOLD_COLUMNS = range(8)
+
+
+def pack_fold(i_net: int, fold: Fold) -> FloatArray:
+    """Return one row of the fold table, shape (N_COLUMNS,).
+
+    Raises
+    ------
+    OptionError
+        If the width is not positive, or the folds of a row run into each other.
+    """
+    if not fold.width > 0.0:
+        raise OptionError(f"fold of a net: width is {1e3 * fold.width:g} mm; it must be positive")
+    if 0.0 < fold.period < 2.0 * fold.width:
+        raise OptionError(
+            f"fold of a net: period is {1e3 * fold.period:g} mm, less than the "
+            f"{2e3 * fold.width:g} mm from foot to foot; make it longer or 0"
+        )
+    way = (math.cos(fold.direction), math.sin(fold.direction))
+    return np.array([i_net, *way, fold.place, fold.height, fold.width, fold.period])
+
+
+@inline_borrowing_kernel
+def folded(u: float, v: float, folds: FloatArray, i: int) -> tuple[float, float, float]:
+    """Return height (m) and slopes along u and v of the folds of net i."""
+    height, slope_u, slope_v = 0.0, 0.0, 0.0
+    for k in range(folds.shape[0]):
+        if folds[k, NET] != i:
+            continue
+        s = folds[k, DIRECTION_U] * u + folds[k, DIRECTION_V] * v - folds[k, PLACE]
+        if folds[k, PERIOD] > 0.0:
+            s -= folds[k, PERIOD] * np.floor(s / folds[k, PERIOD] + 0.5)
+        if abs(s) >= folds[k, WIDTH]:
+            continue
+        phase = np.pi * s / folds[k, WIDTH]
+        height += 0.5 * folds[k, HEIGHT] * (1.0 + np.cos(phase))
+        slope = -0.5 * folds[k, HEIGHT] * np.pi / folds[k, WIDTH] * np.sin(phase)
+        slope_u += slope * folds[k, DIRECTION_U]
+        slope_v += slope * folds[k, DIRECTION_V]
+    return height, slope_u, slope_v
+
+
+@inline_borrowing_kernel
+def fold_limits(folds: FloatArray, i: int) -> tuple[float, float, float]:
+    """Return what folds of net i can add at most: lowest (0 or less), highest, steepest slope."""
+    low, high, steepest = 0.0, 0.0, 0.0
+    for k in range(folds.shape[0]):
+        if folds[k, NET] == i:
+            low += min(folds[k, HEIGHT], 0.0)
+            high += max(folds[k, HEIGHT], 0.0)
+            steepest += 0.5 * np.pi * abs(folds[k, HEIGHT]) / folds[k, WIDTH]
+    return low, high, steepest
+
 
 ORIGIN, AXIS_U, AXIS_V, NORMAL = 0, 3, 6, 9
 KAPPA_U, KAPPA_V, IS_HEXAGON, BAR, RADIUS, FOULING, GROWTH, MISSING = range(12, 20)
 SEED, HALF_U, HALF_V, OFFSET_U, OFFSET_V, FAMILIES, DIRECTIONS = range(20, 27)
-SPACING, ALBEDO, N_COLUMNS = 32, 35, 38
+SPACING, ALBEDO, NET_COLUMNS = 32, 35, 38
 
 # Helix of the twine: a ply comes to the front every so many radii, and how deep its grooves are.
 _LAY = 2.2
@@ -64,7 +131,7 @@ class Strand(NamedTuple):
 
 def pack_net(net: Net, dome_from_scene: SE3) -> FloatArray:
     """Return one row of the net table, shape (N_COLUMNS,), everything in `dome`."""
-    row = np.zeros(N_COLUMNS)
+    row = np.zeros(NET_COLUMNS)
     row[ORIGIN : ORIGIN + 3] = dome_from_scene.translation
     axes = dome_from_scene.rotation
     row[AXIS_U : AXIS_U + 3], row[AXIS_V : AXIS_V + 3] = axes[:, 0], axes[:, 2]

@@ -15,9 +15,9 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.scene import Box, Bubble, Fish, Fold, Net, Scene, Wall
-from aqualvs.simulation.vectors import Vec
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 # Pairs of corners that differ in one coordinate.

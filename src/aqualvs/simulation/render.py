@@ -3,6 +3,10 @@
 Every pixel's corners are traced through the housing once; rays inside a pixel are interpolated
 between its four corners (the housing bends them by less than 1e-6 px from that inside a pixel),
 so any number of them costs no further refraction.
+
+Marine snow: particles that drift before the camera and flash where a laser sheet meets them.
+
+Which small things each part of the image can show, so that other rays need not try them.
 """
 
 from collections.abc import Sequence
@@ -16,16 +20,159 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
+from aqualvs.geometry.linear_algebra import Vec, combine, row3, unit
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
-from aqualvs.simulation.culling import TILE, TileMembers, tile_members
-from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources
-from aqualvs.simulation.lit_points import LitPoints, find_lit_points, light_sheets
+from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources, light_on_points
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.shading import Light, Members, pack_light, radiance
-from aqualvs.simulation.snow import add_snow
 from aqualvs.simulation.surfaces import Surfaces, pack_surfaces
-from aqualvs.simulation.vectors import Vec, combine, row3, unit
+from aqualvs.simulation.truth import LitPoints, find_lit_points, light_sheets
+
+# Particles drift in this box in `dome` and re-enter on the other side, in metres.
+_LOW, _HIGH = np.array([-0.6, 0.12, -0.5]), np.array([0.6, 1.3, 0.5])
+_DRIFT = np.array([0.03, -0.02, -0.012])
+_RADII = (0.2e-3, 1.0e-3)
+_REFLECTANCE = 0.7
+_SMALLEST_PX = 0.45
+
+
+def add_snow(
+    radiance: NDArray[np.float32], camera: Camera, scene: Scene, t: float, sheets: Sheets
+) -> None:
+    """Add the scene's marine snow to a radiance picture in place."""
+    if scene.water.snow <= 0:
+        return
+    points, radii = _particles(scene.water.snow, t)
+    ahead = _before_target(points, scene)
+    pixels, valid = camera.project(points[ahead])
+    points, radii = points[ahead][valid], radii[ahead][valid]
+    lit = light_on_points(points, sheets, scene.water.attenuation)
+    distance = np.linalg.norm(points, axis=-1)
+    reach = np.exp(-np.outer(distance, scene.water.attenuation))
+    colour = np.array(scene.water.ambient) + lit
+    sizes = radii / distance * _pixels_per_radian(camera)
+    for pixel, size, light in zip(pixels[valid], sizes, _REFLECTANCE * colour * reach, strict=True):
+        _splat(radiance, pixel, float(size), light)
+
+
+def _particles(count: int, t: float) -> tuple[FloatArray, FloatArray]:
+    """Positions and radii; each particle keeps its own drift through all frames."""
+    rng = np.random.default_rng(20210126)
+    start = rng.random((count, 3))
+    own = 1.0 + 0.6 * rng.standard_normal((count, 3))
+    turns = start + own * _DRIFT * t / (_HIGH - _LOW)
+    radii = rng.uniform(*_RADII, count)
+    return _LOW + (turns % 1.0) * (_HIGH - _LOW), radii
+
+
+def _before_target(points: FloatArray, scene: Scene) -> BoolArray:
+    if scene.target == "none":
+        return np.ones(len(points), dtype=np.bool_)
+    before: BoolArray = scene.target_plane().signed_distance(points) < 0.0
+    return before
+
+
+def _pixels_per_radian(camera: Camera) -> float:
+    """Scale in the middle of the image, from two neighbouring rays."""
+    width, height = camera.size_px
+    pair = np.array([[width / 2.0, height / 2.0], [width / 2.0 + 1.0, height / 2.0]])
+    directions = camera.rays(pair).directions
+    return float(1.0 / np.linalg.norm(directions[1] - directions[0]))
+
+
+def _splat(
+    radiance: NDArray[np.float32], pixel: FloatArray, size: float, light: FloatArray
+) -> None:
+    """Add a round blob that keeps the particle's light when it is smaller than a pixel."""
+    sigma = max(0.6 * size, _SMALLEST_PX)
+    half = int(np.ceil(3.0 * sigma))
+    x0, y0 = (int(value) for value in np.rint(pixel))
+    height, width = radiance.shape[:2]
+    left, right = max(x0 - half, 0), min(x0 + half + 1, width)
+    top, bottom = max(y0 - half, 0), min(y0 + half + 1, height)
+    if left >= right or top >= bottom:
+        return
+    x = np.exp(-0.5 * ((np.arange(left, right) - pixel[0]) / sigma) ** 2)
+    y = np.exp(-0.5 * ((np.arange(top, bottom) - pixel[1]) / sigma) ** 2)
+    cover = min((size / (2.0**0.5 * sigma)) ** 2, 0.8)
+    radiance[top:bottom, left:right] += (cover * y[:, None, None] * x[:, None] * light).astype(
+        np.float32
+    )
+
+
+# Side of a square part of the image, in pixels.
+TILE = 32
+# The outline of a sphere is sampled at points of a box around it; this covers what lies between.
+_MARGIN_PX = 4.0
+# A thing this far off, in metres, that cannot be projected anywhere is out of sight.
+_NEAR = 0.2
+
+
+class TileMembers(NamedTuple):
+    """Rows of the tables that each tile can show, as one list with its starts.
+
+    Attributes
+    ----------
+    n_columns : int
+        Tiles beside each other.
+    ellipsoids, bubbles : int arrays
+        Rows, tile after tile.
+    ellipsoid_start, bubble_start : int arrays, shape (n_tiles + 1,)
+        Where each tile's part begins.
+    """
+
+    n_columns: int
+    ellipsoids: IntArray
+    ellipsoid_start: IntArray
+    bubbles: IntArray
+    bubble_start: IntArray
+
+
+def tile_members(camera: Camera, size_px: tuple[int, int], surfaces: Surfaces) -> TileMembers:
+    """List for every tile the ellipsoids and bubbles whose outline can reach it.
+
+    A thing that can be projected in part only (near the dome, or at the edge of the lens model)
+    is listed everywhere: the answer may be slow but is never wrong.
+    """
+    columns, rows = (-(-side // TILE) for side in size_px)
+    e, b = surfaces.ellipsoids, surfaces.bubbles
+    reach = [1.0 / np.linalg.norm(row[3:12].reshape(3, 3), axis=1).min() for row in e]
+    ellipsoids = _lists(camera, e[:, :3], np.array(reach), columns, rows)
+    bubbles = _lists(camera, b[:, :3], b[:, 3], columns, rows)
+    return TileMembers(columns, *ellipsoids, *bubbles)
+
+
+def _lists(
+    camera: Camera, centres: FloatArray, radii: FloatArray, columns: int, rows: int
+) -> tuple[IntArray, IntArray]:
+    shown = np.zeros((rows, columns, len(centres)), dtype=np.bool_)
+    for i, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
+        shown[..., i] = _tiles_of(camera, centre, float(radius), columns, rows)
+    flat = shown.reshape(rows * columns, len(centres))
+    start = np.concatenate([[0], np.cumsum(flat.sum(axis=1))]).astype(np.int64)
+    return np.nonzero(flat)[1].astype(np.int64), start
+
+
+def _tiles_of(
+    camera: Camera, centre: FloatArray, radius: float, columns: int, rows: int
+) -> BoolArray:
+    """Mark the tiles under the box around a sphere."""
+    steps = np.linspace(-1.0, 1.0, 3)
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    pixels, valid = camera.project(centre + radius * grid)
+    marked = np.ones((rows, columns), dtype=np.bool_)
+    if not valid.any() and np.linalg.norm(centre) > radius + _NEAR:
+        return ~marked
+    if not valid.all():
+        return marked
+    low, high = pixels.min(axis=0) - _MARGIN_PX, pixels.max(axis=0) + _MARGIN_PX
+    x, y = np.arange(columns) * TILE, np.arange(rows) * TILE
+    marked &= ((x + TILE > low[0]) & (x < high[0]))[None, :]
+    marked &= ((y + TILE > low[1]) & (y < high[1]))[:, None]
+    return marked
+
 
 _ZERO = (0.0, 0.0, 0.0)
 

@@ -1,13 +1,31 @@
-"""A scenario: what is before the vehicle and how the vehicle moves, over the time of a dive."""
+"""A scenario: what is before the vehicle and how the vehicle moves, over the time of a dive.
 
-from collections.abc import Iterator
+Fish and bubbles at random, so placed that the camera meets them.
+
+How the vehicle moves before its target: smooth functions of time.
+
+Scenario files: short YAML with the unit in every key.
+"""
+
+import difflib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
 
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.interpolate import PchipInterpolator
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.scene import (
     Box,
     Bubble,
     Fish,
+    Fold,
+    Mesh,
     Net,
     Scene,
     Sensor,
@@ -15,7 +33,180 @@ from aqualvs.simulation.scene import (
     Wall,
     WaterOptics,
 )
-from aqualvs.simulation.trajectory import Trajectory
+from aqualvs.yamlfile import read_yaml
+
+_IN_FRONT = 0.10
+_SIDE, _HEIGHT = 0.20, 0.13
+
+
+def random_fish(
+    rng: np.random.Generator, count: int, duration: float, behind: float
+) -> tuple[Fish, ...]:
+    """Return fish that cross the view some time in the dive.
+
+    Parameters
+    ----------
+    rng : Generator
+        Source of chance.
+    count : int
+        How many.
+    duration : float
+        Of the dive, in seconds.
+    behind : float
+        Room behind the target plane, in metres; fish keep clear of a wall there.
+    """
+    return tuple(_fish(rng, duration, behind) for _ in range(count))
+
+
+def _fish(rng: np.random.Generator, duration: float, behind: float) -> Fish:
+    length = float(rng.uniform(0.12, 0.34))
+    depth = float(rng.uniform(-_IN_FRONT, max(behind - 0.3 * length, -0.05)))
+    side = float(rng.choice([-1.0, 1.0]))
+    speed = side * float(rng.uniform(0.05, 0.30))
+    middle, when = float(rng.uniform(-_SIDE, _SIDE)), float(rng.uniform(0.0, duration))
+    height, climb = float(rng.uniform(-_HEIGHT, _HEIGHT)), float(rng.normal(0.0, 0.01))
+    return Fish(
+        position=(middle - speed * when, depth, height - climb * when),
+        velocity=(speed, 0.0, climb),
+        length=length,
+        beat=float(rng.uniform(0.8, 2.5)),
+    )
+
+
+def random_bubbles(
+    rng: np.random.Generator, count: int, duration: float, behind: float
+) -> tuple[Bubble, ...]:
+    """Return bubbles that rise through the view some time in the dive.
+
+    Parameters
+    ----------
+    rng, count, duration, behind
+        As for `random_fish`.
+    """
+    return tuple(_bubble(rng, duration, behind) for _ in range(count))
+
+
+def _bubble(rng: np.random.Generator, duration: float, behind: float) -> Bubble:
+    rise, when = float(rng.uniform(0.10, 0.25)), float(rng.uniform(0.0, duration))
+    place = (
+        float(rng.uniform(-_SIDE, _SIDE)),
+        float(rng.uniform(-_IN_FRONT, max(behind, 0.0))),
+        float(rng.uniform(-_HEIGHT, _HEIGHT)) - rise * when,
+    )
+    drift = (float(rng.normal(0.0, 0.01)), float(rng.normal(0.0, 0.01)), rise)
+    radius = float(np.clip(rng.lognormal(np.log(2.2e-3), 0.45), 0.8e-3, 7e-3))
+    return Bubble(position=place, velocity=drift, radius=radius)
+
+
+_STEEPEST = np.deg2rad(85.0)
+
+
+def dome_from_target(
+    distance: float, pitch: float, yaw: float, slide: tuple[float, float] = (0.0, 0.0)
+) -> SE3:
+    """Return the pose of a target frame from the posture (docs/conventions.md).
+
+    Parameters
+    ----------
+    distance : float
+        Range: distance of the dome's centre from the target plane, in metres.
+    pitch, yaw : float
+        tan(pitch) = n_z / n_y and tan(yaw) = n_x / n_y for the far normal n, in radians.
+    slide : (float, float)
+        Shift of the target in its plane, right and up, in metres.
+
+    Returns
+    -------
+    SE3
+        y of the target frame is n; its z is as near to the dome's z as that allows; without slide
+        its origin is the foot of the perpendicular from the dome's centre.
+
+    Raises
+    ------
+    OptionError
+        If the distance is not positive or an angle is 85 degrees or steeper.
+    """
+    if not distance > 0.0:
+        raise OptionError(f"range is {1e3 * distance:g} mm; it must be positive")
+    if max(abs(pitch), abs(yaw)) >= _STEEPEST:
+        raise OptionError(
+            f"pitch {np.rad2deg(pitch):g} and yaw {np.rad2deg(yaw):g} deg: the target would be "
+            "seen edge on; keep both below 85 deg"
+        )
+    normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
+    normal /= np.linalg.norm(normal)
+    up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    up /= np.linalg.norm(up)
+    right = np.cross(normal, up)
+    origin = distance * normal + slide[0] * right + slide[1] * up
+    return SE3(np.column_stack([right, normal, up]), origin)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """One quantity over time: through values, with a sway on top.
+
+    Attributes
+    ----------
+    values : sequence of float
+        Passed at equal intervals from the start to the end of the dive; one value holds still.
+    mode : {"smooth", "steps"}
+        Smooth passes through the values without overshoot; steps holds each of them for its
+        share of the dive.
+    sway : float
+        Amplitude of a sine on top.
+    period : float
+        Of that sine, in seconds.
+    """
+
+    values: Sequence[float] = (0.0,)
+    mode: Literal["smooth", "steps"] = "smooth"
+    sway: float = 0.0
+    period: float = 4.0
+
+    def at(self, t: float, duration: float) -> float:
+        """Return the value at time `t` of a dive of `duration` seconds."""
+        share = min(max(t / duration, 0.0), 1.0) if duration > 0.0 else 0.0
+        value = self._base(share)
+        return value + self.sway * float(np.sin(2.0 * np.pi * t / self.period))
+
+    def _base(self, share: float) -> float:
+        n = len(self.values)
+        if n == 1:
+            return float(self.values[0])
+        if self.mode == "steps":
+            # The small addition keeps frame times such as 0.4 s on the right side of a step.
+            return float(self.values[min(int(share * n + 1e-9), n - 1)])
+        return float(PchipInterpolator(np.linspace(0.0, 1.0, n), self.values)(share))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trajectory:
+    """Posture over time.
+
+    Attributes
+    ----------
+    distance, pitch, yaw : Course
+        Metres and radians.
+    slide_x, slide_z : Course
+        Shift of the target in its plane, in metres.
+    """
+
+    distance: Course = field(default_factory=lambda: Course(values=(0.6,)))
+    pitch: Course = field(default_factory=Course)
+    yaw: Course = field(default_factory=Course)
+    slide_x: Course = field(default_factory=Course)
+    slide_z: Course = field(default_factory=Course)
+
+    def pose_at(self, t: float, duration: float) -> SE3:
+        """Return `dome_from_target` at time `t`."""
+        slide = (self.slide_x.at(t, duration), self.slide_z.at(t, duration))
+        return dome_from_target(
+            self.distance.at(t, duration),
+            self.pitch.at(t, duration),
+            self.yaw.at(t, duration),
+            slide,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,3 +272,288 @@ class Scenario:
             sensor=self.sensor,
             lasers_on=self.lasers_on,
         )
+
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Triple: TypeAlias = tuple[Finite, Finite, Finite]
+
+
+class _Strict(BaseModel):
+    """Every model refuses keys that it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CourseFile(_Strict):
+    """One quantity over the dive; see `trajectory.Course`."""
+
+    values: Annotated[list[Finite], Field(min_length=1)]
+    mode: Literal["smooth", "steps"] = "smooth"
+    sway: NotNegative = 0.0
+    period_s: Positive = 4.0
+
+
+Motion: TypeAlias = Finite | list[Finite] | CourseFile
+
+
+class MotionFile(_Strict):
+    """Posture over the dive: numbers, lists of numbers to pass through, or `CourseFile`."""
+
+    range_mm: Motion = 600.0
+    pitch_deg: Motion = 0.0
+    yaw_deg: Motion = 0.0
+    slide_x_mm: Motion = 0.0
+    slide_z_mm: Motion = 0.0
+
+
+class FoldFile(_Strict):
+    """A fold across the net, or a row of them; see `scene.Fold`."""
+
+    direction_deg: Finite = 0.0
+    place_mm: Finite = 0.0
+    height_mm: Finite = -30.0
+    width_mm: Positive = 50.0
+    every_mm: NotNegative = 0.0
+
+
+class NetFile(_Strict):
+    """A net in the target plane; see `scene.Net`."""
+
+    mesh: Mesh = "diamond"
+    bar_mm: Positive = 25.0
+    twine_mm: Positive = 2.0
+    roll_deg: Finite = 0.0
+    hanging_ratio: Annotated[float, Field(ge=0.2, le=0.98)] = 0.7071
+    fouling: Fraction = 0.0
+    growth: NotNegative = 1.0
+    missing: Fraction = 0.0
+    holes_mm: list[Triple] = []
+    curvature_per_m: tuple[Finite, Finite] = (0.0, 0.0)
+    folds: list[FoldFile] = []
+    half_size_mm: tuple[Positive, Positive] | None = None
+
+
+class WallFile(_Strict):
+    """A wall; `behind_mm` 0 puts it in the target plane; see `scene.Wall`."""
+
+    behind_mm: NotNegative = 0.0
+    yaw_deg: Annotated[float, Field(gt=-80.0, lt=80.0)] = 0.0
+    pitch_deg: Annotated[float, Field(gt=-80.0, lt=80.0)] = 0.0
+    contrast: Fraction = 0.35
+    tile_mm: NotNegative = 0.0
+
+
+class BoxFile(_Strict):
+    """A box, its position from the target plane's middle; see `scene.Box`."""
+
+    centre_mm: Triple
+    size_mm: tuple[Positive, Positive, Positive] = (300.0, 200.0, 300.0)
+    heading_deg: Finite = 0.0
+
+
+class WaterFile(_Strict):
+    """Water; see `scene.WaterOptics`."""
+
+    attenuation_per_m: tuple[NotNegative, NotNegative, NotNegative] = WaterOptics().attenuation
+    veil: tuple[NotNegative, NotNegative, NotNegative] = WaterOptics().veil
+    ambient: tuple[NotNegative, NotNegative, NotNegative] = WaterOptics().ambient
+    sheet_scatter_per_m: NotNegative = WaterOptics().sheet_scatter
+    forward_scatter: Fraction = WaterOptics().forward_scatter
+    halo_px: Positive = WaterOptics().halo_px
+    caustics: Fraction = 0.0
+    glare: NotNegative = 0.0
+    snow: Annotated[int, Field(ge=0, le=20_000)] = 0
+
+
+class SensorFile(_Strict):
+    """Sensor; see `scene.Sensor`."""
+
+    gain: Positive = 1.0
+    gamma: Positive = Sensor().gamma
+    read_noise: NotNegative = Sensor().read_noise
+    shot_noise: NotNegative = Sensor().shot_noise
+    defocus_px: NotNegative = Sensor().defocus_px
+
+
+class ScenarioFile(_Strict):
+    """The whole file. Without `net` and without a wall in the target plane there is no target."""
+
+    duration_s: Positive = 4.0
+    fps: Positive = 25.0
+    seed: Annotated[int, Field(ge=0)] = 0
+    motion: MotionFile = MotionFile()
+    net: NetFile | None = None
+    walls: list[WallFile] = []
+    boxes: list[BoxFile] = []
+    fish: Annotated[int, Field(ge=0, le=50)] = 0
+    bubbles: Annotated[int, Field(ge=0, le=500)] = 0
+    water: WaterFile = WaterFile()
+    sensor: SensorFile = SensorFile()
+    lasers_on: bool = True
+
+    def scenario(self, name: str) -> Scenario:
+        """Return the scenario that the file describes, in SI units."""
+        rng = np.random.default_rng([self.seed, 7])
+        walls = tuple(_wall(wall) for wall in self.walls)
+        behind = min((wall.depth for wall in walls), default=0.6)
+        return Scenario(
+            name=name,
+            duration=self.duration_s,
+            fps=self.fps,
+            seed=self.seed,
+            trajectory=_trajectory(self.motion),
+            target=_target(self),
+            walls=walls,
+            nets=(_net(self.net, self.seed),) if self.net else (),
+            fish=random_fish(rng, self.fish, self.duration_s, behind),
+            bubbles=random_bubbles(rng, self.bubbles, self.duration_s, behind),
+            boxes=tuple(_box(box) for box in self.boxes),
+            water=_water(self.water),
+            sensor=Sensor(**self.sensor.model_dump()),
+            lasers_on=self.lasers_on,
+        )
+
+
+def read_scenario(path: Path) -> Scenario:
+    """Read a scenario file; the scenario is called as the file.
+
+    Raises
+    ------
+    OptionError
+        If the file cannot be read, is not YAML, or holds a key or value that makes no sense; the
+        message names the file, the key and the remedy.
+    """
+    content = read_yaml(path, "a scenario file, or the name of a built-in scenario", OptionError)
+    return parse_scenario(content, path.stem, str(path))
+
+
+def parse_scenario(content: Any, name: str, source: str) -> Scenario:
+    """Return the scenario that a mapping describes; `source` is named in the error.
+
+    Raises
+    ------
+    OptionError
+        If a key is unknown or a value makes no sense.
+    """
+    try:
+        return ScenarioFile.model_validate({} if content is None else content).scenario(name)
+    except ValidationError as error:
+        raise OptionError(f"scenario {source}: {_first_fault(error)}") from None
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault = error.errors(include_url=False)[0]
+    names = [str(part) for part in fault["loc"]]
+    where = ".".join(names) or "the file"
+    if fault["type"] != "extra_forbidden":
+        return f"{where} is {fault['input']!r}: {fault['msg'].lower()}"
+    known = _known_keys(names[:-1])
+    near = difflib.get_close_matches(names[-1], known, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"known keys: {', '.join(known)}"
+    return f"unknown key {where}; {hint}"
+
+
+_MODELS: dict[str, type[_Strict]] = {
+    "motion": MotionFile,
+    "net": NetFile,
+    "walls": WallFile,
+    "boxes": BoxFile,
+    "water": WaterFile,
+    "sensor": SensorFile,
+}
+
+
+def _known_keys(parents: list[str]) -> list[str]:
+    model: type[_Strict] = _MODELS.get(parents[0], ScenarioFile) if parents else ScenarioFile
+    if "CourseFile" in parents:
+        model = CourseFile
+    if "folds" in parents:
+        model = FoldFile
+    return list(model.model_fields)
+
+
+def _course(motion: Motion, unit: float) -> Course:
+    if isinstance(motion, CourseFile):
+        values = [value * unit for value in motion.values]
+        sway = motion.sway * unit
+        return Course(values=values, mode=motion.mode, sway=sway, period=motion.period_s)
+    values = motion if isinstance(motion, list) else [motion]
+    return Course(values=[value * unit for value in values])
+
+
+def _trajectory(motion: MotionFile) -> Trajectory:
+    mm, deg = 1e-3, float(np.deg2rad(1.0))
+    return Trajectory(
+        distance=_course(motion.range_mm, mm),
+        pitch=_course(motion.pitch_deg, deg),
+        yaw=_course(motion.yaw_deg, deg),
+        slide_x=_course(motion.slide_x_mm, mm),
+        slide_z=_course(motion.slide_z_mm, mm),
+    )
+
+
+def _target(file: ScenarioFile) -> Target:
+    if file.net:
+        return "net"
+    upright = [w for w in file.walls if w.behind_mm == w.yaw_deg == w.pitch_deg == 0.0]
+    return "wall" if upright else "none"
+
+
+def _metres(values: tuple[float, float, float]) -> Vec:
+    return values[0] / 1e3, values[1] / 1e3, values[2] / 1e3
+
+
+def _net(net: NetFile, seed: int) -> Net:
+    half = net.half_size_mm or (np.inf, np.inf)
+    return Net(
+        mesh=net.mesh,
+        bar=net.bar_mm / 1e3,
+        twine=net.twine_mm / 1e3,
+        roll=float(np.deg2rad(net.roll_deg)),
+        hanging_ratio=net.hanging_ratio,
+        fouling=net.fouling,
+        growth=net.growth,
+        missing=net.missing,
+        holes=tuple(_metres(hole) for hole in net.holes_mm),
+        curvature=net.curvature_per_m,
+        folds=tuple(_fold(fold) for fold in net.folds),
+        half_size=(half[0] / 1e3, half[1] / 1e3),
+        seed=seed,
+    )
+
+
+def _fold(fold: FoldFile) -> Fold:
+    return Fold(
+        direction=float(np.deg2rad(fold.direction_deg)),
+        place=fold.place_mm / 1e3,
+        height=fold.height_mm / 1e3,
+        width=fold.width_mm / 1e3,
+        period=fold.every_mm / 1e3,
+    )
+
+
+def _wall(wall: WallFile) -> Wall:
+    return Wall(
+        depth=wall.behind_mm / 1e3,
+        yaw=float(np.deg2rad(wall.yaw_deg)),
+        pitch=float(np.deg2rad(wall.pitch_deg)),
+        contrast=wall.contrast,
+        tile_pitch=wall.tile_mm / 1e3,
+    )
+
+
+def _box(box: BoxFile) -> Box:
+    return Box(
+        centre=_metres(box.centre_mm),
+        size=_metres(box.size_mm),
+        heading=float(np.deg2rad(box.heading_deg)),
+    )
+
+
+def _water(water: WaterFile) -> WaterOptics:
+    values = water.model_dump()
+    attenuation, scatter = values.pop("attenuation_per_m"), values.pop("sheet_scatter_per_m")
+    return WaterOptics(attenuation=attenuation, sheet_scatter=scatter, **values)

@@ -1,13 +1,171 @@
-"""Built-in scenarios by name, and how a name or a path becomes a scenario."""
+"""Built-in scenarios by name, and how a name or a path becomes a scenario.
+
+Rigs to simulate with, in round numbers.
+
+`example_rig` resembles the rig of the paper: a lens strongly off the dome's centre and three
+lasers, one nearly level below, one nearly upright on the left, one diagonal on the right.
+`bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome.
+
+Scenes at random, for statistics over conditions rather than over one dive.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.simulation.scenario import Scenario
-from aqualvs.simulation.scenario_file import parse_scenario, read_scenario
+from aqualvs.geometry.linear_algebra import Vec
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.optics.camera import Dome
+from aqualvs.optics.lens import Lens
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
+from aqualvs.simulation.scenario import (
+    Scenario,
+    dome_from_target,
+    parse_scenario,
+    random_bubbles,
+    random_fish,
+    read_scenario,
+)
+from aqualvs.simulation.scene import Mesh, Net, Scene, Wall, WaterOptics
+
+_N_FRESH_WATER = 1.3333
+
+
+def example_rig() -> Rig:
+    """Return a rig like the paper's: 720x576, lens 41.7 mm off the centre of a small dome."""
+    return Rig(
+        name="example",
+        size_px=(720, 576),
+        lens=Lens(
+            fx=817.0, fy=878.0, cx=369.0, cy=282.0, distortion=(-0.126, 0.083, 0.0006, -0.0004)
+        ),
+        dome_from_cam=_pose((2.3, 1.7, 0.9), (3.0, 41.5, 3.0)),
+        dome=Dome(inner_radius=44.25e-3, thickness=5.75e-3, n_acrylic=1.49),
+        n_air=1.0003,
+        n_water=_N_FRESH_WATER,
+        lasers=(
+            Laser("lower", Plane.from_normal((-0.020, -0.340, 0.940), -0.143)),
+            Laser("left", Plane.from_normal((0.960, -0.253, -0.121), -0.138)),
+            Laser("right", Plane.from_normal((0.724, 0.155, 0.672), 0.093)),
+        ),
+        working_range=(0.3, 1.0),
+    )
+
+
+def bluerov2_rig() -> Rig:
+    """Return a rig like a BlueROV2's: 1920x1080, lens 6 mm off the centre of a 4-inch dome."""
+    return Rig(
+        name="bluerov2",
+        size_px=(1920, 1080),
+        lens=Lens(
+            fx=1390.0, fy=1390.0, cx=957.0, cy=543.0, distortion=(-0.11, 0.05, 0.0003, -0.0002)
+        ),
+        dome_from_cam=_pose((0.6, -0.4, 0.2), (0.8, 5.8, -0.6)),
+        dome=Dome(inner_radius=51.0e-3, thickness=6.0e-3, n_acrylic=1.49),
+        n_air=1.0003,
+        n_water=_N_FRESH_WATER,
+        lasers=(
+            Laser("lower", Plane.from_normal((0.015, -0.300, 0.954), -0.150)),
+            Laser("left", Plane.from_normal((0.962, -0.265, 0.060), -0.165)),
+            Laser("right", Plane.from_normal((0.730, 0.170, 0.662), 0.110)),
+        ),
+        working_range=(0.3, 1.2),
+    )
+
+
+def _pose(rotation_deg: Vec, lens_mm: Vec) -> SE3:
+    turn = rotation_from_rotvec(np.deg2rad(rotation_deg))
+    return SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(lens_mm) / 1e3)
+
+
+Difficulty: TypeAlias = Literal["clean", "usual", "hard"]
+
+# By difficulty: most fouling, most fish, most bubbles, chance of a wall behind, chance of glare,
+# spread of the attenuation (factor on clear water).
+_LIMITS: dict[str, tuple[float, int, int, float, float, float]] = {
+    "clean": (0.0, 0, 0, 0.0, 0.0, 1.0),
+    "usual": (0.3, 1, 12, 0.5, 0.15, 1.6),
+    "hard": (0.6, 3, 40, 0.7, 0.5, 3.0),
+}
+
+
+def random_scene(rng: np.random.Generator, difficulty: Difficulty = "usual") -> Scene:
+    """Return a net before the vehicle with everything about it left to chance.
+
+    Mesh 15-50 mm, twine 1-4 mm, range 0.3-1.0 m, roll 0-90 deg, yaw and pitch within 20 deg, all
+    uniform; fouling up to 60 %, fish, bubbles, a wall behind, turbidity, caustics and glare as
+    the difficulty allows.
+
+    Parameters
+    ----------
+    rng : Generator
+        Source of chance; the same state gives the same scene.
+    difficulty : {"clean", "usual", "hard"}
+        A clean net in open water; what a dive usually meets; everything at once.
+
+    Raises
+    ------
+    OptionError
+        If there is no such difficulty.
+    """
+    if difficulty not in _LIMITS:
+        raise OptionError(
+            f"difficulty is {difficulty!r}; choose one of {', '.join(get_args(Difficulty))}"
+        )
+    _, n_fish, n_bubbles, wall, _, _ = _LIMITS[difficulty]
+    pitch, yaw = np.deg2rad(rng.uniform(-20.0, 20.0, 2))
+    pose = dome_from_target(float(rng.uniform(0.3, 1.0)), float(pitch), float(yaw))
+    net = _net(rng, difficulty)
+    behind = float(rng.uniform(0.15, 0.9))
+    walls = (Wall(depth=behind, yaw=float(rng.normal(0.0, 0.1))),) if rng.random() < wall else ()
+    return Scene(
+        dome_from_scene=pose,
+        walls=walls,
+        nets=(net,),
+        fish=random_fish(rng, int(rng.integers(0, n_fish + 1)), 0.2, behind),
+        bubbles=random_bubbles(rng, int(rng.integers(0, n_bubbles + 1)), 0.2, behind),
+        target="net",
+        water=_water(rng, difficulty),
+    )
+
+
+def _net(rng: np.random.Generator, difficulty: str) -> Net:
+    fouling = _LIMITS[difficulty][0]
+    meshes: tuple[Mesh, ...] = get_args(Mesh)
+    bar, twine = float(rng.uniform(0.015, 0.050)), float(rng.uniform(0.001, 0.004))
+    return Net(
+        mesh=meshes[int(rng.integers(len(meshes)))],
+        bar=bar,
+        # A mesh of thick twine leaves openings of at least two thirds of the bar.
+        twine=min(twine, bar / 3.0),
+        roll=float(np.deg2rad(rng.uniform(0.0, 90.0))),
+        hanging_ratio=float(rng.uniform(0.5, 0.85)),
+        fouling=float(rng.uniform(0.0, fouling)),
+        offset=(float(rng.uniform(0.0, 0.1)), float(rng.uniform(0.0, 0.1))),
+        seed=int(rng.integers(256)),
+    )
+
+
+def _water(rng: np.random.Generator, difficulty: str) -> WaterOptics:
+    *_, glare, spread = _LIMITS[difficulty]
+    clear = WaterOptics()
+    factor = float(rng.uniform(1.0, spread)) if spread > 1.0 else 1.0
+    sunny = rng.random() < glare
+    red, green, blue = clear.attenuation
+    return WaterOptics(
+        attenuation=(red * factor, green * factor, blue * factor),
+        sheet_scatter=clear.sheet_scatter * factor**2,
+        forward_scatter=clear.forward_scatter * factor,
+        caustics=float(rng.uniform(0.2, 0.7)) if sunny else 0.0,
+        glare=float(rng.uniform(0.1, 0.5)) if sunny else 0.0,
+        snow=int(300 * (factor - 1.0)),
+    )
+
 
 _NET_MOTION: dict[str, Any] = {
     "range_mm": {"values": [350, 520, 430], "sway": 4, "period_s": 2.3},

@@ -285,7 +285,7 @@ class Scene:
     Attributes
     ----------
     dome_from_scene : SE3
-        Places the scene; see `aqualvs.simulation.trajectory.dome_from_target`.
+        Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
     walls, nets, fish, bubbles, boxes
         Surfaces.
     target : {"net", "wall", "none"}

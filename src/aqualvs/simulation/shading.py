@@ -6,7 +6,8 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
-from aqualvs.optics.sheet_kernels import START, WINDOWED, sheet_tangent
+from aqualvs.geometry.linear_algebra import Vec, along, dot, minus, row3, scaled, unit
+from aqualvs.optics.sheet import START, WINDOWED, sheet_tangent
 from aqualvs.simulation.lasers import (
     CUT,
     NORMAL,
@@ -28,7 +29,6 @@ from aqualvs.simulation.surfaces import (
     normal_and_albedo,
 )
 from aqualvs.simulation.textures import Tiles, sample
-from aqualvs.simulation.vectors import Vec, along, dot, minus, row3, scaled, unit
 
 # Light comes down steeply, leaning towards the target.
 _UP = (0.10, -0.42, 0.90)

@@ -6,14 +6,13 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
+from aqualvs.geometry.linear_algebra import Vec, along, combine, dot, minus, row3, scaled, unit
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.simulation.folds import N_COLUMNS as FOLD_COLUMNS
-from aqualvs.simulation.folds import pack_fold
-from aqualvs.simulation.net import N_COLUMNS as NET_COLUMNS
-from aqualvs.simulation.net import meet_net, pack_net, strand_albedo
+from aqualvs.simulation.net import FOLD_COLUMNS as FOLD_COLUMNS
+from aqualvs.simulation.net import NET_COLUMNS as NET_COLUMNS
+from aqualvs.simulation.net import meet_net, pack_fold, pack_net, strand_albedo
 from aqualvs.simulation.scene import Box, Fish, Scene, Wall
 from aqualvs.simulation.textures import Tiles, noise_tiles, sample
-from aqualvs.simulation.vectors import Vec, along, combine, dot, minus, row3, scaled, unit
 
 # Columns of the tables. A wall: origin on the plane, axes, albedo, contrast, pitch of its tiles.
 _ORIGIN, _AXIS_U, _AXIS_V, _NORMAL, _ALBEDO, _CONTRAST, _TILE = 0, 3, 6, 9, 12, 15, 16

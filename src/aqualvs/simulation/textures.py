@@ -1,11 +1,21 @@
-"""Periodic noise tiles that kernels look up instead of computing noise for every ray."""
+"""Periodic noise tiles that kernels look up instead of computing noise for every ray.
 
+What is printed on panels: boards, walls with markers, mottled grounds.
+
+A texture is a grid of equal square cells of one albedo each, so that every printed edge lies on an
+edge of the grid: an area's mean over it is exact, and no raster adds jaggies of its own.
+"""
+
+from dataclasses import dataclass, field
 from functools import cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
 
 TILE_SIZE = 512
@@ -78,3 +88,188 @@ def sample(tile: NDArray[np.float32], x: float, y: float) -> float:
 def white_at(white: NDArray[np.float32], i: int, j: int) -> float:
     """Return the uniform value that belongs to a pair of whole numbers."""
     return float(white[i & _WHITE_MASK, j & _WHITE_MASK])
+
+
+PAPER, INK = 0.82, 0.05
+"""Albedo of white paper and of black ink."""
+
+# Cells of a marker's black frame, each side.
+_FRAME = 1
+_EXACT = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Texture:
+    """A grid of square cells.
+
+    Attributes
+    ----------
+    albedo : array, shape (rows, columns)
+        Diffuse reflectance; rows go down, as in an image.
+    cell : float
+        Side of a cell, in metres.
+    """
+
+    albedo: FloatArray
+    cell: float
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height, in metres."""
+        rows, columns = self.albedo.shape
+        return columns * self.cell, rows * self.cell
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CharucoPrint:
+    """A ChArUco board as it is printed (OpenCV's current pattern).
+
+    Attributes
+    ----------
+    squares : (int, int)
+        Number of squares along x and y.
+    square, marker, border : float
+        Side of a square and of a marker, width of the light border, in metres.
+    dictionary : str
+        OpenCV's name of the markers' dictionary.
+    """
+
+    squares: tuple[int, int]
+    square: float
+    marker: float
+    border: float
+    dictionary: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkerPrint:
+    """Markers on one flat sheet, in cells of a texture.
+
+    Attributes
+    ----------
+    dictionary : str
+        OpenCV's name of their dictionary.
+    ids : int array, shape (M,)
+        Number of each in the dictionary.
+    corners : int array, shape (M, 2)
+        Column and row of each one's top-left corner, in cells.
+    side : int
+        Cells along a marker's side; a multiple of its bits and its frame together.
+    ring : int
+        Cells of white paper around each.
+    """
+
+    dictionary: str
+    ids: IntArray
+    corners: IntArray = field(repr=False)
+    side: int
+    ring: int
+
+
+def charuco_texture(board: CharucoPrint) -> Texture:
+    """Return a ChArUco board with its border.
+
+    Raises
+    ------
+    OptionError
+        If square, marker and border are not whole numbers of the markers' cells, or the dictionary
+        has too few markers.
+    """
+    book = _dictionary(board.dictionary)
+    cell = board.marker / (book.markerSize + 2 * _FRAME)
+    side, margin, border = (
+        _whole(length, cell, what)
+        for length, what in (
+            (board.square, "square"),
+            (0.5 * (board.square - board.marker), "margin around a marker"),
+            (board.border, "border"),
+        )
+    )
+    n_x, n_y = board.squares
+    if margin < 1 or n_x * n_y // 2 > len(book.bytesList):
+        raise OptionError(
+            f"a board of {n_x} x {n_y} squares with {board.dictionary}: too many markers for the "
+            "dictionary or for their squares; take fewer or smaller ones"
+        )
+    pattern = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, book)
+    white = pattern.generateImage((n_x * side, n_y * side), marginSize=0) > 127
+    return Texture(np.where(np.pad(white, border, constant_values=True), PAPER, INK), cell)
+
+
+def marker_texture(ground: FloatArray, cell: float, prints: MarkerPrint) -> Texture:
+    """Return a ground with markers on it, each in a ring of white paper.
+
+    Parameters
+    ----------
+    ground : array, shape (rows, columns)
+        Albedo of what the markers are glued to; it is not changed.
+    cell : float
+        Side of a cell, in metres.
+    prints : MarkerPrint
+        What is glued on.
+
+    Raises
+    ------
+    OptionError
+        If a marker's side is no multiple of its cells, or it does not lie on the ground.
+    """
+    book = _dictionary(prints.dictionary)
+    n_cells = book.markerSize + 2 * _FRAME
+    if prints.side % n_cells:
+        raise OptionError(f"a marker of {prints.side} cells; take a multiple of {n_cells}")
+    albedo = ground.copy()
+    reach = prints.side + prints.ring
+    for number, (column, row) in zip(prints.ids, prints.corners, strict=True):
+        top, left = row - prints.ring, column - prints.ring
+        if min(top, left) < 0 or row + reach > len(albedo) or column + reach > albedo.shape[1]:
+            raise OptionError(f"marker {number} at cell ({column}, {row}) is off its panel")
+        albedo[top : row + reach, left : column + reach] = PAPER
+        white = book.generateImageMarker(int(number), prints.side, borderBits=_FRAME) > 127
+        albedo[row : row + prints.side, column : column + prints.side] = np.where(white, PAPER, INK)
+    return Texture(albedo, cell)
+
+
+def mottled(
+    shape: tuple[int, int], albedo: float, contrast: float, *, scale: float = 1.0, shift: int = 0
+) -> FloatArray:
+    """Return an uneven ground (rows, columns): concrete, plywood.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    albedo : float
+        Mean.
+    contrast : float
+        Half the spread over the mean.
+    scale : float
+        Cells over which a texel of the noise is stretched.
+    shift : int
+        Another place in the noise, so that panels differ.
+    """
+    tile = noise_tiles().smooth
+    rows, columns = (((np.arange(n) / scale).astype(int) + shift) % len(tile) for n in shape)
+    noise = tile[np.ix_(rows, columns)].astype(np.float64)
+    return np.asarray(albedo * (1.0 + contrast * (2.0 * noise - 1.0)))
+
+
+def grid_corners(columns: ArrayLike, rows: ArrayLike) -> IntArray:
+    """Return the cells (M, 2), column and row, of a grid of markers, row by row."""
+    c, r = np.meshgrid(np.asarray(columns, np.int64), np.asarray(rows, np.int64))
+    return np.stack([c.ravel(), r.ravel()], axis=-1)
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    number = getattr(cv2.aruco, name.replace("h", "H"), None)
+    if number is None or not name.startswith("DICT_"):
+        raise OptionError(f"dictionary {name!r} is unknown; take one of OpenCV's, DICT_4X4_250 say")
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def _whole(length: float, cell: float, what: str) -> int:
+    count = round(length / cell)
+    if abs(count * cell - length) > _EXACT * cell:
+        raise OptionError(
+            f"{what} is {1e3 * length:g} mm, no multiple of a marker's cell of {1e3 * cell:g} mm"
+        )
+    return count

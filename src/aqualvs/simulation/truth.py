@@ -1,14 +1,156 @@
-"""One row of truth for every frame."""
+"""One row of truth for every frame.
 
-from typing import TypeAlias
+The truth of the stripes: where the middles of the laser sheets meet what the camera sees.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel
+from aqualvs.geometry.linear_algebra import row3
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.lit_points import LitPoints
+from aqualvs.simulation.lasers import (
+    COLOUR_BALANCED,
+    ColourFilters,
+    LaserSource,
+    Sheets,
+    fan_rays,
+    pack_sheets,
+)
 from aqualvs.simulation.scene import Label, Scene, Target
+from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
+
+# A point is seen when the camera's ray to it ends no farther than this before it. The twine's
+# grooves and growth, which depend a little on the ray's direction, stay within it.
+_SEEN_WITHIN = 5e-4
+# Below this fraction of the fan's power a stripe has faded out.
+_FAN_FLOOR = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LitPoints:
+    """Points on the middles of the stripes that the camera sees, N of them, ordered by laser.
+
+    Attributes
+    ----------
+    points_in_dome : array, shape (N, 3)
+        Metres. On twine they lie on its surface, not on the net plane.
+    pixels : array, shape (N, 2)
+        Exact projections in `image`.
+    laser : int32 array, shape (N,)
+        Index into `Rig.lasers`.
+    label : int32 array, shape (N,)
+        `Label` values.
+    """
+
+    points_in_dome: FloatArray
+    pixels: FloatArray
+    laser: NDArray[np.int32]
+    label: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.laser)
+
+
+def light_sheets(
+    rig: Rig,
+    sources: Sequence[LaserSource],
+    surfaces: Surfaces,
+    filters: ColourFilters = COLOUR_BALANCED,
+) -> Sheets:
+    """Return the tables of laser sheets with the distances at which surfaces end them."""
+    sheets = pack_sheets(rig, sources, filters)
+    for i in range(len(rig.lasers)):
+        origins, directions, way = fan_rays(rig, sheets, i)
+        sheets.first[i] = way + cast(origins, directions, surfaces).solid
+    return sheets
+
+
+def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
+    """Trace every sheet's middle from its source, project what it meets, drop what is hidden."""
+    found = [_lit_by(i, rig, surfaces, sheets) for i in range(len(sheets.table))]
+    points = np.concatenate([np.empty((0, 3)), *(p for p, _ in found)])
+    label = np.concatenate([np.empty(0, dtype=np.int32), *(kind for _, kind in found)])
+    laser = np.repeat(np.arange(len(found), dtype=np.int32), [len(p) for p, _ in found])
+    camera = rig.camera()
+    pixels, valid = camera.project(points)
+    seen = valid & camera.inside_image(pixels)
+    rays = camera.rays(pixels[seen])
+    reach = cast(rays.origins, rays.directions, surfaces).solid
+    distance = np.linalg.norm(points[seen] - rays.origins, axis=-1)
+    seen[seen] = rays.valid & (reach > distance - _SEEN_WITHIN)
+    return LitPoints(points[seen], pixels[seen], laser[seen], label[seen].astype(np.int32))
+
+
+def _lit_by(
+    i: int, rig: Rig, surfaces: Surfaces, sheets: Sheets
+) -> tuple[FloatArray, NDArray[np.int32]]:
+    """Points and labels that sheet i lights; bubbles cast no shadow, so both may be on one ray."""
+    origins, directions, way = fan_rays(rig, sheets, i)
+    reach, kind, bubble = cast(origins, directions, surfaces)
+    strong = (sheets.fan[i] > _FAN_FLOOR) & np.isfinite(way)
+    solid, clear = strong & np.isfinite(reach), strong & (bubble < reach)
+    points = np.concatenate(
+        [
+            origins[solid] + reach[solid, None] * directions[solid],
+            origins[clear] + bubble[clear, None] * directions[clear],
+        ]
+    )
+    on_bubbles = np.full(int(clear.sum()), Label.BUBBLE, dtype=np.int32)
+    return points, np.concatenate([kind[solid].astype(np.int32), on_bubbles])
+
+
+class Reach(NamedTuple):
+    """What rays meet, shape (n,) each.
+
+    Attributes
+    ----------
+    solid : array
+        Distance of the first opaque surface in metres; infinite where there is none.
+    kind : int array
+        Its `Label`.
+    bubble : array
+        Distance of the first bubble.
+    """
+
+    solid: FloatArray
+    kind: IntArray
+    bubble: FloatArray
+
+
+def cast(origins: FloatArray, directions: FloatArray, surfaces: Surfaces) -> Reach:
+    """Return what rays, origins and unit directions of shape (n, 3) in `dome`, meet first."""
+    n = len(origins)
+    reach = Reach(np.empty(n), np.empty(n, dtype=np.int64), np.empty(n))
+    everything = (np.arange(len(surfaces.ellipsoids)), np.arange(len(surfaces.bubbles)))
+    _cast_all(
+        np.ascontiguousarray(origins), np.ascontiguousarray(directions), surfaces, everything, reach
+    )
+    return reach
+
+
+@borrowing_kernel
+def _cast_all(
+    origins: FloatArray,
+    directions: FloatArray,
+    s: Surfaces,
+    everything: tuple[IntArray, IntArray],
+    out: Reach,
+) -> None:
+    ellipsoids, bubbles = everything
+    for k in range(origins.shape[0]):
+        o, d = row3(origins, k, 0), row3(directions, k, 0)
+        hit = first_hit(o, d, s, ellipsoids, 0, ellipsoids.shape[0])
+        out.solid[k], out.kind[k] = hit.t, hit.kind
+        out.bubble[k] = meet_bubbles(o, d, s, bubbles, 0, bubbles.shape[0])[0]
+
 
 Cell: TypeAlias = int | float | str
 

@@ -2,8 +2,8 @@
 
 from typing import Protocol
 
-from aqualvs.live.health import PartHealth
-from aqualvs.live.sample import LiveSample
+from aqualvs.recording.sample import LiveSample
+from aqualvs.sources.base import PartHealth
 
 
 class Output(Protocol):

@@ -3,12 +3,12 @@
 import math
 from typing import Any
 
-from aqualvs.live.health import PartHealth
-from aqualvs.live.mavlink_link import LinkOptions, MavlinkLink
-from aqualvs.live.sample import LiveSample
-from aqualvs.live.time_filter import FilteredPosture
+from aqualvs.control.time_filter import FilteredPosture
+from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
+from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import ScanPoints
+from aqualvs.sources.base import PartHealth
 
 # The scanner believes a range that is beyond the working range by one part in a hundred.
 _RANGE_TOLERANCE = 0.01

@@ -1,16 +1,291 @@
-"""To ROS 1: posture, range, cloud and diagnostics as topics of a node."""
+"""To ROS 1: posture, range, cloud and diagnostics as topics of a node.
 
+A ROS 1 node in plain Python: known to roscore, found by subscribers.
+
+`rospy` would tie us to the Python of a ROS release (3.8 on Noetic), waits for roscore without end
+when it starts, never comes back when roscore was restarted, and can be started once in a process.
+What a publisher needs of the protocol is little (http://wiki.ros.org/ROS/Slave_API, Master_API).
+"""
+
+import http.client
+import logging
 import os
 import re
+import socket
+import socketserver
+import threading
+import xmlrpc.client
+import xmlrpc.server
 from collections import Counter
 from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit
 
 from aqualvs.errors import OptionError
-from aqualvs.live.health import PartHealth, State
-from aqualvs.live.outputs.ros1_messages import ROS1_TYPES, to_ros1
-from aqualvs.live.outputs.ros1_node import DEFAULT_MASTER, Ros1Node
+from aqualvs.live.outputs.ros1_links import ROS1_TYPES, Ros1Links, Ros1Type, to_ros1
 from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
-from aqualvs.live.sample import LiveSample
+from aqualvs.recording.sample import LiveSample
+from aqualvs.sources.base import PartHealth, State
+
+DEFAULT_MASTER = "http://localhost:11311"
+_ASK_EVERY_S = 2.0
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
+_MASTER_S = 2.0
+_PATIENCE_S = 3.0
+# No packet is ever sent there; the system is only asked which way it would go.
+_FAR_AWAY = "198.51.100.1"
+_TROUBLE = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError)
+_log = logging.getLogger(__name__)
+
+
+class Ros1Node:
+    """Publishes topics; registers with roscore, whenever it is there.
+
+    Parameters
+    ----------
+    name : str
+        Full name, such as `/aqualvs`.
+    topics : mapping
+        Type of each topic by its full name.
+    master_uri : str
+        Where roscore is.
+    environment : mapping
+        `ROS_HOSTNAME` or `ROS_IP`: the name that subscribers reach this machine by.
+
+    Raises
+    ------
+    OptionError
+        If `master_uri` is no address.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        topics: Mapping[str, Ros1Type],
+        master_uri: str,
+        environment: Mapping[str, str] = os.environ,
+    ) -> None:
+        self.name, self._topics, self.master_uri = name, dict(topics), master_uri
+        self._host = advertised_host(master_host(master_uri), environment)
+        self._stop = threading.Event()
+        self._trouble, self._ended = "not registered yet", ""
+        at = "127.0.0.1" if _is_loopback(self._host) else "0.0.0.0"
+        self.links = Ros1Links(at, name, topics)
+        self._server = _Server(at, _SlaveApi(self))
+        self.uri = f"http://{self._host}:{self._server.port}/"
+        self._keeper = threading.Thread(target=self._keep, name="ros1 node", daemon=True)
+        self._keeper.start()
+
+    @property
+    def topics(self) -> dict[str, Ros1Type]:
+        """Types by topic."""
+        return self._topics
+
+    @property
+    def tcpros(self) -> list[Any]:
+        """How subscribers connect, in the protocol's words."""
+        return ["TCPROS", self._host, self.links.port]
+
+    @property
+    def trouble(self) -> str:
+        """Why nobody can find the node, in a few words; empty where roscore knows it."""
+        return self._ended or self._trouble
+
+    def leave(self, reason: str) -> None:
+        """End as ROS demands it: another node has taken the name, or `rosnode kill`."""
+        self._ended = f"ended by ROS: {reason}"
+        _log.warning("%s %s", self.name, self._ended)
+        self._stop.set()
+        self.links.close()
+
+    def close(self) -> None:
+        """Say good-bye to roscore and subscribers, within some seconds; once is enough."""
+        self._stop.set()
+        self._keeper.join(_PATIENCE_S)
+        self._server.close()
+        self.links.close()
+
+    def _keep(self) -> None:
+        """See to it that roscore knows the node, also one that was restarted."""
+        wait_s, registered, next_wait_s = 0.0, False, _FIRST_WAIT_S
+        while not self._stop.wait(wait_s):
+            try:
+                with _master(self.master_uri) as master:
+                    if not (registered and self._is_known(master)):
+                        self._register(master)
+            except _TROUBLE as fault:
+                registered = False
+                self._trouble = f"no roscore at {self.master_uri} ({fault})"
+                wait_s, next_wait_s = next_wait_s, min(2.0 * next_wait_s, _LONGEST_WAIT_S)
+            else:
+                registered, self._trouble = True, ""
+                wait_s, next_wait_s = _ASK_EVERY_S, _FIRST_WAIT_S
+        if registered:
+            self._unregister()
+
+    def _is_known(self, master: xmlrpc.client.ServerProxy) -> bool:
+        code, _, uri = _answer(master.lookupNode(self.name, self.name))
+        return code == 1 and uri == self.uri
+
+    def _register(self, master: xmlrpc.client.ServerProxy) -> None:
+        for topic, kind in self._topics.items():
+            code, told, _ = _answer(master.registerPublisher(self.name, topic, kind.name, self.uri))
+            if code != 1:
+                raise ValueError(f"{topic} refused: {told}")
+
+    def _unregister(self) -> None:
+        try:
+            with _master(self.master_uri) as master:
+                for topic in self._topics:
+                    master.unregisterPublisher(self.name, topic, self.uri)
+        except _TROUBLE as fault:
+            _log.info("roscore went before %s: %s", self.name, fault)
+
+
+class _SlaveApi:
+    """What roscore and subscribers may ask of a node; each answer is (code, message, value)."""
+
+    def __init__(self, node: Ros1Node) -> None:
+        self._node = node
+
+    def _dispatch(self, method: str, params: tuple[Any, ...]) -> list[Any]:
+        """Answer a call."""
+        node = self._node
+        match method, *params:
+            case "requestTopic", _, str(topic), list(protocols):
+                return self._request(topic, protocols)
+            case "getPid", _:
+                return [1, "", os.getpid()]
+            case "getMasterUri", _:
+                return [1, "", node.master_uri]
+            case "getPublications", _:
+                return [1, "", [[topic, kind.name] for topic, kind in node.topics.items()]]
+            case "getBusInfo", _:
+                pairs = enumerate(node.links.connections())
+                return [1, "", [[i, who, "o", "TCPROS", what, True] for i, (who, what) in pairs]]
+            case "getSubscriptions", _:
+                return [1, "", []]
+            case "getBusStats", _:
+                return [1, "", [[], [], []]]
+            case (("publisherUpdate" | "paramUpdate"), *_):
+                return [1, "", 0]
+            case "shutdown", *said:
+                node.leave(str(said[1]) if len(said) > 1 else "no reason given")
+                return [1, "", 0]
+        return [-1, f"{method}: not understood", 0]
+
+    def _request(self, topic: str, protocols: list[Any]) -> list[Any]:
+        if topic not in self._node.topics:
+            return [-1, f"{topic} is not published by {self._node.name}", []]
+        if not any(protocol and protocol[0] == "TCPROS" for protocol in protocols):
+            return [0, "TCPROS only", []]
+        return [1, "ready", self._node.tcpros]
+
+
+class _QuietHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
+    rpc_paths = ("/", "/RPC2")
+    timeout = 5.0
+
+
+class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
+    """Answers calls, each in a thread that nobody waits for."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, host: str, api: _SlaveApi) -> None:
+        super().__init__((host, 0), _QuietHandler, logRequests=False)
+        self.register_instance(api)
+        self._thread = threading.Thread(
+            target=self.serve_forever, args=(0.1,), name="ros1 calls", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        return int(self.server_address[1])
+
+    def handle_error(self, *_: object) -> None:
+        """Take note of a caller that went away or talked nonsense, and no more."""
+        _log.debug("a call failed", exc_info=True)
+
+    def close(self) -> None:
+        self.shutdown()
+        self._thread.join(_PATIENCE_S)
+        self.server_close()
+
+
+class _Transport(xmlrpc.client.Transport):
+    """Gives up on a roscore that does not answer."""
+
+    def make_connection(self, host: Any) -> http.client.HTTPConnection:
+        connection = super().make_connection(host)
+        connection.timeout = _MASTER_S
+        return connection
+
+
+def _master(uri: str) -> xmlrpc.client.ServerProxy:
+    return xmlrpc.client.ServerProxy(uri, transport=_Transport())
+
+
+def _answer(value: Any) -> tuple[int, str, Any]:
+    """Return the three parts of roscore's answer.
+
+    Raises
+    ------
+    ValueError
+        If it is no such answer: something else listens at that port.
+    """
+    if not (isinstance(value, list) and len(value) == 3):
+        raise ValueError("what answers there is not roscore")
+    return value[0], value[1], value[2]
+
+
+def master_host(uri: str) -> str:
+    """Return the host in the address of roscore.
+
+    Raises
+    ------
+    OptionError
+        If it is no address.
+    """
+    parts = urlsplit(uri)
+    try:
+        sound = parts.scheme == "http" and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        sound = False
+    if not sound:
+        raise OptionError(f"ROS_MASTER_URI {uri!r}: write it as {DEFAULT_MASTER}")
+    return str(parts.hostname)
+
+
+def advertised_host(roscore: str, environment: Mapping[str, str]) -> str:
+    """Return the name or number by which subscribers reach this machine.
+
+    `ROS_HOSTNAME` or `ROS_IP`, as for every node; else the address that leads to roscore; else,
+    with roscore on this machine, the one that leads out of it, so that others can listen too.
+    """
+    named = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP")
+    if named:
+        return named
+    own = _address_towards(roscore)
+    if own is None or _is_loopback(own):
+        own = _address_towards(_FAR_AWAY)
+    return own or "127.0.0.1"
+
+
+def _address_towards(host: str) -> str | None:
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((host, 9))
+            return str(probe.getsockname()[0])
+    except OSError:
+        return None
+
+
+def _is_loopback(host: str) -> bool:
+    return host == "localhost" or host.startswith("127.")
+
 
 _NODE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 

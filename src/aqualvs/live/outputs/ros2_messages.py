@@ -9,12 +9,13 @@ from aqualvs.live.outputs.ros_messages import (
     POINT_FIELDS,
     POINT_TYPE,
     CloudMessage,
+    DiagnosticsMessage,
     Message,
     PoseMessage,
     RangeMessage,
+    Status,
     Topic,
 )
-from aqualvs.live.outputs.ros_messages_diagnostics import DiagnosticsMessage, Status
 
 INFRARED = 1
 """`Range.radiation_type`: the message knows sound and light only."""

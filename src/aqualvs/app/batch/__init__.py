@@ -1,1 +1,0 @@
-"""Many dives at once: cut into pieces, measured by many processes, joined again."""

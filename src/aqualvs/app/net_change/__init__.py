@@ -1,1 +1,0 @@
-"""The same net on several dates: how fouling grew, which holes are new."""

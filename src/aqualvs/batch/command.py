@@ -1,0 +1,233 @@
+"""`aqualvs batch`: a season's dives, on this machine or on many."""
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from aqualvs.batch.cluster import DaskWorkers
+from aqualvs.batch.dataset import clear, read_seal, write_dives
+from aqualvs.batch.dives import Dive, find_dives, name_dives
+from aqualvs.batch.merge import JOINED
+from aqualvs.batch.records import BatchProgress, DiveRecord, DiveState
+from aqualvs.batch.scheduler import Season, known_net
+from aqualvs.batch.summary_page import SUMMARY_HTML, write_summary
+from aqualvs.batch.work import PIECE_FRAMES, DiveWork, size_of
+from aqualvs.errors import OptionError, OutputError
+from aqualvs.nets.target_file import NetRequest
+from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, writing
+from aqualvs.results.run_request import RunRequest, Water
+from aqualvs.scanner import ScannerOptions
+from aqualvs.terminal import StopSignals
+
+DIVES, DATASET, HOME = "dives", "dataset", ".batch"
+"""Folders of a batch: results by dive, the data set, and what is under way."""
+
+_NAMES, _LOCK = "names.json", "lock"
+_EXIT_INCOMPLETE = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchRequest:
+    """What to measure, with what, and where.
+
+    Attributes
+    ----------
+    dives : tuple of str
+        As `find_dives` takes them.
+    out : Path
+        Folder to write, or of an earlier batch to go on with.
+    rig : Path or None
+        As `find_dives` takes it.
+    water : Water
+    scheduler : str or None
+        Address of a Dask scheduler; None works on this machine.
+    n_workers : int or None
+        Processes on this machine; None for one per core.
+    no_dome : bool
+    fps : float or None
+        Of folders of images.
+    scanner : ScannerOptions
+    chosen : frozenset of str or None
+        As in `RunRequest`.
+    target : str
+    index_target : Path or None
+    report : bool
+        Whether each dive gets its report.
+    net : NetRequest or None
+        What to find out about the net of each dive, if anything; logs are those of the dives.
+    piece_frames : int
+        Frames that a piece of a dive has at least.
+    """
+
+    dives: tuple[str, ...]
+    out: Path
+    rig: Path | None = None
+    water: Water = field(default_factory=Water)
+    scheduler: str | None = None
+    n_workers: int | None = None
+    no_dome: bool = False
+    fps: float | None = None
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    chosen: frozenset[str] | None = None
+    target: str = "auto"
+    index_target: Path | None = None
+    report: bool = True
+    net: NetRequest | None = None
+    piece_frames: int = PIECE_FRAMES
+
+
+def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
+    """Measure dives, tell how it goes line by line, and write results, summary and data set.
+
+    What an earlier batch in the same folder has finished, of the same dives with the same rig,
+    options and versions, is checked and taken as it is.
+
+    Returns
+    -------
+    exit_code : int
+        0 if all dives are finished, 1 if one is not, 128 + signal if it was stopped.
+
+    Raises
+    ------
+    AqualvsError
+        If nothing can be begun: no such dive, a dive without a rig, a folder that cannot be
+        written, no workers.
+    """
+    _check(request)
+    dives = find_dives(request.dives, rig=request.rig, water=request.water, out=request.out)
+    # What an earlier batch of this folder has finished is gone on with, not replaced.
+    files = [request.out / name for name in (SUMMARY_HTML, DIVES, DATASET)]
+    known = files if (request.out / HOME).is_dir() else []
+    claim = Claim("batch", files, overwrite=True, known=known)
+    with writing(request.out):
+        (request.out / HOME).mkdir(parents=True, exist_ok=True)
+    lock = request.out / HOME / _LOCK
+    if is_locked(lock):
+        raise OutputError(f"{request.out}: another batch is under way here; wait for its end")
+    with writing(lock):
+        held = _locked(lock)
+    with closing(held):
+        with writing(request.out):
+            works = _works(request, dives)
+        with (
+            StopSignals() as stop,
+            DaskWorkers(request.n_workers, request.scheduler) as workers,
+            BatchProgress(len(works), tell) as progress,
+        ):
+            if request.scheduler is not None:
+                workers.check_sight(lock)
+            sized = [(work, size_of(Path(work.request.source))) for work in works]
+            found = Season(sized, workers, progress).run(lambda: stop.caught is not None)
+        records = _all_records(request.out, found)
+        with writing(request.out):
+            _tidy(request.out / HOME)
+            (request.out / DATASET).mkdir(exist_ok=True)
+            write_dives(request.out / DATASET, [record.row() for record in records])
+        for line in _summary_lines(
+            request, found, stopped_by=stop.caught.name if stop.caught else ""
+        ):
+            tell(line)
+        tell(f"summary: {write_summary(request.out, records)}")
+    claim.close()
+    if stop.caught:
+        return stop.exit_code
+    unfinished = [r for r in found.values() if r.state is not DiveState.FINISHED]
+    return _EXIT_INCOMPLETE if unfinished else 0
+
+
+def _check(request: BatchRequest) -> None:
+    if not request.dives:
+        raise OptionError("DIVES: missing; name videos, folders, patterns or a list of dives")
+    if request.scheduler is not None and request.n_workers is not None:
+        raise OptionError("--workers: the scheduler has its own workers; leave one of them out")
+    if request.n_workers is not None and request.n_workers < 1:
+        raise OptionError(f"--workers {request.n_workers}: give at least 1")
+
+
+def _locked(path: Path) -> AppendFile:
+    file = AppendFile(path)
+    file.lock()
+    return file
+
+
+def _works(request: BatchRequest, dives: Sequence[Dive]) -> list[DiveWork]:
+    """Return the work for each dive, under the name that it has in the folder for good."""
+    out = request.out.resolve()
+    known = _known_names(out)
+    names = name_dives([(dive.source, dive.name) for dive in dives], known)
+    known |= {str(dive.source): name for dive, name in zip(dives, names, strict=True)}
+    path = out / HOME / _NAMES
+    draft = path.with_name(f"{_NAMES}.part")
+    draft.write_text(json.dumps(known, indent=1, ensure_ascii=False), encoding="utf-8")
+    os.replace(draft, path)
+    return [_work(request, dive, name, out) for dive, name in zip(dives, names, strict=True)]
+
+
+def _work(request: BatchRequest, dive: Dive, name: str, out: Path) -> DiveWork:
+    index_target = request.index_target
+    run = RunRequest(
+        source=str(dive.source),
+        rig=dive.rig,
+        out=out / DIVES / name,
+        water=dive.water,
+        no_dome=request.no_dome,
+        fps=request.fps if dive.source.is_dir() else None,
+        scanner=request.scanner,
+        chosen=request.chosen,
+        report=request.report,
+        index_target=None if index_target is None else index_target.resolve(),
+        target=request.target,
+        net=request.net and replace(request.net, log=dive.log, log_offset_s=dive.log_offset_s),
+    )
+    return DiveWork(
+        name=name,
+        request=run,
+        home=out / HOME / DIVES / name,
+        dataset=out / DATASET,
+        piece_frames=request.piece_frames,
+    )
+
+
+def _known_names(out: Path) -> dict[str, str]:
+    """Return source to name of all dives that this folder has ever had."""
+    try:
+        found = read_json(out / HOME / _NAMES)
+    except (OSError, ValueError):
+        return {}
+    return {str(key): str(value) for key, value in found.items()}
+
+
+def _tidy(home: Path) -> None:
+    """Remove what processes left that were killed."""
+    for path in list(home.rglob("*.part")):
+        clear(path)
+        if path.is_file():
+            path.unlink(missing_ok=True)
+
+
+def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]:
+    """Return how all dives of the folder stand, those of earlier batches too, by name."""
+    records = dict(found)
+    for source, name in _known_names(out).items():
+        seal = read_seal(out / HOME / DIVES / name / JOINED)
+        if name not in records and seal is not None:
+            facts = seal["facts"] | known_net(out / HOME / DIVES / name, seal["key"])
+            records[name] = DiveRecord.of(name, source, facts, reused=True)
+    return [records[name] for name in sorted(records, key=str.casefold)]
+
+
+def _summary_lines(
+    request: BatchRequest, found: Mapping[str, DiveRecord], stopped_by: str
+) -> list[str]:
+    counts: dict[DiveState, int] = {}
+    for record in found.values():
+        counts[record.state] = counts.get(record.state, 0) + 1
+    lines = [f"{len(found)} dives: " + ", ".join(f"{n} {s.value}" for s, n in counts.items())]
+    if stopped_by:
+        lines.append(
+            f"stopped by {stopped_by}; what is finished is kept, the same command goes on from here"
+        )
+    return [*lines, f"data set: {request.out / DATASET}"]

@@ -1,0 +1,334 @@
+"""The batch's Parquet data set: one partition for each dive, in folders `dive=NAME`.
+
+::
+
+    dataset/posture/dive=NAME/posture.parquet   one row for every frame
+    dataset/points/dive=NAME/points.parquet     one row for every stripe point
+    dataset/net/dive=NAME/net.parquet           one row for every stretch of net, if told
+    dataset/holes/dive=NAME/holes.parquet       one row for every hole in it, if told
+    dataset/dives.parquet                       one row for every dive
+
+Folders that are whole or not there: finished work with its checksums, kept for the next time.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import uuid
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import csv, parquet
+
+from aqualvs.results.files import read_json
+from aqualvs.results.folder import HOLES_CSV, NET_CSV, POINTS_PARQUET, POSTURE_CSV
+
+SEAL = "done.json"
+"""Written last; says for what the content of a folder was made, and what it is."""
+
+_BLOCK = 1 << 20
+
+
+def seal(
+    folder: Path,
+    key: str,
+    facts: Mapping[str, Any],
+    names: Sequence[str],
+    place: Path | None = None,
+) -> None:
+    """Declare files in a folder finished.
+
+    Parameters
+    ----------
+    folder : Path
+    key : str
+        What the files were made from.
+    facts : mapping
+        To be had back; ready for JSON.
+    names : sequence of str
+        The files, which are read for their checksums.
+    place : Path or None
+        Where the files are, if not in `folder`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    files = {name: _fingerprint((place or folder) / name) for name in names}
+    content = {"key": key, "files": files, "facts": dict(facts)}
+    draft = folder / f"{SEAL}.{uuid.uuid4().hex[:8]}.part"
+    draft.write_text(json.dumps(content), encoding="utf-8")
+    os.replace(draft, folder / SEAL)
+
+
+def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
+    """Return the facts of finished work, None unless it is there, made for `key`, and intact.
+
+    Parameters
+    ----------
+    folder : Path
+        With the seal.
+    key : str
+        As in `seal`.
+    place : Path or None
+        Where the files are, if not in `folder`.
+    """
+    content = read_seal(folder)
+    if content is None or content["key"] != key:
+        return None
+    try:
+        for name, fingerprint in content["files"].items():
+            if _fingerprint((place or folder) / name) != fingerprint:
+                return None
+    except OSError:
+        return None
+    facts: dict[str, Any] = content["facts"]
+    return facts
+
+
+def read_seal(folder: Path) -> dict[str, Any] | None:
+    """Return the content of a seal, None where there is none that can be read."""
+    try:
+        content = read_json(folder / SEAL)
+    except (OSError, ValueError):
+        return None
+    whole = isinstance(content, dict) and {"key", "files", "facts"} <= set(content)
+    return content if whole else None
+
+
+@contextlib.contextmanager
+def drafted(folder: Path) -> Iterator[Path]:
+    """Yield a folder to fill, which becomes `folder` at the end; nothing is left after a fault.
+
+    Two processes may fill the same folder at a time, as when one of them was taken for dead: the
+    first to finish wins, and the other's work is dropped.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    draft = folder.with_name(f"{folder.name}.{uuid.uuid4().hex[:8]}.part")
+    draft.mkdir(parents=True)
+    try:
+        yield draft
+        _publish(draft, folder)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def scratch(home: Path, name: str) -> Iterator[Path]:
+    """Yield a new folder below another, which is gone at the end."""
+    folder = home / f"{name}-{uuid.uuid4().hex[:8]}.part"
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        clear(folder)
+
+
+def clear(folder: Path) -> None:
+    """Remove a folder and all that is in it, if it is there."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _publish(draft: Path, folder: Path) -> None:
+    try:
+        os.rename(draft, folder)
+    except OSError:
+        seal_ours, seal_theirs = read_seal(draft), read_seal(folder)
+        if (
+            seal_ours is not None
+            and seal_theirs is not None
+            and (sealed(folder, seal_ours["key"]) is not None)
+        ):
+            return
+        clear(folder)
+        os.rename(draft, folder)
+
+
+def _fingerprint(path: Path) -> list[int]:
+    """Return size and CRC-32 of a file."""
+    size, checksum = 0, 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            size += len(block)
+            checksum = zlib.crc32(block, checksum)
+    return [size, checksum]
+
+
+DIVES_PARQUET = "dives.parquet"
+
+_COUNTS = (
+    *("frame", "n_points", "first_frame", "last_frame", "n_frames"),
+    *("stretch", "piece", "hole", "n_looks"),
+)
+# Of columns in CSV files; all others hold numbers.
+_TYPES = dict.fromkeys(_COUNTS, pa.int32()) | {
+    **dict.fromkeys(("reason", "mesh", "placed_by"), pa.string()),
+    "valid": pa.bool_(),
+}
+_OF_NET = (NET_CSV, HOLES_CSV)
+DIVES_SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in ("dive", "source", "rig", "rig_file", "state", "words")),
+        *((name, pa.int64()) for name in ("n_frames", "n_valid")),
+        *(
+            (name, pa.float64())
+            for name in ("duration_s", "range_median_m", "range_min_m", "range_max_m", "n_water")
+        ),
+        ("lasers", pa.string()),
+        ("net_holes", pa.int64()),
+        *(
+            (name, pa.float64())
+            for name in (
+                "net_area_m2",
+                "net_bar_mm",
+                "net_twine_mm",
+                "net_solidity",
+                "net_fouling",
+                "net_largest_hole_mm",
+            )
+        ),
+    ]
+)
+"""Columns of `dives.parquet`; `state` is finished, incomplete or failed, `words` says why.
+
+Those of the net are null where its state was not told."""
+
+
+def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
+    """Put a run's posture and points into the data set, in place of what is there of this dive.
+
+    The points are not stored twice where the file system can give one file two names.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    _put_table(dataset, name, run_folder / POSTURE_CSV, null_words=False)
+    with _replacing(_partition(dataset, name, POINTS_PARQUET)) as draft:
+        try:
+            os.link(run_folder / POINTS_PARQUET, draft)
+        except OSError:
+            shutil.copyfile(run_folder / POINTS_PARQUET, draft)
+
+
+def holds_dive(dataset: Path, name: str) -> bool:
+    """Return whether both partitions of a dive are there."""
+    return _holds(dataset, name, (POSTURE_CSV, POINTS_PARQUET))
+
+
+def drop_dive(dataset: Path, name: str) -> None:
+    """Remove the partitions of a dive, if they are there."""
+    _drop(dataset, name, (POSTURE_CSV, POINTS_PARQUET, *_OF_NET))
+
+
+def put_net(dataset: Path, name: str, folder: Path) -> None:
+    """Put the state of a dive's net into the data set, in place of what is there of this dive.
+
+    Parameters
+    ----------
+    dataset : Path
+    name : str
+        Of the dive.
+    folder : Path
+        With `net.csv` and `holes.csv`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    for table in _OF_NET:
+        _put_table(dataset, name, folder / table, null_words=True)
+
+
+def holds_net(dataset: Path, name: str) -> bool:
+    """Return whether both partitions of a dive's net are there."""
+    return _holds(dataset, name, _OF_NET)
+
+
+def drop_net(dataset: Path, name: str) -> None:
+    """Remove the partitions of a dive's net, if they are there."""
+    _drop(dataset, name, _OF_NET)
+
+
+def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write `dives.parquet`.
+
+    Parameters
+    ----------
+    dataset : Path
+    rows : iterable of mappings
+        With the columns of `DIVES_SCHEMA`; absent ones are null.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=DIVES_SCHEMA)
+    with _replacing(dataset / DIVES_PARQUET) as draft:
+        parquet.write_table(table, draft, compression="zstd")
+
+
+def posture_table(posture_csv: Path) -> Any:
+    """Return `posture.csv` as a table; numbers that a frame has not are null."""
+    return _table(posture_csv, null_words=False)
+
+
+def _table(path: Path, *, null_words: bool) -> Any:
+    """Return a CSV file as a table; numbers that are not there are null, and words if wanted."""
+    with path.open(encoding="utf-8") as file:
+        columns = file.readline().rstrip("\n").split(",")
+    convert = csv.ConvertOptions(
+        column_types={column: _TYPES.get(column, pa.float64()) for column in columns},
+        null_values=[""],
+        strings_can_be_null=null_words,
+        true_values=["1"],
+        false_values=["0"],
+    )
+    # One thread: the process has one core to itself.
+    read = csv.ReadOptions(use_threads=False)
+    return csv.read_csv(path, read_options=read, convert_options=convert)
+
+
+def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> None:
+    with _replacing(_partition(dataset, name, path.name)) as draft:
+        parquet.write_table(_table(path, null_words=null_words), draft, compression="zstd")
+
+
+def _holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:
+    return all(_partition(dataset, name, table).is_file() for table in tables)
+
+
+def _drop(dataset: Path, name: str, tables: Iterable[str]) -> None:
+    for table in tables:
+        shutil.rmtree(_partition(dataset, name, table).parent, ignore_errors=True)
+
+
+def _partition(dataset: Path, name: str, table: str) -> Path:
+    """Return where a dive's part of a table is, which is called after a file of its run."""
+    stem = Path(table).stem
+    return dataset / stem / f"dive={name}" / f"{stem}.parquet"
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield the path of a draft that takes the place of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Readers of data sets pass over what begins with an underscore.
+    draft = path.with_name(f"_{path.stem}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        yield draft
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)

@@ -1,0 +1,403 @@
+"""Which dives a batch is about: files, folders, patterns and lists, and the rig of each dive.
+
+Names of dives: folders and partitions that keep dives of the same file name apart.
+
+Lists of dives, as CSV or YAML.
+
+::
+
+    dive,rig,name,water_n,temperature_c,salinity,log,log_offset_s
+    north/0412.mp4,rig_april.yaml,north_april,,6.5,34,north/0412.tlog,
+    north/0610.mp4,rig_june.yaml,north_june,,9.0,33,north/0610.BIN,-3.2
+
+or the same as a list of mappings in YAML. Only `dive` is needed; paths are relative to the list.
+"""
+
+import csv
+import glob
+import math
+import re
+import unicodedata
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from aqualvs.errors import OptionError, RigError, SourceError
+from aqualvs.recording import is_recording
+from aqualvs.results.folder import RUN_YAML
+from aqualvs.results.run_request import Water
+from aqualvs.sources.images import IMAGE_SUFFIXES
+from aqualvs.yamlfile import parse_yaml, read_text
+
+_LONGEST = 80
+_DEEPEST = 4
+
+
+def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) -> list[str]:
+    """Return a name for every dive, no two the same, whatever the file system makes of case.
+
+    Parameters
+    ----------
+    sources : sequence of (Path, str)
+        Where a dive is, and the name that the user gives it, if any. A dive without is named after
+        its file; where that is taken, with the folders before it, as many as it needs.
+    known : mapping
+        Source to the name that an earlier batch in the same folder gave it, and which stays.
+
+    Returns
+    -------
+    names : list of str
+        They begin with a letter, so that no reader takes them for numbers or dates, and hold
+        letters, digits, dots, underscores and hyphens.
+
+    Raises
+    ------
+    OptionError
+        If the user gives one name to two dives.
+    """
+    names = {str(path): known[str(path)] for path, given in sources if _keeps(path, given, known)}
+    for path, given in sources:
+        if given:
+            # Another dive's name for good: what the earlier batch wrote under it would be lost.
+            others = {name for source, name in {**known, **names}.items() if source != str(path)}
+            if _folded(safe_name(given)) in map(_folded, others):
+                raise OptionError(f"name {given!r}: is that of another dive; choose another")
+            names[str(path)] = safe_name(given)
+    unnamed = [path for path, _ in sources if str(path) not in names]
+    taken = {_folded(name) for name in (*known.values(), *names.values())}
+    names |= {str(path): name for path, name in zip(unnamed, _own(unnamed, taken), strict=True)}
+    return [names[str(path)] for path, _ in sources]
+
+
+def safe_name(text: str) -> str:
+    """Return a text as part of a path that every system and every reader of Parquet takes."""
+    text = unicodedata.normalize("NFC", text)
+    text = "".join(c if c.isalnum() or c in "._-" else "_" for c in text)
+    text = re.sub("_+", "_", text).strip("._")[:_LONGEST].rstrip("._")
+    return text if text[:1].isalpha() else f"dive_{text}".rstrip("_")
+
+
+def _keeps(path: Path, given: str, known: Mapping[str, str]) -> bool:
+    return str(path) in known and (not given or safe_name(given) == known[str(path)])
+
+
+def _own(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
+    """Return names after the files; those that clash all get more of their path."""
+    used, names = set(taken), dict.fromkeys(paths, "")
+    waiting = list(names)
+    for depth in range(1, _DEEPEST + 1):
+        called = {path: _called(path, depth) for path in waiting}
+        counted = [_folded(name) for name in called.values()]
+        for path, name in called.items():
+            if counted.count(_folded(name)) == 1 and _folded(name) not in used:
+                names[path] = name
+        used |= {_folded(name) for name in names.values() if name}
+        waiting = [path for path in waiting if not names[path]]
+    for path in waiting:
+        names[path] = _numbered(_called(path, _DEEPEST), used)
+        used.add(_folded(names[path]))
+    return [names[path] for path in paths]
+
+
+def _called(path: Path, depth: int) -> str:
+    folders = [part for part in path.parent.parts if part.strip("/\\")]
+    own = path.name if path.is_dir() else path.stem
+    # The file's own end must outlive the cut.
+    return safe_name("_".join([*folders[len(folders) - depth + 1 :], own])[-_LONGEST:])
+
+
+def _numbered(name: str, used: Collection[str]) -> str:
+    number = 2
+    while _folded(f"{name}-{number}") in used:
+        number += 1
+    return f"{name}-{number}"
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name.casefold())
+
+
+LIST_SUFFIXES = frozenset({".csv", ".yaml", ".yml"})
+
+_NUMBERS = ("water_n", "temperature_c", "salinity")
+_KEYS = ("dive", "rig", "name", *_NUMBERS, "log", "log_offset_s")
+
+
+@dataclass(frozen=True, slots=True)
+class ListedDive:
+    """A dive as the user names it.
+
+    Attributes
+    ----------
+    source : Path
+    rig : Path or None
+        None where the list does not say.
+    name : str
+        Empty where the list does not say.
+    water : Water
+        Nothing where the list does not say.
+    log : Path or None
+        The vehicle's, where the list says it.
+    log_offset_s : float or None
+        Its clock minus the dive's, where the list says it.
+    """
+
+    source: Path
+    rig: Path | None = None
+    name: str = ""
+    water: Water = field(default_factory=Water)
+    log: Path | None = None
+    log_offset_s: float | None = None
+
+
+def read_list(path: Path) -> list[ListedDive]:
+    """Read a list of dives.
+
+    Raises
+    ------
+    OptionError
+        If it cannot be read, a row has no dive, or what it says is not understood.
+    """
+    text = read_text(path, "a list of dives", OptionError)
+    rows = list(_csv_rows(text, path) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
+    if not rows:
+        raise OptionError(f"{path}: lists no dive; give at least one row")
+    return [_listed(row, path, number) for number, row in enumerate(rows, 1)]
+
+
+def _csv_rows(text: str, path: Path) -> Iterator[Mapping[str, Any]]:
+    try:
+        for row in csv.DictReader(text.splitlines(), skipinitialspace=True):
+            yield {str(key).strip(): value for key, value in row.items() if value not in ("", None)}
+    except csv.Error as fault:
+        raise OptionError(f"{path}: cannot be read as a list of dives ({fault})") from fault
+
+
+def _yaml_rows(text: str, path: Path) -> Iterable[Mapping[str, Any]]:
+    content = parse_yaml(text, str(path), OptionError)
+    if isinstance(content, dict) and set(content) == {"dives"}:
+        content = content["dives"]
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+        raise OptionError(
+            f"{path}: no list of dives; give mappings with the keys {', '.join(_KEYS)}"
+        )
+    return content
+
+
+def _listed(row: Mapping[str, Any], path: Path, number: int) -> ListedDive:
+    unknown = sorted(str(key) for key in set(row) - set(_KEYS))
+    if unknown:
+        raise OptionError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
+    if "dive" not in row:
+        raise OptionError(f"{path}: row {number} names no dive; fill in the column 'dive'")
+    rig, log = row.get("rig"), row.get("log")
+    return ListedDive(
+        source=path.parent / str(row["dive"]).strip(),
+        rig=None if rig is None else path.parent / str(rig).strip(),
+        name=str(row.get("name", "")).strip(),
+        water=_water(row, path, number),
+        log=None if log is None else path.parent / str(log).strip(),
+        log_offset_s=_number(row, "log_offset_s", path, number),
+    )
+
+
+def _water(row: Mapping[str, Any], path: Path, number: int) -> Water:
+    values = {key: _number(row, key, path, number) for key in _NUMBERS}
+    return Water(
+        n_water=values["water_n"],
+        temperature_c=values["temperature_c"],
+        salinity=values["salinity"],
+    )
+
+
+def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float | None:
+    if key not in row:
+        return None
+    try:
+        value = float(row[key])
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise OptionError(f"{path}: row {number}: {key} is {row[key]!r}; give a number")
+    return value
+
+
+VIDEO_SUFFIXES = frozenset(
+    [
+        ".avi",
+        ".h264",
+        ".h265",
+        ".m2ts",
+        ".m4v",
+        ".mkv",
+        ".mov",
+        ".mp4",
+        ".mpeg",
+        ".mpg",
+        ".mts",
+        ".ts",
+        ".webm",
+        ".wmv",
+    ]
+)
+"""Files that are dives when a folder is given; a file that is named may have any suffix."""
+
+RIG_YAML = "rig.yaml"
+_RECORDING = ".mcap"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dive:
+    """A dive to be measured.
+
+    Attributes
+    ----------
+    source : Path
+        Video, folder of images or recording; absolute.
+    rig : Path or None
+        Absolute; None for a recording, which has its own.
+    name : str
+        As the user calls it; empty if it shall be named after its file.
+    water : Water
+        What the user says about the water of this dive.
+    log : Path or None
+        The vehicle's; absolute.
+    log_offset_s : float or None
+        Its clock minus the dive's, where it is known.
+    """
+
+    source: Path
+    rig: Path | None
+    name: str = ""
+    water: Water = field(default_factory=Water)
+    log: Path | None = None
+    log_offset_s: float | None = None
+
+
+def find_dives(
+    wanted: Sequence[str], *, rig: Path | None, water: Water, out: Path | None = None
+) -> list[Dive]:
+    """Return the dives that the user means, each once, in natural order of what was given.
+
+    Parameters
+    ----------
+    wanted : sequence of str
+        Files, folders (searched through), patterns such as `2026/*/dive*.mp4`, and lists
+        (`read_list`).
+    rig : Path or None
+        For all dives but those for which a list names another. None takes what lies beside each
+        dive: `NAME.rig.yaml` for `NAME.mp4`, else `rig.yaml` in its folder.
+    water : Water
+        Of all dives for which a list does not say better.
+    out : Path or None
+        The batch's own folder, in which no dive is looked for.
+
+    Raises
+    ------
+    SourceError
+        If there is no such file, a folder holds no dive, or the log of one is not there.
+    RigError
+        If a dive has no rig.
+    OptionError
+        If a dive is given twice with different rigs, water or names, or a list cannot be read.
+    """
+    found: dict[Path, Dive] = {}
+    for listed in _dives_listed(wanted, out):
+        source = listed.source.resolve()
+        dive = Dive(
+            source=source,
+            rig=_rig_of(source, listed.rig or rig),
+            name=listed.name,
+            water=listed.water if listed.water != Water() else water,
+            log=_log_of(source, listed.log),
+            log_offset_s=listed.log_offset_s,
+        )
+        if found.setdefault(source, dive) != dive:
+            raise OptionError(f"{source}: given twice, with different words; name it once")
+    return list(found.values())
+
+
+def _dives_listed(wanted: Iterable[str], out: Path | None) -> Iterator[ListedDive]:
+    for text in wanted:
+        for path in _expanded(text):
+            if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
+                yield from read_list(path)
+            elif path.is_dir():
+                yield from (ListedDive(inner) for inner in _dives_in(path, out))
+            elif path.exists():
+                yield ListedDive(path)
+            else:
+                raise SourceError(f"{path}: no such file or folder; check the path")
+
+
+def _expanded(text: str) -> list[Path]:
+    """Return the path, or what a pattern matches where no path of that name exists."""
+    if Path(text).exists() or not glob.has_magic(text):
+        return [Path(text)]
+    found = sorted(map(Path, glob.glob(text, recursive=True)), key=natural_key)
+    if not found:
+        raise SourceError(f"{text}: matches no file; check the pattern")
+    return found
+
+
+def _dives_in(folder: Path, out: Path | None) -> list[Path]:
+    """Return the dives below a folder; without any video, each folder of images is one."""
+    own = out.resolve() if out is not None else None
+    found = []
+    for path in sorted(folder.rglob("*"), key=natural_key):
+        if own is not None and path.resolve().is_relative_to(own):
+            continue
+        # What a run has written about a dive is no other dive.
+        if _is_dive(path) and not (path.parent / RUN_YAML).exists():
+            found.append(path)
+    found = found or _image_folders(folder)
+    if found:
+        return found
+    raise SourceError(f"{folder}: holds no dive; name videos, recordings or folders of images")
+
+
+def _image_folders(folder: Path) -> list[Path]:
+    folders = [folder, *(path for path in folder.rglob("*") if path.is_dir())]
+    return sorted((path for path in folders if _holds_images(path)), key=natural_key)
+
+
+def _holds_images(folder: Path) -> bool:
+    if (folder / RUN_YAML).exists():
+        return False
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+
+
+def natural_key(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts `dive2` before `dive10`."""
+    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", str(path))]
+
+
+def _is_dive(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    if suffix == _RECORDING:
+        return is_recording(path)
+    return suffix in VIDEO_SUFFIXES and path.is_file()
+
+
+def _log_of(source: Path, given: Path | None) -> Path | None:
+    if given is None:
+        return None
+    if not given.is_file():
+        raise SourceError(f"{given}: no such log, which the list names for {source}; check it")
+    return given.resolve()
+
+
+def _rig_of(source: Path, given: Path | None) -> Path | None:
+    if given is not None:
+        return given.resolve()
+    if is_recording(source):
+        return None
+    own = source.with_name(f"{source.stem}.rig.yaml")
+    shared = (source if source.is_dir() else source.parent) / RIG_YAML
+    for path in (own, shared, source.parent / RIG_YAML):
+        if path.is_file():
+            return path
+    raise RigError(
+        f"{source}: has no rig; put {own.name} or {RIG_YAML} beside it, or give --rig for all dives"
+    )

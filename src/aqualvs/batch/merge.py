@@ -1,0 +1,216 @@
+"""From the pieces of a dive to its folder, as `aqualvs run` would have written it.
+
+The summary of a dive from the notes of its pieces.
+"""
+
+import os
+import shutil
+import time
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from aqualvs.batch.dataset import clear, drop_net, holds_dive, put_dive, scratch, seal, sealed
+from aqualvs.batch.parts import (
+    NOTES,
+    PieceResult,
+    peak_bytes,
+    piece_folder,
+    piece_key,
+    stand_ins,
+    stored_bars,
+    stored_ranges,
+)
+from aqualvs.batch.summary_page import range_steps
+from aqualvs.batch.work import DiveWork, OpenDive, Survey, open_dive
+from aqualvs.nets.target_file import net_check
+from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.pipeline import agreement_for
+from aqualvs.report.run_page import write_report
+from aqualvs.results.files import writing
+from aqualvs.results.folder import (
+    DIVE_MCAP,
+    JOURNAL,
+    POINTS_PARQUET,
+    POINTS_PLY,
+    POSTURE_BARE_CSV,
+    POSTURE_CSV,
+    REPORT_HTML,
+    RUN_FILES,
+    RUN_YAML,
+)
+from aqualvs.results.points import export_batches, read_journal
+from aqualvs.results.run_request import RunFile, Status
+from aqualvs.results.summary import Tally
+
+
+def joined_tally(dive: OpenDive, pieces: Sequence[Path]) -> Tally:
+    """Return the summary that a run of the whole dive would have gathered.
+
+    Parameters
+    ----------
+    dive : OpenDive
+    pieces : sequence of Path
+        Folders of all pieces, in order.
+
+    Raises
+    ------
+    UnlikeSurveyError
+        If a watcher asks for what the pieces did not keep.
+    """
+    tally = Tally(agreement=agreement_for(dive.request, dive.rig))
+    for piece in pieces:
+        for scan in stand_ins(piece / NOTES):
+            tally.add(scan)
+    tally.net_check = net_check(dive.request.target, dive.rig)
+    if tally.net_check is not None:
+        for piece in pieces:
+            tally.net_check.bars.extend(stored_bars(piece / NOTES))
+    return tally
+
+
+def joined_ranges(pieces: Sequence[Path]) -> "array[float]":
+    """Return the range of every frame in metres, NaN without a posture."""
+    found = array("d")
+    for piece in pieces:
+        found.extend(stored_ranges(piece / NOTES))
+    return found
+
+
+JOINED = "joined"
+"""Folder, below a dive's home, with the seal of its result."""
+
+_VERIFIED = (POSTURE_CSV, POSTURE_BARE_CSV, POINTS_PARQUET, POINTS_PLY, RUN_YAML)
+"""Files whose content a later batch checks; the report may be written again by anyone."""
+
+
+class PieceLostError(Exception):
+    """A finished piece is not there any more, or not intact; it must be measured again."""
+
+
+def finished_dive(work: DiveWork, survey: Survey) -> dict[str, Any] | None:
+    """Return the facts of a dive that an earlier batch has finished; None if it has not.
+
+    Its files must be there and intact, and made from the same dive, rig, options and versions.
+    """
+    out = work.request.out
+    facts = sealed(work.home / JOINED, survey.key, out)
+    if facts is None or (work.request.report and not (out / REPORT_HTML).exists()):
+        return None
+    return facts if holds_dive(work.dataset, work.name) else None
+
+
+def join_dive(work: DiveWork, survey: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
+    """Join the pieces of a dive, write its report, and drop the pieces.
+
+    Parameters
+    ----------
+    work : DiveWork
+    survey : Survey
+    results : sequence of PieceResult
+        Of all pieces, in order.
+
+    Returns
+    -------
+    facts : dict
+        Of the dive, for the summary; ready for JSON.
+
+    Raises
+    ------
+    PieceLostError
+        If a piece must be measured again.
+    UnlikeSurveyError
+        If the pieces do not tell all that the whole dive's run would know.
+    AqualvsError
+        If the dive's folder cannot be written.
+    """
+    pieces = [piece_folder(work, survey, number) for number in range(len(survey.spans))]
+    for number, piece in enumerate(pieces):
+        if sealed(piece, piece_key(survey, number)) is None:
+            raise PieceLostError(f"{piece}: is not intact")
+    began_s = time.process_time()
+    out, home = work.request.out, work.home
+    with writing(out), scratch(home, "joining") as draft:
+        _join_files(pieces, draft)
+        facts = _write_run_file(work, survey, results, pieces, draft)
+        if work.request.report:
+            write_report(draft)
+        names = _replace_run(draft, out)
+        put_dive(work.dataset, work.name, out)
+        # That of an older result; its files in the dive's folder are gone already.
+        drop_net(work.dataset, work.name)
+        (home / JOINED).mkdir(parents=True, exist_ok=True)
+        cpu_s = sum(result.cpu_s for result in results) + time.process_time() - began_s
+        peak = max(peak_bytes(), *(result.peak_bytes for result in results))
+        facts |= {"cpu_s": round(cpu_s, 2), "peak_bytes": peak}
+        seal(home / JOINED, survey.key, facts, names, out)
+    for old in home.glob("pieces-*"):
+        clear(old)
+    return facts
+
+
+def _write_run_file(
+    work: DiveWork,
+    survey: Survey,
+    results: Sequence[PieceResult],
+    pieces: Sequence[Path],
+    folder: Path,
+) -> dict[str, Any]:
+    """Write `run.yaml`; returns the facts of the dive."""
+    dive = open_dive(work.request)
+    with dive.source:
+        tally = joined_tally(dive, pieces)
+    fault, summary, rig = results[-1].fault, tally.facts(), rig_to_mapping(dive.rig)
+    run_file = RunFile(folder / RUN_YAML, survey.source, rig, dive.request.facts())
+    run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=summary)
+    return {
+        "n_frames": tally.n_frames,
+        "n_valid": tally.n_valid,
+        "duration_s": results[-1].duration_s,
+        "fault": fault,
+        "summary": summary,
+        "range_steps": range_steps(joined_ranges(pieces)),
+        "rig": str(rig.get("name", "")),
+        "rig_file": str(work.request.rig or work.request.source),
+        "n_water": dive.rig.n_water,
+        "source": dict(survey.source),
+        "why_whole": survey.why_whole,
+        "n_pieces": len(pieces),
+    }
+
+
+def _join_files(pieces: Sequence[Path], folder: Path) -> None:
+    """Write rows and points of all pieces as those of one run."""
+    for name in (POSTURE_CSV, POSTURE_BARE_CSV):
+        parts = [piece / name for piece in pieces if (piece / name).exists()]
+        if parts:
+            _join_rows(parts, folder / name)
+    export_batches(
+        (batch for piece in pieces for batch in read_journal(piece / JOURNAL)),
+        folder / POINTS_PARQUET,
+        folder / POINTS_PLY,
+    )
+
+
+def _join_rows(parts: Sequence[Path], path: Path) -> None:
+    """Write the rows of several CSV files under the head of the first."""
+    with path.open("wb") as whole:
+        for number, part in enumerate(parts):
+            with part.open("rb") as rows:
+                head = rows.readline()
+                if number == 0:
+                    whole.write(head)
+                shutil.copyfileobj(rows, whole)
+
+
+def _replace_run(draft: Path, out: Path) -> list[str]:
+    """Put the files of a run in the place of an older one's; returns the names to be verified."""
+    out.mkdir(parents=True, exist_ok=True)
+    # A batch makes no recordings; one that is there is somebody's.
+    for name in set(RUN_FILES) - {DIVE_MCAP}:
+        if (draft / name).exists():
+            os.replace(draft / name, out / name)
+        else:
+            (out / name).unlink(missing_ok=True)
+    return [name for name in _VERIFIED if (out / name).exists()]

@@ -1,0 +1,323 @@
+"""What is to be done for one dive, as it travels to the processes that do it.
+
+The first look at a dive: whether it can be measured, what it holds, and where it is cut.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import av
+
+from aqualvs.batch.dataset import seal, sealed
+from aqualvs.errors import OptionError
+from aqualvs.nets.target_file import target_facts
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.pipeline import following_for
+from aqualvs.results.files import writing
+from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig, source_facts, versions
+from aqualvs.scanner import Scanner
+from aqualvs.sources import FrameSource, open_source
+from aqualvs.sources.images import ImageSource, images_in
+from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
+from aqualvs.sources.video import VideoSource
+from aqualvs.workers.frame_results import ScansFrames
+from aqualvs.workers.replay import Replay, ReplayRequest, replay_of
+
+PIECE_FRAMES = 1500
+"""Frames that a piece has at least: a minute of video, seconds of work."""
+
+_FORMAT = 1
+"""Of what pieces hold; another one makes old pieces worthless."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiveWork:
+    """One dive of a batch.
+
+    Attributes
+    ----------
+    name : str
+        Of the dive in the batch.
+    request : RunRequest
+        The run that the result equals; its `out` is the dive's folder.
+    home : Path
+        Folder for what is finished of the dive, until it is whole.
+    dataset : Path
+        Folder of the batch's Parquet data set.
+    piece_frames : int
+        Frames that a piece has at least.
+    """
+
+    name: str
+    request: RunRequest
+    home: Path
+    dataset: Path
+    piece_frames: int = PIECE_FRAMES
+
+
+@dataclass(slots=True)
+class OpenDive:
+    """A dive that is ready to be measured.
+
+    Attributes
+    ----------
+    source : FrameSource or Replay
+        A context manager.
+    rig : Rig
+    request : RunRequest
+        With the options that count, which a recording may bring itself.
+    replay : Replay or None
+        The source, where it is a recording.
+    """
+
+    source: FrameSource
+    rig: Rig
+    request: RunRequest
+    replay: Replay | None
+
+    def scanner(self) -> ScansFrames:
+        """Return what measures the frames.
+
+        Raises
+        ------
+        AqualvsError
+            If the target that tells the water's index cannot be used.
+        """
+        following = following_for(self.request, self.rig)
+        return following or self.replay or Scanner(self.rig, self.request.scanner)
+
+
+def open_dive(request: RunRequest) -> OpenDive:
+    """Open a dive's source and load its rig, as `run` does it.
+
+    Raises
+    ------
+    AqualvsError
+        If one of them cannot be used, or they do not belong together.
+    """
+    replay = replay_of(
+        request.source,
+        ReplayRequest(
+            rig=request.rig,
+            water=request.water,
+            no_dome=request.no_dome,
+            scanner=request.scanner,
+            chosen=request.chosen,
+            index_target=request.index_target,
+            pictures=False,
+        ),
+    )
+    if replay is not None:
+        return OpenDive(replay, replay.rig, replace(request, scanner=replay.options), replay)
+    rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)
+    source = open_source(request.source, fps=request.fps)
+    try:
+        check_fits(source, rig)
+    except BaseException:
+        source.__exit__(None, None, None)
+        raise
+    return OpenDive(source, rig, request, None)
+
+
+def result_key(dive: OpenDive) -> str:
+    """Return what a dive's numbers depend on besides its pictures, as a short text.
+
+    Content counts, not the place: a rig file that says the same under another name changes nothing.
+    """
+    request = dive.request
+    target_content = content_digest(request.index_target)
+    facts = request.facts() | {"rig_file": None, "index_target": target_content}
+    target = asdict(target_facts(request.target))
+    found = {
+        "format": _FORMAT,
+        "rig": rig_to_mapping(dive.rig),
+        "options": facts,
+        "fps": request.fps,
+        "target": target,
+        "versions": versions(),
+    }
+    return digest(found)
+
+
+def digest(facts: Mapping[str, Any]) -> str:
+    """Return a short text that differs for different facts."""
+    text = json.dumps(facts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def content_digest(path: Path | None) -> str | None:
+    """Return a text that differs for files of different content; None for no file.
+
+    Raises
+    ------
+    OptionError
+        If the file cannot be read.
+    """
+    if path is None:
+        return None
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as fault:
+        raise OptionError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
+
+
+_MEMORY = "survey"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Survey:
+    """What the first look at a dive has found.
+
+    Attributes
+    ----------
+    source_key : str
+        Of the dive's content; other pictures give another key.
+    result_key : str
+        Of all else that the result depends on.
+    spans : tuple of Span
+        The pieces, at least one.
+    why_whole : str
+        Why the dive is not cut, where it could be longer than a piece; empty if it is.
+    n_bytes : int
+        Size of the source.
+    n_frames : int or None
+        If known.
+    source : mapping
+        For `run.yaml`.
+    """
+
+    source_key: str
+    result_key: str
+    spans: tuple[Span, ...]
+    why_whole: str
+    n_bytes: int
+    n_frames: int | None
+    source: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """Of everything that the dive's result depends on."""
+        return digest({"source": self.source_key, "result": self.result_key})
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the dive is not cut."""
+        return [span.kind for span in self.spans] == [SpanKind.WHOLE]
+
+    def only(self, number: int) -> "Survey":
+        """Return the survey with one of its pieces alone, as its process needs it."""
+        return replace(self, spans=(self.spans[number],))
+
+    def in_one_piece(self, why: str) -> "Survey":
+        """Return the survey of the same dive, not to be cut."""
+        whole = (Span(kind=SpanKind.WHOLE, n_bytes=self.n_bytes),)
+        return replace(self, spans=whole, why_whole=why)
+
+
+def survey(work: DiveWork) -> Survey:
+    """Look at a dive.
+
+    Reads the whole file once, unless an earlier look is still valid, but decodes nothing.
+
+    Raises
+    ------
+    AqualvsError
+        If the dive or its rig cannot be used.
+    """
+    dive = open_dive(work.request)
+    with dive.source:
+        found = Survey(
+            source_key="",
+            result_key=result_key(dive),
+            spans=(),
+            why_whole="",
+            n_bytes=0,
+            n_frames=dive.source.n_frames,
+            source=source_facts(dive.source),
+        )
+        stat = _stat_key(Path(work.request.source)) | {"frames": work.piece_frames}
+        content = _remembered(work, stat) or _remember(
+            work, stat, _content(dive, work.piece_frames)
+        )
+    spans = tuple(Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"])
+    found = replace(
+        found, source_key=content["source_key"], spans=spans, n_bytes=content["n_bytes"]
+    )
+    why = "" if work.request.index_target is None else "the water is followed from frame to frame"
+    why = why or content["why_whole"]
+    return found.in_one_piece(why) if why or not spans else found
+
+
+def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
+    """Return what is found in the source itself, ready for JSON."""
+    path = Path(dive.request.source)
+    if isinstance(dive.source, VideoSource):
+        try:
+            video = video_spans(path, piece_frames)
+        except (av.error.FFmpegError, OSError) as fault:
+            return _uncut(path, f"cannot be looked through ({fault})")
+        return {
+            "source_key": digest({"packets": video.checksum, "n_bytes": video.n_bytes}),
+            "spans": [asdict(span) for span in video.spans],
+            "why_whole": video.why_whole,
+            "n_bytes": video.n_bytes,
+        }
+    if isinstance(dive.source, ImageSource) and path.is_dir():
+        return _images(path, piece_frames)
+    return _uncut(path, "recordings and bags are not cut")
+
+
+def _images(folder: Path, piece_frames: int) -> dict[str, Any]:
+    files = [(path.name, path.stat()) for path in images_in(folder)]
+    sizes = [stat.st_size for _, stat in files]
+    return {
+        "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
+        "spans": [asdict(span) for span in image_spans(sizes, piece_frames)],
+        "why_whole": "",
+        "n_bytes": sum(sizes),
+    }
+
+
+def _uncut(path: Path, why: str) -> dict[str, Any]:
+    stat = _stat_key(path)
+    return {
+        "source_key": digest(stat),
+        "spans": [],
+        "why_whole": why,
+        "n_bytes": size_of(path),
+    }
+
+
+def size_of(path: Path) -> int:
+    """Return the size of a file, or of the files in a folder; 0 where there is nothing."""
+    try:
+        if path.is_dir():
+            return sum(inner.stat().st_size for inner in path.iterdir() if inner.is_file())
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _stat_key(path: Path) -> dict[str, Any]:
+    """Return what changes when a file, or what is in a folder, is replaced."""
+    found = [path, *(path.iterdir() if path.is_dir() else ())]
+    latest = max(one.stat().st_mtime_ns for one in found)
+    return {"path": str(path), "size": size_of(path), "n_files": len(found), "mtime_ns": latest}
+
+
+def _remembered(work: DiveWork, stat: Mapping[str, Any]) -> dict[str, Any] | None:
+    return sealed(work.home / _MEMORY, digest(stat))
+
+
+def _remember(work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    folder = work.home / _MEMORY
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        seal(folder, digest(stat), content, [])
+    return content

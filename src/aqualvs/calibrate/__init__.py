@@ -1,0 +1,4 @@
+"""The `aqualvs calibrate` and `aqualvs board` commands.
+
+Imports calibration, sources, results and report.
+"""

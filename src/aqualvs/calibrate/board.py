@@ -1,0 +1,294 @@
+"""`aqualvs board`: print a target, true to scale, with the file that describes it.
+
+A ChArUco board or chessboard for camera and dome, the markers of a box for the lasers, or a small
+plate of markers, fixed to the vehicle, for the water's index.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from aqualvs.calibration.targets.printed import (
+    FIT,
+    BoxPlan,
+    Page,
+    Patch,
+    best_paper,
+    board_rectangles,
+    box_patches,
+    marker_rectangles,
+    outline,
+    papers,
+    pdf_bytes,
+    sheet,
+)
+from aqualvs.calibration.targets.target_files import save_board, save_markers
+from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, aruco_dictionary
+from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
+from aqualvs.results.files import Claim, writing
+
+Tell: TypeAlias = Callable[[str], object]
+
+_MM = 1e3
+# OpenCV's own boards have markers of about this share of the square.
+_MARKER_SHARE = 0.75
+# A light border that keeps the outer squares readable on any background, as a share of a square.
+_BORDER_SHARE = 0.25
+_PLATE_GAP_SHARE = 0.25
+_COUNT_SUFFIXES = (50, 100, 250, 1000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardRequest:
+    """What is asked for; see `aqualvs board --help`. Lengths in millimetres, angles in degrees.
+
+    Attributes
+    ----------
+    kind : str
+        What to print.
+    out : Path
+        `OUT.pdf` and `OUT.yaml` are written.
+    paper : str
+        A4 to A0, letter, WIDTHxHEIGHT, or "fit".
+    squares_x, squares_y : int
+        Of a board, or columns and rows of markers on a plate.
+    square_mm : float or None
+        Side of a square; None takes the largest whole one that the paper holds.
+    marker_mm : float or None
+        Side of a marker; None takes 3/4 of the square on a board, 48 in a box, 12 on a plate.
+    dictionary : str or None
+        None takes the smallest DICT_4X4 on a board, AprilTag 36h11 otherwise.
+    border_mm : float or None
+        Light border; None takes a quarter of a square.
+    width_mm, height_mm, depth_mm : float
+        Of the box, inside.
+    first_id : int
+        Number of the first marker of a box or plate.
+    position_mm : (float, float, float) or None
+        Where the plate's first corner (top left of its first marker) is in `dome`.
+    rotation_deg : (float, float, float)
+        Rotation vector in `dome`, applied to a plate that faces the camera upright.
+    overwrite : bool
+        Whether to replace files that this command wrote before.
+    """
+
+    kind: Literal["charuco", "chessboard", "box", "plate"]
+    out: Path
+    paper: str = "a4"
+    squares_x: int | None = None
+    squares_y: int | None = None
+    square_mm: float | None = None
+    marker_mm: float | None = None
+    dictionary: str | None = None
+    border_mm: float | None = None
+    width_mm: float = 400.0
+    height_mm: float = 380.0
+    depth_mm: float = 700.0
+    first_id: int = 0
+    position_mm: tuple[float, float, float] | None = None
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    overwrite: bool = False
+
+
+def print_board(request: BoardRequest, tell: Tell) -> None:
+    """Write the PDF and the yaml of a target.
+
+    Raises
+    ------
+    OptionError
+        If the target cannot be, or does not fit the paper.
+    OutputError
+        If a file cannot be written.
+    """
+    out = request.out.with_suffix("") if request.out.suffix == ".pdf" else request.out
+    pdf, yaml = out.with_name(f"{out.name}.pdf"), out.with_name(f"{out.name}.yaml")
+    with Claim("board", [pdf, yaml], overwrite=request.overwrite):
+        try:
+            if request.kind == "box":
+                pages, words = _print_box(request, yaml)
+            elif request.kind == "plate":
+                pages, words = _print_plate(request, yaml)
+            else:
+                pages, words = _print_squares(request, yaml)
+        except CalibrationError as fault:
+            raise OptionError(str(fault)) from None
+        with writing(pdf):
+            pdf.write_bytes(pdf_bytes(pages, f"aqualvs {request.kind}"))
+    n = len(pages)
+    tell(f"pages: {pdf} ({n} page{'s' if n > 1 else ''}; print at 100 %, then measure the ruler)")
+    tell(f"file: {yaml}")
+    for word in words:
+        tell(f"note: {word}")
+
+
+def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]]:
+    board = _board(request)
+    border = _MM * board.border
+    width, height = (_MM * side + 2.0 * border for side in board.size)
+    paper = best_paper(request.paper, width, height, "the board")
+    rectangles = _MM * board_rectangles(board) + np.array([border, border, 0.0, 0.0])
+    page = sheet(paper, rectangles, (width, height), f"aqualvs: {board.describe()}")
+    save_board(board, yaml)
+    measure = f"measure {board.squares[0]} squares: {_MM * board.size[0]:g} mm"
+    return [page], [f"glue it flat on a stiff plate, and {measure}; else correct square_mm"]
+
+
+def _board(request: BoardRequest) -> Board:
+    squares = (request.squares_x or 11, request.squares_y or 8)
+    square = request.square_mm or _largest_square(request, squares)
+    border = _BORDER_SHARE * square if request.border_mm is None else request.border_mm
+    if request.kind == "chessboard":
+        return Board(
+            kind=BoardKind.CHESSBOARD, squares=squares, square=square / _MM, border=border / _MM
+        )
+    n_markers = squares[0] * squares[1] // 2
+    marker = _MARKER_SHARE * square if request.marker_mm is None else request.marker_mm
+    return Board(
+        kind=BoardKind.CHARUCO,
+        squares=squares,
+        square=square / _MM,
+        marker=marker / _MM,
+        dictionary=request.dictionary or _smallest_dictionary(n_markers),
+        border=border / _MM,
+    )
+
+
+def _largest_square(request: BoardRequest, squares: tuple[int, int]) -> float:
+    """Return the largest whole number of millimetres that the paper has room for."""
+    border = request.border_mm
+    shares = np.array(squares) + (2.0 * _BORDER_SHARE if border is None else 0.0)
+    sides = []
+    for paper in papers(request.paper):
+        if paper.size_mm is None:
+            raise OptionError(f"--paper {FIT}: needs --square-mm, the side of a square")
+        sides.append(np.min((np.array(paper.room_mm) - 2.0 * (border or 0.0)) / shares))
+    side = float(np.floor(max(sides)))
+    if side < 4.0:
+        raise OptionError(
+            f"--paper {request.paper}: {squares[0]} x {squares[1]} squares would be smaller than "
+            "4 mm; take fewer squares or larger paper"
+        )
+    return side
+
+
+def _smallest_dictionary(n_markers: int) -> str:
+    fitting = [n for n in _COUNT_SUFFIXES if n >= n_markers]
+    if not fitting:
+        raise OptionError(
+            f"{n_markers} markers: no dictionary has more than {_COUNT_SUFFIXES[-1]}; take fewer "
+            "squares"
+        )
+    return f"DICT_4X4_{fitting[0]}"
+
+
+def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]]:
+    plan = BoxPlan(
+        width=request.width_mm / _MM,
+        height=request.height_mm / _MM,
+        depth=request.depth_mm / _MM,
+        marker=(request.marker_mm or 48.0) / _MM,
+        family=request.dictionary or "DICT_APRILTAG_36h11",
+        first_id=request.first_id,
+    )
+    rooms = [paper.room_mm for paper in papers(request.paper)]
+    markers, patches = box_patches(plan, [(x / _MM, y / _MM) for x, y in rooms])
+    pages = [_patch_page(request, plan, patch) for patch in patches]
+    save_markers(markers, yaml)
+    return pages, [
+        "cut along the lines and glue each sheet where its words say, upright as seen from inside; "
+        "the box needs no other pattern",
+        "measure the box: where a sheet lies elsewhere, correct the corners and planes in the file",
+    ]
+
+
+def _patch_page(request: BoardRequest, plan: BoxPlan, patch: Patch) -> Page:
+    width, height = _MM * patch.size[0], _MM * patch.size[1]
+    paper = best_paper(request.paper, width, height, f"a sheet of plane {patch.plane}")
+    rectangles = [
+        _MM * marker_rectangles(plan.family, number, corner, plan.marker)
+        for number, corner in zip(patch.ids, patch.corners, strict=True)
+    ]
+    left, top = _MM * patch.offset[0], _MM * patch.offset[1]
+    words = (
+        f"aqualvs box: plane {patch.plane}; top-left corner {left:.1f} mm from its left edge and "
+        f"{top:.1f} mm from its top edge; markers of {_MM * plan.marker:g} mm, "
+        f"ids {min(patch.ids)}-{max(patch.ids)}"
+    )
+    black = np.concatenate([*rectangles, outline(0.0, 0.0, width, height)])
+    return sheet(paper, black, (width, height), words)
+
+
+def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]]:
+    columns, rows = request.squares_x or 3, request.squares_y or 2
+    size = request.marker_mm or 12.0
+    family = request.dictionary or "DICT_APRILTAG_36h11"
+    _check_ids(family, request.first_id, columns * rows)
+    corners = _plate_corners(columns, rows, size)
+    border = _PLATE_GAP_SHARE * size if request.border_mm is None else request.border_mm
+    width, height = corners.reshape(-1, 2).max(axis=0) + 2.0 * border
+    paper = best_paper(request.paper, width, height, "the plate")
+    ids = request.first_id + np.arange(columns * rows, dtype=np.int64)
+    rectangles = [
+        marker_rectangles(family, int(number), corner[0] + border, size)
+        for number, corner in zip(ids, corners, strict=True)
+    ]
+    black = np.concatenate([*rectangles, outline(0.0, 0.0, width, height)])
+    what = f"{columns} x {rows} markers of {size:g} mm, {family}, ids {ids[0]}-{ids[-1]}"
+    save_markers(_plate_markers(request, family, ids, corners / _MM), yaml)
+    return [
+        sheet(paper, black, (float(width), float(height)), f"aqualvs plate: {what}")
+    ], _plate_notes(request, yaml)
+
+
+def _plate_corners(columns: int, rows: int, size: float) -> FloatArray:
+    """Return the markers' corners (M, 4, 2) from the first one's top left, row by row."""
+    pitch = (1.0 + _PLATE_GAP_SHARE) * size
+    column, row = np.meshgrid(np.arange(columns), np.arange(rows))
+    first = pitch * np.stack([column.ravel(), row.ravel()], axis=-1)
+    corners: FloatArray = first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    return corners
+
+
+def _plate_markers(
+    request: BoardRequest, family: str, ids: IntArray, flat: FloatArray
+) -> MarkerSet:
+    corners: FloatArray = np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
+    frame = "plate"
+    if request.position_mm is not None:
+        turn = rotation_from_rotvec(np.deg2rad(request.rotation_deg)) @ DOME_FROM_CAM_NOMINAL
+        corners = SE3(turn, np.array(request.position_mm) / _MM).apply(corners)
+        frame = "dome"
+    return MarkerSet(
+        frame=frame,
+        family=family,
+        ids=ids,
+        corners=corners,
+        plane_names=(None,) * len(ids),
+    )
+
+
+def _plate_notes(request: BoardRequest, yaml: Path) -> list[str]:
+    fix = "fix the plate where the camera sees it sharp, off the middle, beside the lasers"
+    if request.position_mm is not None:
+        return [fix, f"{yaml} holds the corners in the dome's frame, for the place that was given"]
+    return [
+        fix,
+        f"{yaml} does not know the plate's place yet; measure where the top-left corner of marker "
+        f"{request.first_id} is in the dome's frame, and print again with --position-mm X Y Z "
+        "(and --rotation-deg where the plate does not face straight back)",
+    ]
+
+
+def _check_ids(family: str, first_id: int, count: int) -> None:
+    held = len(aruco_dictionary(family).bytesList)
+    if first_id < 0 or first_id + count > held:
+        raise OptionError(
+            f"--first-id {first_id}: {count} markers from there, but {family} has ids 0 to "
+            f"{held - 1}; begin lower or print fewer"
+        )

@@ -1,0 +1,353 @@
+"""What all calibrations share: finding targets in pictures, keeping and writing the rig.
+
+What is known of a rig before any calibration: its name, pictures, dome and lasers.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from aqualvs.calibration.targets.targets import View
+from aqualvs.errors import CalibrationError, OptionError, RigError
+from aqualvs.optics.camera import Dome
+from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
+from aqualvs.optics.rigschema import LaserWavelength
+from aqualvs.report.calibration_page import Page, write_page
+from aqualvs.results.files import writing
+from aqualvs.results.run_request import checked_index
+from aqualvs.sources.images import read_image
+from aqualvs.terminal import progress
+from aqualvs.yamlfile import read_yaml
+
+WATER_N = 1.3340
+"""Index assumed until something better is known: fresh water of 15 °C under green light."""
+N_LASERS = "n_lasers"
+"""Key of `Rig.solved_from` under which a rig without lasers keeps how many it will have."""
+WAVELENGTH_NM = "wavelength_nm"
+"""Likewise for their wavelength, in nanometres."""
+
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
+_Count = Annotated[int, Field(gt=0)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nominal:
+    """A rig as its drawings tell it.
+
+    Attributes
+    ----------
+    name : str
+    size_px : (int, int) or None
+        Image width and height.
+    dome : Dome or None
+    n_air, n_water : float
+    n_lasers : int or None
+    wavelength_nm : float or None
+        Of the lasers; None if nothing is said, or if they differ.
+    working_range : (float, float)
+        Metres.
+    """
+
+    name: str = "rig"
+    size_px: tuple[int, int] | None = None
+    dome: Dome | None = None
+    n_air: float = 1.0003
+    n_water: float = WATER_N
+    n_lasers: int | None = None
+    wavelength_nm: float | None = None
+    working_range: tuple[float, float] = (0.25, 1.3)
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _Image(_Part):
+    width: _Count
+    height: _Count
+
+
+class _Dome(_Part):
+    inner_radius_mm: _Positive
+    thickness_mm: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+    n_acrylic: _Index = 1.49
+
+
+class _Lasers(_Part):
+    count: _Count
+    wavelength_nm: LaserWavelength | None = None
+
+
+class _File(_Part):
+    name: str = "rig"
+    image: _Image | None = None
+    dome: _Dome | None = None
+    n_air: _Index = 1.0003
+    lasers: _Lasers | None = None
+    fps: _Positive | None = None
+
+
+def load_nominal(path: Path) -> Nominal:
+    """Read a nominal rig, or take over what a rig file knows.
+
+    Raises
+    ------
+    RigError
+        One line that names the file, the place in it, the value and the remedy.
+    """
+    content = read_yaml(path, "a nominal rig or a rig file", RigError)
+    if not isinstance(content, Mapping):
+        raise RigError(f"{path}: is not a nominal rig; write keys such as 'dome: ...'")
+    return _of_rig_file(path) if "aqualvs_rig" in content else _of_mapping(content, path)
+
+
+def common_wavelength(lasers: Sequence[Laser]) -> float | None:
+    """Return the wavelength of lasers (nm); None if they differ, or nothing is said of it."""
+    found = {laser.wavelength_nm for laser in lasers}
+    return found.pop() if len(found) == 1 else None
+
+
+def _of_rig_file(path: Path) -> Nominal:
+    rig = load_rig(path, need_lasers=False)
+    return Nominal(
+        name=rig.name,
+        size_px=rig.size_px,
+        dome=rig.dome,
+        n_air=rig.n_air,
+        n_water=rig.n_water,
+        n_lasers=len(rig.lasers) or None,
+        wavelength_nm=common_wavelength(rig.lasers),
+        working_range=rig.working_range,
+    )
+
+
+def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
+    try:
+        file = _File.model_validate(dict(content))
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        place = ".".join(map(str, fault["loc"]))
+        raise RigError(
+            f"{path}: {place} is {fault['input']!r}: {fault['msg'].lower()}; a nominal rig has "
+            f"{', '.join(_File.model_fields)}"
+        ) from None
+    part = file.dome
+    return Nominal(
+        name=file.name,
+        size_px=None if file.image is None else (file.image.width, file.image.height),
+        dome=None
+        if part is None
+        else Dome(part.inner_radius_mm / 1e3, part.thickness_mm / 1e3, part.n_acrylic),
+        n_air=file.n_air,
+        n_lasers=None if file.lasers is None else file.lasers.count,
+        wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
+    )
+
+
+Tell: TypeAlias = Callable[[str], object]
+Image: TypeAlias = NDArray[np.uint8]
+Detect: TypeAlias = Callable[[Path, Image], View | str]
+"""Finds a target in a grey picture; a clause says why there is none."""
+
+# More threads than this gain nothing on small pictures.
+_THREADS = 4
+# Names of pictures that a note lists.
+_NAMES_SHOWN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What was found in a set of pictures.
+
+    Attributes
+    ----------
+    views : tuple of View
+        Of the pictures in which the target was found.
+    paths : tuple of Path
+        Theirs.
+    size_px : (int, int)
+        Width and height of every picture.
+    missed : dict
+        Name of a picture in which it was not found, and why.
+    """
+
+    views: tuple[View, ...]
+    paths: tuple[Path, ...]
+    size_px: tuple[int, int]
+    missed: dict[str, str]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What to warn of."""
+        return [
+            *self.notes,
+            *(f"{name}: left out, {why}" for name, why in self.missed.items()),
+        ]
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth knowing of how targets were found, each with its pictures."""
+        names: dict[str, list[str]] = {}
+        for view in self.views:
+            for note in view.notes:
+                names.setdefault(note, []).append(view.name)
+        return [f"{_listed(where)}: {note}" for note, where in names.items()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMES_SHOWN
+    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def find_targets(paths: Sequence[Path], detect: Detect, target: str) -> Found:
+    """Look for a target in every picture.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Pictures.
+    detect : callable
+        Finds the target in one.
+    target : str
+        What is looked for, for messages: "board.yaml", say.
+
+    Raises
+    ------
+    CalibrationError
+        If the target is in none of the pictures, or they differ in size.
+    """
+    with (
+        progress(f"looking for {target}", len(paths), unit="pictures") as tick,
+        ThreadPoolExecutor(_THREADS) as pool,
+    ):
+
+        def look(path: Path) -> tuple[View | str, tuple[int, int]]:
+            image = read_grey(path)
+            found = detect(path, image)
+            tick(1)
+            return found, (image.shape[1], image.shape[0])
+
+        results = list(pool.map(look, paths))
+    size_px = _common_size(paths, [size for _, size in results])
+    views = [(path, view) for path, (view, _) in zip(paths, results, strict=True)]
+    missed = {path.name: why for path, why in views if isinstance(why, str)}
+    found = [(path, view) for path, view in views if isinstance(view, View)]
+    if not found:
+        name, why = next(iter(missed.items()))
+        raise CalibrationError(f"{target}: found in none of {len(paths)} pictures; {name}: {why}")
+    return Found(
+        tuple(view for _, view in found), tuple(path for path, _ in found), size_px, missed
+    )
+
+
+def read_grey(path: Path) -> Image:
+    """Read a picture as grey.
+
+    Raises
+    ------
+    CalibrationError
+        If it is no picture.
+    """
+    return _read(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_colour(path: Path) -> Image:
+    """Read a picture as blue, green, red.
+
+    Raises
+    ------
+    CalibrationError
+        If it is no picture.
+    """
+    return _read(path, cv2.IMREAD_COLOR)
+
+
+def medium_index(word: str | None, rig: Rig, default: float) -> float:
+    """Return the index that `--medium` means: "air", "water" (the rig's), or a number.
+
+    Raises
+    ------
+    OptionError
+        If it is none of these.
+    """
+    if word is None:
+        return default
+    if word == "air":
+        return rig.n_air
+    if word == "water":
+        return rig.n_water
+    try:
+        return checked_index(float(word), "--medium")
+    except ValueError:
+        raise OptionError(
+            f"--medium {word}: not understood; say air, water, or an index such as 1.3333"
+        ) from None
+
+
+def finish(
+    rig: Rig, page: Page, out: Path, step: str, tell: Tell, *, comments_of: Path | None = None
+) -> None:
+    """Write the rig and the page of a calibration, and tell where they are.
+
+    A rig and a page that are there already are kept under dated names.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written, or `out` is a file but no rig.
+    """
+    with writing(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+    copy = save_rig(rig, out, comments_of=comments_of)
+    if copy is not None:
+        tell(f"kept: {copy}")
+    tell(f"rig: {out}")
+    report = out.with_suffix(f".{step}.html")
+    if report.exists():
+        keep_dated(report)
+    tell(f"report: {write_page(page, report)}")
+
+
+def check_same_size(rig: Rig, found: Found) -> None:
+    """Refuse pictures of another size than the rig's.
+
+    Raises
+    ------
+    CalibrationError
+        With both sizes.
+    """
+    if found.size_px != rig.size_px:
+        (w, h), (rw, rh) = found.size_px, rig.size_px
+        raise CalibrationError(
+            f"{found.paths[0]}: {w}x{h} px, but the rig's camera was calibrated at {rw}x{rh} px; "
+            "take the pictures at that size, or calibrate the camera again"
+        )
+
+
+def _read(path: Path, how: int) -> Image:
+    image = read_image(path, how)
+    if image is None:
+        raise CalibrationError(
+            f"{path}: not a readable picture, or too large; remove or replace it"
+        )
+    return image
+
+
+def _common_size(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    usual = max(set(sizes), key=sizes.count)
+    for path, size in zip(paths, sizes, strict=True):
+        if size != usual:
+            raise CalibrationError(
+                f"{path}: {size[0]}x{size[1]} px, but the other pictures have "
+                f"{usual[0]}x{usual[1]} px; one calibration takes pictures of one size"
+            )
+    return usual

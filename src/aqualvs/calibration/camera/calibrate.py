@@ -1,0 +1,453 @@
+"""`calibrate camera`: intrinsics from views of a board in air, without the dome.
+
+OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) starts it; the robust bundle of
+`calibrate dome` finishes it, which adds the covariance and names what does not fit.
+
+Refusals of `calibrate camera`, and where in the picture its intrinsics are to be trusted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.camera.problem import (
+    BEND_DEGREES,
+    BentFit,
+    bend_is_significant,
+    direction_sigma_px,
+    fit_bend,
+    fitted_camera,
+    with_supported_coefficients,
+)
+from aqualvs.calibration.dome.cross_validation import predicted
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState
+from aqualvs.calibration.solver.covariance import (
+    ViewCovariance,
+    shared_covariance,
+    unbelievable_distance,
+)
+from aqualvs.calibration.solver.least_squares import Solution, solve
+from aqualvs.calibration.solver.result import ViewFit, rms_px, view_fit
+from aqualvs.calibration.targets.targets import View
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.rig import RigUncertainty
+
+COVERAGE_CELLS = (6, 8)
+"""Rows and columns of the coverage grid."""
+_MIN_VIEWS = 3
+_MIN_POINTS = 60
+# Corners noisier than this mean that something else is wrong than noise.
+_MAX_NOISE_PX = 1.0
+# Focal lengths (share) and image centre (share of the width) known worse than this are of no use.
+_MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.01, 0.02
+# Views whose boards lean less than this from each other are parallel.
+_PARALLEL = np.deg2rad(5.0)
+
+
+def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
+    """Refuse views that are too few, or are not of this size.
+
+    Raises
+    ------
+    CalibrationError
+        With what there is and what it takes.
+    """
+    if len(views) < _MIN_VIEWS:
+        raise CalibrationError(
+            f"{len(views)} pictures show the board; the camera needs {_MIN_VIEWS} at least, and "
+            "15 to 20 from different sides to be good"
+        )
+    points = sum(len(view) for view in views)
+    if points < _MIN_POINTS:
+        raise CalibrationError(
+            f"{points} board corners in {len(views)} pictures; the camera needs {_MIN_POINTS} at "
+            "least; show more of the board, or more often"
+        )
+    for view in views:
+        inside = np.all((view.pixels > -1.0) & (view.pixels < size_px), axis=1)
+        if not inside.all():
+            raise CalibrationError(
+                f"{view.name}: corners outside a picture of {size_px[0]}x{size_px[1]} px; all "
+                "pictures of a calibration must have one size"
+            )
+
+
+def check_camera_solution(
+    solution: Solution[BundleState], covariance: FloatArray, views: Sequence[View]
+) -> None:
+    """Refuse intrinsics that do not explain the views, or that the views do not determine.
+
+    Parameters
+    ----------
+    solution : Solution
+    covariance : array, shape (P, P)
+        Of the intrinsics, by corners: focal lengths and image centre first.
+    views : sequence of View
+
+    Raises
+    ------
+    CalibrationError
+        With the likely cause and the remedy.
+    """
+    noise = CORNER_SIGMA_PX * solution.scales[CORNERS]
+    if noise > _MAX_NOISE_PX:
+        raise CalibrationError(
+            f"no camera explains the views: corners are {noise:.2g} px off (0.1 px is usual); "
+            "check squares_x, squares_y and the dictionary against the print, that the board is "
+            "flat, and that zoom and focus stood still"
+        )
+    _check_determined(solution, covariance)
+    poses = solution.state.poses
+    away = [np.linalg.norm(p.apply(v.middle)) for p, v in zip(poses, views, strict=True)]
+    fault = unbelievable_distance(np.array(away), [view.name for view in views])
+    if fault is not None:
+        raise CalibrationError(fault)
+
+
+def _check_determined(solution: Solution[BundleState], covariance: FloatArray) -> None:
+    rig = solution.state.rig
+    sigma = np.sqrt(np.diag(covariance)[:4])
+    focal = max(sigma[0] / rig.lens.fx, sigma[1] / rig.lens.fy)
+    centre = float(sigma[2:].max()) / rig.size_px[0]
+    normals = np.array([pose.rotation[:, 2] for pose in solution.state.poses])
+    lean = float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0).min()))
+    remedy = (
+        f"all boards are parallel within {np.rad2deg(lean):.1f} deg: tilt the board by 20 to 40 "
+        "degrees, to different sides"
+        if lean < _PARALLEL
+        else "take more views, with the board tilted by 20 to 40 degrees to different sides, near, "
+        "and in all parts of the picture"
+    )
+    if not focal < _MAX_FOCAL_SIGMA:
+        raise CalibrationError(
+            f"the views do not determine the focal length ({100.0 * focal:.2g} % uncertain); "
+            f"{remedy}"
+        )
+    if not centre < _MAX_CENTRE_SIGMA:
+        raise CalibrationError(
+            f"the views do not determine the image centre ({float(sigma[2:].max()):.2g} px "
+            f"uncertain); {remedy}"
+        )
+    if not solution.converged:
+        raise CalibrationError(f"the solve does not come to rest; {remedy}")
+
+
+def coverage(pixels: FloatArray, size_px: tuple[int, int]) -> IntArray:
+    """Return how many pixels (N, 2) fall into each cell of a grid over the picture."""
+    rows, columns = COVERAGE_CELLS
+    width, height = size_px
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1] + 0.5,
+        pixels[:, 0] + 0.5,
+        bins=(rows, columns),
+        range=((0.0, height), (0.0, width)),
+    )
+    return counts.astype(np.int64)
+
+
+def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
+    """Return the pixels (N, 2) of a grid over the picture, borders included."""
+    rows, columns = COVERAGE_CELLS
+    u, v = np.meshgrid(
+        np.linspace(0.0, size_px[0] - 1.0, columns + 1),
+        np.linspace(0.0, size_px[1] - 1.0, rows + 1),
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=-1)
+
+
+# A view is bad if it is this many times noisier than the typical one, and noisier than this.
+_BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
+_MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
+# Every so-many-th view is held back; a camera needs the rest.
+_HELD_BACK_EVERY, _MIN_HELD_BACK, _CAMERA_MIN_POINTS = 4, 8, 12
+_MANY_OUTLIERS = 0.05
+_WEAK_PIXEL_PX = 1.0
+_THIN_COVERAGE = 0.6
+# Variance by views over that by corners that is worth a word: sigmas half as large again.
+_SHARED_ERRORS = 2.25
+# Uncertainty of the focal length (share) that is worth a word: ranges are off by as much.
+_WEAK_FOCAL = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """Intrinsics, and how far to trust them.
+
+    Attributes
+    ----------
+    lens : Lens
+    size_px : (int, int)
+        Image width and height.
+    uncertainty : RigUncertainty
+        Of the intrinsics, from how the views disagree (`view_covariance`).
+    inflation : float
+        How many times larger that variance is than if the errors of corners were independent.
+    views : tuple of ViewFit
+        Poses are `cam_from_target`.
+    left_out : dict
+        Names of views that were not used, and why.
+    noise_px : float
+        Typical standard deviation of a corner's coordinate.
+    coverage : int array, shape (6, 8)
+        How many corners fell into each cell of the picture.
+    held_back_rms_px : float
+        How well a model from three views in four predicts corners of the fourth; NaN where there
+        are too few views.
+    bend_height : float
+        How far apart the highest and the lowest corner of a bent board are, in metres; 0 for a
+        board that is flat as far as the views tell.
+    findings : tuple of str
+        In plain words: what is worth knowing.
+    n_iterations : int
+    """
+
+    lens: Lens
+    size_px: tuple[int, int]
+    uncertainty: RigUncertainty
+    inflation: float
+    views: tuple[ViewFit, ...]
+    left_out: dict[str, str]
+    noise_px: float
+    coverage: IntArray
+    held_back_rms_px: float
+    bend_height: float
+    findings: tuple[str, ...]
+    n_iterations: int
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of all inliers from their predicted pixels (as OpenCV)."""
+        return rms_px(np.concatenate([v.residuals[v.inliers] for v in self.views]))
+
+    @property
+    def n_points(self) -> int:
+        """Number of corners that were believed."""
+        return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
+
+
+def camera(
+    views: Sequence[View],
+    size_px: tuple[int, int],
+    *,
+    model: LensModel = LensModel.OPENCV,
+    n_coefficients: int | None = None,
+) -> CameraCalibration:
+    """Solve the intrinsics.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of them.
+    size_px : (int, int)
+        Image width and height.
+    model : LensModel
+    n_coefficients : int, optional
+        Number of distortion coefficients; by default as many as the views show to be there.
+
+    Returns
+    -------
+    CameraCalibration
+
+    Raises
+    ------
+    CalibrationError
+        If the views are too few or too much alike to determine the intrinsics, or do not show the
+        board they are said to.
+    """
+    check_camera_views(views, size_px)
+    bundle, solution = fitted_camera(views, size_px, model, n_coefficients)
+    bundle, solution, left_out = _without_bad_views(bundle, solution)
+    flat = [target.view for target in bundle.views]
+    bent = _bent(bundle, solution, n_coefficients)
+    if bent is not None:
+        bundle, solution = bent.bundle, bent.solution
+    covariance = shared_covariance(bundle, solution)
+    check_camera_solution(solution, covariance.by_corners, flat)
+    result = _result(bundle, solution, covariance, left_out)
+    if bent is not None:
+        result = replace(result, bend_height=bent.bend.height(flat))
+    return replace(result, findings=tuple(_findings(result)))
+
+
+def _bent(
+    bundle: Bundle, solution: Solution[BundleState], n_coefficients: int | None
+) -> BentFit | None:
+    """Solve with a bend of the board, of the highest degree that is significant."""
+    best: BentFit | None = None
+    flat = bundle
+    for degree in BEND_DEGREES:
+        n_solved = 0 if best is None else len(best.bend.exponents)
+        if not bend_is_significant(bundle, solution, degree, n_solved):
+            continue
+        fit = fit_bend(flat, solution.state, degree)
+        if fit is None:
+            break
+        if n_coefficients is None:
+            # What the bend did to the pictures may have passed for distortion.
+            straight, settled = with_supported_coefficients(fit.bundle, fit.solution)
+            if straight.free != flat.free:
+                flat = replace(straight, views=flat.views)
+                fit = fit_bend(flat, settled.state, degree) or fit
+        best, bundle, solution = fit, fit.bundle, fit.solution
+    return best
+
+
+def _without_bad_views(
+    bundle: Bundle, solution: Solution[BundleState]
+) -> tuple[Bundle, Solution[BundleState], dict[str, str]]:
+    """Leave out views that fit far worse than the others, and solve again."""
+    typical = CORNER_SIGMA_PX * solution.scales[CORNERS]
+    bad: dict[int, str] = {}
+    for i, target in enumerate(bundle.views):
+        noise = CORNER_SIGMA_PX * solution.block_scales[i]
+        share = float(np.mean(solution.inliers[i]))
+        if noise > max(_BAD_VIEW * typical, _BAD_NOISE_PX):
+            bad[i] = f"its corners are {noise:.2g} px off, those of other views {typical:.2g} px"
+        elif share < _MOSTLY_WRONG:
+            bad[i] = f"only {100.0 * share:.0f} % of its {len(target.view)} corners fit"
+    if not bad or len(bad) > _BAD_SHARE * len(bundle.views):
+        return bundle, solution, {}
+    keep = [i for i in range(len(bundle.views)) if i not in bad]
+    part = _part(bundle, keep)
+    reasons = {
+        bundle.views[i].view.name: f"{why}; blurred, or the board bent?" for i, why in bad.items()
+    }
+    return part, solve(part, _state(solution.state, keep)), reasons
+
+
+def _part(bundle: Bundle, keep: Sequence[int]) -> Bundle:
+    return replace(
+        bundle,
+        views=tuple(bundle.views[i] for i in keep),
+        start=_state(bundle.start, keep),
+    )
+
+
+def _state(state: BundleState, keep: Sequence[int]) -> BundleState:
+    return replace(state, poses=tuple(state.poses[i] for i in keep))
+
+
+def _result(
+    bundle: Bundle,
+    solution: Solution[BundleState],
+    covariance: ViewCovariance,
+    left_out: dict[str, str],
+) -> CameraCalibration:
+    rig, n = solution.state.rig, len(bundle.free)
+    fits = []
+    for i, target in enumerate(bundle.views):
+        columns = bundle.pose_columns(i)
+        fits.append(
+            view_fit(
+                target.view.name,
+                target.view,
+                solution.state.poses[i],
+                solution.covariance[np.ix_(columns, columns)],
+                solution.blocks[i],
+                solution.inliers[i],
+                solution.block_scales[i],
+            )
+        )
+    seen = np.concatenate([fit.view.pixels[fit.inliers] for fit in fits])
+    return CameraCalibration(
+        lens=rig.lens,
+        size_px=rig.size_px,
+        uncertainty=RigUncertainty(bundle.free, covariance.by_views[:n, :n]),
+        inflation=covariance.inflation,
+        views=tuple(fits),
+        left_out=left_out,
+        noise_px=CORNER_SIGMA_PX * solution.scales[CORNERS],
+        coverage=coverage(seen, rig.size_px),
+        held_back_rms_px=_held_back(bundle, solution),
+        bend_height=0.0,
+        findings=(),
+        n_iterations=solution.n_iterations,
+    )
+
+
+def _held_back(bundle: Bundle, solution: Solution[BundleState]) -> float:
+    n = len(bundle.views)
+    believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
+    held = [i for i in range(1, n, _HELD_BACK_EVERY) if len(believed[i]) >= _CAMERA_MIN_POINTS]
+    if n < _MIN_HELD_BACK or not held:
+        return float("nan")
+    rest = [i for i in range(n) if i not in held]
+    try:
+        state = solve(_part(bundle, rest), _state(solution.state, rest)).state
+        errors = np.concatenate(predicted(state, [0] * len(held), [believed[i] for i in held]))
+        return rms_px(errors[np.isfinite(errors).all(axis=1)])
+    except CalibrationError:
+        return float("nan")
+
+
+def _findings(result: CameraCalibration) -> list[str]:
+    sigmas, lens = result.uncertainty.sigmas, result.lens
+    n = len(lens.distortion)
+    lines = [
+        f"focal lengths: {lens.fx:.2f} ± {sigmas['fx']:.2f} and {lens.fy:.2f} ± "
+        f"{sigmas['fy']:.2f} px; image centre {lens.cx:.2f} ± {sigmas['cx']:.2f}, "
+        f"{lens.cy:.2f} ± {sigmas['cy']:.2f} px",
+        f"distortion: {n} coefficients of the {lens.model} model",
+    ]
+    lines += _shared_errors(result)
+    if np.isfinite(result.held_back_rms_px):
+        lines.append(
+            f"corners of views held back are predicted to {result.held_back_rms_px:.3f} px"
+        )
+    lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
+    for fit in result.views:
+        wrong = int(np.count_nonzero(~fit.inliers))
+        if wrong > _MANY_OUTLIERS * len(fit.view):
+            lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
+    return lines + _weak_places(result)
+
+
+def _shared_errors(result: CameraCalibration) -> list[str]:
+    lines = []
+    if result.bend_height > 0.0:
+        lines.append(
+            f"the board is not flat: {1e3 * result.bend_height:.2g} mm between its highest and its "
+            "lowest corner, the same in all views; this bend is solved for. Glue the board to "
+            "something stiff before the next step"
+        )
+    if result.inflation > _SHARED_ERRORS:
+        lines.append(
+            "views disagree more than their corners' noise explains: the uncertainties are "
+            f"{np.sqrt(result.inflation):.1f} times larger than independent corners would make "
+            "them. Usual causes: the board bends, it moves while the shutter is open, rolling "
+            "shutter, autofocus"
+        )
+    sigmas, lens = result.uncertainty.sigmas, result.lens
+    focal = max(sigmas["fx"] / lens.fx, sigmas["fy"] / lens.fy)
+    if focal > _WEAK_FOCAL:
+        lines.append(
+            f"the focal length is uncertain by {100.0 * focal:.2g} %: take more views, with a "
+            "stiff board, tilted by 20 to 40 degrees to different sides, near, and in all parts of "
+            "the picture"
+        )
+    return lines
+
+
+def _weak_places(result: CameraCalibration) -> list[str]:
+    lines = []
+    covered = float(np.mean(result.coverage > 0))
+    if covered < _THIN_COVERAGE:
+        lines.append(
+            f"corners were seen in {100.0 * covered:.0f} % of the picture; show the board in all "
+            "parts of it"
+        )
+    grid = pixel_grid(result.size_px)
+    sigma = direction_sigma_px(result.lens, result.uncertainty.covariance, grid)
+    if not np.isfinite(sigma).all():
+        lines.append("the distortion model does not reach all corners of the picture")
+    worst = int(np.argmax(np.nan_to_num(sigma)))
+    if np.nan_to_num(sigma)[worst] > _WEAK_PIXEL_PX:
+        u, v = grid[worst]
+        lines.append(
+            f"at pixel ({u:.0f}, {v:.0f}) the intrinsics are uncertain by {sigma[worst]:.1f} px; "
+            "show the board there"
+        )
+    return lines

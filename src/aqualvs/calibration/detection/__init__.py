@@ -1,0 +1,1 @@
+"""Detection of targets in pictures, to a few hundredths of a pixel."""

@@ -1,0 +1,571 @@
+"""Find a ChArUco board: a few markers say where it is, then corner leads to corner.
+
+Reading a marker is slow, and near the picture's border or under a laser stripe many cannot be
+read. So markers are read in the middle of the picture first, and only until enough of them agree;
+all other corners are found from their neighbours and borne out by the picture.
+
+Markers as OpenCV reads them: numbers and rough corners.
+
+The inner corners of a board as a grid: predict from neighbours, grow, find the odd ones out.
+
+Find a plain chessboard, all of it, and put its corners in the board's order.
+
+OpenCV's finders say roughly where the corners are. What they find may be a wrong grid, one row off
+onto the paper's border for example; every grid is tested on the picture, and other finders are
+tried until one stands the test.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from aqualvs.calibration.detection.saddle_corners import GreyImage, SaddleFit, refine_saddles
+from aqualvs.calibration.targets.targets import Board, aruco_dictionary
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+
+# Widest window of the local threshold, as a share of the picture's width.
+_WIDEST_WINDOW = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Markers:
+    """Markers as OpenCV reads them, not refined.
+
+    Attributes
+    ----------
+    ids : int array, shape (M,)
+        Numbers in the dictionary.
+    corners : array, shape (M, 4, 2)
+        In `image`, in OpenCV's order.
+    """
+
+    ids: IntArray
+    corners: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of markers."""
+        return len(self.ids)
+
+
+def read_markers(
+    image: GreyImage, dictionary: str, *, n_first: int | None = None, window_px: int | None = None
+) -> Markers:
+    """Read markers in a picture, by contour, to about half a pixel.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    dictionary : str
+        Name of the markers' dictionary.
+    n_first : int or None
+        Read only the first so many markers of the dictionary, which is faster.
+    window_px : int or None
+        Odd width of the only local threshold; None tries several.
+    """
+    parameters = cv2.aruco.DetectorParameters()
+    if window_px is not None:
+        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window_px
+    else:
+        widest = _WIDEST_WINDOW * image.shape[1]
+        parameters.adaptiveThreshWinSizeMax = max(parameters.adaptiveThreshWinSizeMax, int(widest))
+    markers = aruco_dictionary(dictionary)
+    if n_first is not None:
+        markers = cv2.aruco.Dictionary(
+            markers.bytesList[:n_first], markers.markerSize, markers.maxCorrectionBits
+        )
+    corners, ids, _ = cv2.aruco.ArucoDetector(markers, parameters).detectMarkers(image)
+    if ids is None or len(ids) == 0:
+        return Markers(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
+    return Markers(
+        np.asarray(ids, np.int64).ravel(), np.asarray(corners, np.float64).reshape(-1, 4, 2)
+    )
+
+
+# Neighbours that predict a corner: up to this many squares away.
+_REACH = 2
+# An affine map needs three neighbours; a fourth guards it.
+_MIN_NEIGHBOURS = 4
+# Nearer neighbours say more, because the map is affine only nearby.
+_FALL = 0.7
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Corners of a board in one picture.
+
+    Attributes
+    ----------
+    pixels : array, shape (rows, columns, 2)
+        In `image`.
+    known : bool array, shape (rows, columns)
+        Which were found.
+    notes : tuple of str
+        What a user should know of how they were found.
+    """
+
+    pixels: FloatArray
+    known: BoolArray
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Where the neighbours of each grid point say that it is.
+
+    Attributes
+    ----------
+    pixels : array, shape (rows, columns, 2)
+        In `image`; NaN where not valid.
+    axes : array, shape (rows, columns, 2, 2)
+        One square's side along the board's x (`[..., 0]`) and y (`[..., 1]`), in pixels.
+    valid : bool array, shape (rows, columns)
+        False where too few neighbours are known, or all on one line.
+    """
+
+    pixels: FloatArray
+    axes: FloatArray
+    valid: BoolArray
+
+
+def nothing_known(board: Board) -> Grid:
+    """Return the grid of a board of which no corner was found."""
+    shape = board.corner_grid[::-1]
+    return Grid(np.zeros((*shape, 2)), np.zeros(shape, dtype=bool))
+
+
+def predict(pixels: FloatArray, known: BoolArray) -> Prediction:
+    """Fit an affine map to the known neighbours of every grid point, without the point itself.
+
+    Parameters
+    ----------
+    pixels : array, shape (rows, columns, 2)
+        Corners in `image`.
+    known : bool array, shape (rows, columns)
+        Which of them are known; others are ignored, even if NaN.
+    """
+    rows, columns = known.shape
+    weight = np.pad(known.astype(np.float64), _REACH)
+    values = np.pad(np.where(known[..., None], pixels, 0.0), ((_REACH,) * 2, (_REACH,) * 2, (0, 0)))
+    normal, right = np.zeros((rows, columns, 3, 3)), np.zeros((rows, columns, 3, 2))
+    count = np.zeros((rows, columns), dtype=np.int64)
+    for dy in range(-_REACH, _REACH + 1):
+        for dx in range(-_REACH, _REACH + 1):
+            if dx == dy == 0:
+                continue
+            here = np.s_[_REACH + dy : _REACH + dy + rows, _REACH + dx : _REACH + dx + columns]
+            basis = np.array([1.0, dx, dy])
+            share = weight[here] * np.exp(-_FALL * (dx * dx + dy * dy))
+            normal += share[..., None, None] * np.outer(basis, basis)
+            right += share[..., None, None] * (basis[:, None] * values[here][..., None, :])
+            count += weight[here] > 0.0
+    valid = (count >= _MIN_NEIGHBOURS) & _spread_both_ways(normal)
+    safe = np.where(valid[..., None, None], normal, np.eye(3))
+    solution = np.linalg.solve(safe, right)
+    found = np.where(valid[..., None], solution[..., 0, :], np.nan)
+    axes = np.swapaxes(solution[..., 1:, :], -1, -2)
+    return Prediction(found, axes, valid)
+
+
+def _spread_both_ways(normal: FloatArray) -> BoolArray:
+    """Whether the neighbours of a point do not all lie on one line."""
+    mass = np.maximum(normal[..., 0, 0], 1e-12)
+    mean = normal[..., 0, 1:] / mass[..., None]
+    spread = normal[..., 1:, 1:] / mass[..., None, None]
+    spread = spread - mean[..., :, None] * mean[..., None, :]
+    wide: BoolArray = np.linalg.det(spread) > 1e-2
+    return wide
+
+
+def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
+    """Return which known points their neighbours contradict.
+
+    Parameters
+    ----------
+    pixels, known
+        As in `predict`.
+    share : float
+        Allowed distance from the prediction, in sides of a square.
+    """
+    from_neighbours = predict(pixels, known)
+    side = np.sqrt(np.min(np.sum(np.square(from_neighbours.axes), axis=-2), axis=-1))
+    distance = np.linalg.norm(pixels - from_neighbours.pixels, axis=-1)
+    odd: BoolArray = known & from_neighbours.valid & (distance > share * side)
+    return odd
+
+
+# OpenCV's finders look at every pixel; above this size a smaller picture finds the same board.
+_MAX_WIDTH_PX = 1400
+_MISFIT_SHARE = 0.12
+# Share of the corners that the picture must bear out, so that no other finder is asked.
+_ENOUGH = 0.8
+
+_Finder = Callable[[GreyImage, tuple[int, int]], tuple[bool, cv2.typing.MatLike]]
+
+
+def _sectors(flags: int) -> _Finder:
+    return lambda image, grid: cv2.findChessboardCornersSB(image, grid, flags=flags)
+
+
+def _quads(flags: int) -> _Finder:
+    return lambda image, grid: cv2.findChessboardCorners(image, grid, flags=flags)
+
+
+# In the order in which they are tried; the first is the best, and the fastest.
+_FINDERS: tuple[tuple[str, _Finder], ...] = (
+    ("findChessboardCornersSB", _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE)),
+    (
+        "findChessboardCorners",
+        _quads(cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE),
+    ),
+    (
+        "findChessboardCornersSB, exhaustive",
+        _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE),
+    ),
+    ("findChessboardCorners, global threshold", _quads(0)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """A grid as the picture bears it out; `first_is_light` as it lies in the picture."""
+
+    grid: Grid
+    first_is_light: bool
+
+    @property
+    def n_known(self) -> int:
+        return int(np.count_nonzero(self.grid.known))
+
+
+def find_chessboard(image: GreyImage, board: Board) -> Grid:
+    """Find the inner corners of a chessboard.
+
+    Returns
+    -------
+    Grid
+        Nothing known where the board is not seen whole. Corners that the picture does not bear
+        out, under a laser stripe for example, are not known.
+
+    Notes
+    -----
+    A board whose number of squares is even in both directions, or odd in both, looks the same
+    when it is turned by half a turn: then the corner nearer to the picture's top left comes first.
+    Such a board exists in two prints, with a dark or with a light first square; both are taken,
+    and the grid's notes say so.
+    """
+    best, used = _Attempt(nothing_known(board), first_is_light=False), ""
+    for name, rough in _rough_grids(image, board.corner_grid):
+        found = _borne_out(image, rough)
+        if found.n_known > best.n_known:
+            best, used = found, name
+        if best.n_known >= _ENOUGH * board.n_corners:
+            break
+    if not best.n_known:
+        return nothing_known(board)
+    grid, first_is_light = _in_board_order(best)
+    notes = []
+    if used != _FINDERS[0][0]:
+        notes.append(f"board found at a later try (OpenCV's {used})")
+    if first_is_light:
+        notes.append(_other_print(board))
+    return Grid(grid.pixels, grid.known, tuple(notes))
+
+
+def _other_print(board: Board) -> str:
+    n_x, n_y = board.corner_grid
+    return (
+        f"the first square of the print is light, as on a board of {n_y} x {n_x} inner corners; "
+        f"taken as the same board, with x along the {n_x}"
+    )
+
+
+def _rough_grids(image: GreyImage, grid: tuple[int, int]) -> Iterator[tuple[str, FloatArray]]:
+    """Yield corners (rows, columns, 2) as OpenCV's finders have them, each with its name."""
+    scale = min(1.0, _MAX_WIDTH_PX / image.shape[1])
+    small = image
+    if scale < 1.0:
+        small = np.asarray(
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    for name, find in _FINDERS:
+        found, corners = find(small, grid)
+        if found:
+            # The centre of the top-left pixel is (0, 0) in both sizes.
+            pixels = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+            yield name, _right_handed(pixels.reshape(grid[1], grid[0], 2))
+
+
+def _right_handed(pixels: FloatArray) -> FloatArray:
+    """Mirror the grid, if need be, so that z points into the board."""
+    along_x = pixels[:, -1].mean(axis=0) - pixels[:, 0].mean(axis=0)
+    along_y = pixels[-1].mean(axis=0) - pixels[0].mean(axis=0)
+    mirrored = along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0.0
+    return pixels[:, ::-1] if mirrored else pixels
+
+
+def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
+    """Refine a grid and the ring of corners around it, and shift it to where most are."""
+    rows, columns = rough.shape[:2]
+    pixels = np.pad(rough, ((1, 1), (1, 1), (0, 0)))
+    known = np.pad(np.ones((rows, columns), dtype=bool), 1)
+    first_is_light = _diagonal_is_light(image, rough)
+    light = (np.indices(known.shape).sum(axis=0) % 2 == 1) != first_is_light
+    seen = np.zeros_like(known)
+    # The second time from neighbours that were seen, not from where the finder has them.
+    for first in (True, False):
+        expected = predict(pixels, known if first else seen)
+        starts = np.where((known & first)[..., None], pixels, expected.pixels)
+        tried = ~seen & expected.valid & _inside(starts, image)
+        fits = refine_saddles(
+            image, starts[tried], expected.axes[tried], light[tried], margin=1.0, bits_from=1.0
+        )
+        pixels[tried], seen[tried] = fits.pixels, fits.valid
+        seen &= ~misfits(pixels, seen, share=_MISFIT_SHARE)
+    # The middle first: it stays where the others are no better.
+    shifts = sorted(np.ndindex(3, 3), key=lambda s: abs(s[0] - 1) + abs(s[1] - 1))
+    dy, dx = max(shifts, key=lambda s: np.count_nonzero(seen[s[0] :, s[1] :][:rows, :columns]))
+    window = np.s_[dy : dy + rows, dx : dx + columns]
+    grid = Grid(pixels[window], seen[window])
+    return _Attempt(grid, first_is_light != bool((dy + dx) % 2))
+
+
+def _diagonal_is_light(image: GreyImage, pixels: FloatArray) -> bool:
+    """Whether the squares with an even sum of row and column are light, that of (0, 0) included."""
+    centres = 0.25 * (pixels[1:, 1:] + pixels[:-1, 1:] + pixels[1:, :-1] + pixels[:-1, :-1])
+    x, y = np.rint(centres).astype(np.int64).reshape(-1, 2).T
+    height, width = image.shape
+    tone = image[y.clip(0, height - 1), x.clip(0, width - 1)].reshape(centres.shape[:2])
+    even = np.indices(tone.shape).sum(axis=0) % 2 == 0
+    return bool(tone[even].mean() > tone[~even].mean())
+
+
+def _in_board_order(found: _Attempt) -> tuple[Grid, bool]:
+    """Turn a grid so that the first square is dark, and say whether it is light all the same."""
+    pixels, known = found.grid.pixels, found.grid.known
+    rows, columns = known.shape
+    # Over which number of squares the first one moves in each quarter turn.
+    over = {0: 0, 2: rows + columns}
+    if rows == columns:
+        over |= {1: columns, 3: rows}
+    light = {turn: found.first_is_light != bool(n % 2) for turn, n in over.items()}
+    dark = [turn for turn, is_light in light.items() if not is_light]
+    best = min(dark or light, key=lambda turn: float(np.rot90(pixels, turn)[0, 0].sum()))
+    return Grid(np.rot90(pixels, best), np.rot90(known, best)), not dark
+
+
+def _inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
+    height, width = image.shape
+    # NaN, where nothing is predicted, compares false.
+    inside: BoolArray = np.all((pixels >= 0.0) & (pixels <= (width - 1, height - 1)), axis=-1)
+    return inside
+
+
+# Parts of the picture, about its centre, in which markers are looked for in turn.
+_CROPS = (0.25, 0.5, 1.0)
+# Pairs of markers that agree, enough to find the other corners from.
+_ENOUGH_AGREED = 8
+# Window of the local threshold for a quick look at a part, as a share of the picture's width.
+_QUICK_WINDOW = 0.01
+# Markers so many squares apart must agree on how they lie, to this share of their distance: blur
+# makes them look a seventh too small, and on a tilted board squares grow. One square off, as on a
+# board of other make, is a third or more.
+_NEIGHBOUR_SQUARES = 3
+_AGREEMENT = 0.25
+# A marker supports the grid whose corner it sees this near, in sides, and contradicts it from so
+# far; most must support it, and but a few, which were misread, may contradict it.
+_SUPPORT = 0.25
+_SUPPORTED_SHARE = 0.6
+_CONTRADICTION = 0.5
+_CONTRADICTED_SHARE = 0.05
+# A corner that the picture did not bear out is tried again when more neighbours are known.
+_MAX_TRIES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Seeds:
+    """Corners that markers agree on.
+
+    Attributes
+    ----------
+    corners : int array, shape (K,)
+        Which inner corners of the board.
+    pixels : array, shape (K, 2)
+        About where they are, in `image`.
+    axes : array, shape (K, 2, 2)
+        A square's sides along the board's x and y there, as columns, in pixels.
+    n_agreed : int
+        How many pairs of markers agree across rows.
+    """
+
+    corners: IntArray
+    pixels: FloatArray
+    axes: FloatArray
+    n_agreed: int
+
+
+def find_charuco(image: GreyImage, board: Board) -> Grid:
+    """Find the corners of a ChArUco board.
+
+    Returns
+    -------
+    Grid
+        Nothing known where no two markers agree on a corner.
+    """
+    quick_px = 2 * max(round(0.5 * _QUICK_WINDOW * image.shape[1]), 1) + 1
+    for part, offset in _parts(image):
+        window_px = None if part.shape == image.shape else quick_px
+        found = read_markers(part, board.dictionary, n_first=board.n_markers, window_px=window_px)
+        markers = Markers(found.ids, found.corners + offset)
+        seeds = agreed_corners(markers, board)
+        if seeds.n_agreed >= _ENOUGH_AGREED:
+            break
+    grid = _grow(image, board, seeds)
+    return grid if _supported(grid, markers, board) else nothing_known(board)
+
+
+def _parts(image: GreyImage) -> Iterator[tuple[GreyImage, FloatArray]]:
+    height, width = image.shape
+    for share in _CROPS:
+        x, y = round(0.5 * (1.0 - share) * width), round(0.5 * (1.0 - share) * height)
+        part = np.ascontiguousarray(image[y : height - y, x : width - x])
+        yield part, np.array([x, y], dtype=np.float64)
+
+
+def _by_markers(markers: Markers, board: Board) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return what each marker says of the corners of its square, by its own homography.
+
+    Returns
+    -------
+    places : int array, shape (K, 4, 2)
+        Column and row of the square's corners in the grid; outside it at the board's edge.
+    pixels : array, shape (K, 4, 2)
+        Where they should be.
+    axes : array, shape (K, 2, 2)
+        The square's sides along the board's x and y, as columns, in pixels.
+    """
+    squares = board.marker_squares()
+    near, far = board.margin_share, 1.0 - board.margin_share
+    inside = np.array([[near, near], [far, near], [far, far], [near, far]], np.float32)
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.int64)
+    ours = np.flatnonzero(markers.ids < len(squares))
+    places = squares[markers.ids[ours]][:, None, :] - 1 + unit
+    pixels = np.empty((len(ours), 4, 2))
+    for k, i in enumerate(ours):
+        homography = cv2.getPerspectiveTransform(inside, markers.corners[i].astype(np.float32))
+        pixels[k] = cv2.perspectiveTransform(unit[None].astype(np.float32), homography)[0]
+    along_x = 0.5 * (pixels[:, 1] - pixels[:, 0] + pixels[:, 2] - pixels[:, 3])
+    along_y = 0.5 * (pixels[:, 3] - pixels[:, 0] + pixels[:, 2] - pixels[:, 1])
+    return places, pixels, np.stack([along_x, along_y], axis=-1)
+
+
+def agreed_corners(markers: Markers, board: Board) -> Seeds:
+    """Return the corners of those markers that agree with their neighbours.
+
+    Markers whose squares are near each other on the board must be as near in the picture. One that
+    was read wrongly, or on a board of another make, contradicts more neighbours than it has
+    friends.
+    """
+    n_x, n_y = board.corner_grid
+    places, pixels, axes = _by_markers(markers, board)
+    agree, disagree = _neighbours(places[:, 0], pixels.mean(axis=1), axes)
+    trusted = np.count_nonzero(agree, axis=1) > np.count_nonzero(disagree, axis=1)
+    inside = np.all((places >= 0) & (places < (n_x, n_y)), axis=-1)
+    chosen = trusted[:, None] & inside
+    seeds, first = np.unique((places[..., 0] + n_x * places[..., 1])[chosen], return_index=True)
+    # Markers of one row agree on a board of any width.
+    across = agree & (places[:, None, 0, 1] != places[None, :, 0, 1])
+    across &= trusted[:, None] & trusted[None, :]
+    return Seeds(
+        seeds,
+        pixels[chosen][first],
+        np.broadcast_to(axes[:, None], (*inside.shape, 2, 2))[chosen][first],
+        int(np.count_nonzero(across)) // 2,
+    )
+
+
+def _neighbours(
+    squares: IntArray, centres: FloatArray, axes: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """Return which pairs (K, K) of near markers agree on how they lie, and which do not."""
+    step = squares[None, :] - squares[:, None]
+    distance = np.max(np.abs(step), axis=-1)
+    near = distance <= _NEIGHBOUR_SQUARES
+    np.fill_diagonal(near, val=False)
+    mean_axes = 0.5 * (axes[None, :] + axes[:, None])
+    expected = np.einsum("ijkl,ijl->ijk", mean_axes, step.astype(np.float64))
+    off = np.linalg.norm(centres[None, :] - centres[:, None] - expected, axis=-1)
+    side = np.sqrt(np.abs(np.linalg.det(mean_axes)))
+    agree: BoolArray = near & (off < _AGREEMENT * side * distance)
+    return agree, near & ~agree
+
+
+def _grow(image: GreyImage, board: Board, seeds: Seeds) -> Grid:
+    """Refine the seeds, then go from known corners to their neighbours until none is new."""
+    shape = board.corner_grid[::-1]
+    pixels, known = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
+    tries = np.zeros(shape, dtype=np.int64)
+    light = board.light_beyond_corners()
+    fits = _refine(image, board, seeds.pixels, seeds.axes, light[seeds.corners])
+    pixels.reshape(-1, 2)[seeds.corners] = fits.pixels
+    known.reshape(-1)[seeds.corners] = fits.valid
+    known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
+    while True:
+        expected = predict(pixels, known)
+        new = (
+            ~known & expected.valid & (tries < _MAX_TRIES) & _charuco_inside(expected.pixels, image)
+        )
+        if not np.any(new):
+            break
+        tries[new] += 1
+        fits = _refine(
+            image, board, expected.pixels[new], expected.axes[new], light.reshape(shape)[new]
+        )
+        pixels[new], known[new] = fits.pixels, fits.valid
+        known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
+    return Grid(pixels, known)
+
+
+def _supported(grid: Grid, markers: Markers, board: Board) -> bool:
+    """Whether most markers that were read lie where the grid has them, or would have them.
+
+    On a board of another make, with other counts of squares say, some rows agree by chance.
+    """
+    n_x, n_y = board.corner_grid
+    places, pixels, axes = _by_markers(markers, board)
+    inside = np.all((places >= 0) & (places < (n_x, n_y)), axis=-1)
+    column, row = np.moveaxis(places.clip(0, (n_x - 1, n_y - 1)), -1, 0)
+    expected = np.where(grid.known[..., None], grid.pixels, predict(grid.pixels, grid.known).pixels)
+    # NaN, where nothing is expected, is neither near nor far.
+    apart = np.linalg.norm(expected[row, column] - pixels, axis=-1)
+    share = apart / np.sqrt(np.abs(np.linalg.det(axes)))[:, None]
+    supporting = inside & grid.known[row, column] & (share < _SUPPORT)
+    contradicting = inside & (share > _CONTRADICTION)
+    n_for, n_against = (
+        int(np.count_nonzero(np.any(which, axis=1))) for which in (supporting, contradicting)
+    )
+    n = len(places)
+    return n_for >= _SUPPORTED_SHARE * n and n_against <= max(1.0, _CONTRADICTED_SHARE * n)
+
+
+def _refine(
+    image: GreyImage, board: Board, starts: FloatArray, axes: FloatArray, light: BoolArray
+) -> SaddleFit:
+    # The first cell of a marker is its dark border; its bits follow.
+    cell = board.marker / board.square / (aruco_dictionary(board.dictionary).markerSize + 2)
+    return refine_saddles(
+        image,
+        starts,
+        axes,
+        light,
+        margin=board.margin_share,
+        bits_from=board.margin_share + cell,
+    )
+
+
+def _charuco_inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
+    height, width = image.shape
+    inside: BoolArray = np.all((pixels >= 0.0) & (pixels <= (width - 1, height - 1)), axis=-1)
+    return inside

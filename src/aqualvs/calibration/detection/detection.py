@@ -1,0 +1,204 @@
+"""From pictures to views: find a board or markers, to a few hundredths of a pixel.
+
+Why a target was not found: what the picture shows instead, and what may help.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from aqualvs.calibration.detection.boards import (
+    Grid,
+    Markers,
+    agreed_corners,
+    find_charuco,
+    find_chessboard,
+    read_markers,
+)
+from aqualvs.calibration.detection.saddle_corners import GreyImage
+from aqualvs.calibration.detection.tag_corners import refine_tags
+from aqualvs.calibration.targets.targets import DICTIONARIES, Board, BoardKind, MarkerSet, View
+
+# One marker of a small dictionary is easily read into clutter.
+_ENOUGH = 4
+# The small dictionaries are the first markers of their large ones, ArUco's 36H12 aside.
+_LARGEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
+# Squares more or fewer, each way, that a board file may give by mistake.
+_OTHER_COUNTS = 3
+
+
+def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: int) -> str:
+    """Return one clause on why there is no view of a board.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    board : Board
+        What was looked for.
+    n_corners, min_corners : int
+        How many corners were found and needed.
+    """
+    if n_corners > 0:
+        return (
+            f"only {n_corners} corners of the board, at least {min_corners} are needed; show more "
+            "of it, or come nearer"
+        )
+    if board.kind is BoardKind.CHESSBOARD:
+        n_x, n_y = board.corner_grid
+        return (
+            f"no chessboard of {n_x} x {n_y} inner corners; it must be seen whole, with a light "
+            "border, or the number of squares is wrong"
+        )
+    markers = read_markers(image, board.dictionary)
+    if len(markers) < _ENOUGH:
+        return _no_markers(image, board.dictionary, len(markers))
+    read = f"{len(markers)} markers of {board.dictionary}"
+    counts = [
+        (agreed_corners(markers, other).n_agreed, remedy) for other, remedy in _other_boards(board)
+    ]
+    most, remedy = max(counts, key=lambda count: count[0])
+    if most >= _ENOUGH:
+        return f"{read}, but not as on this board; {remedy}"
+    return f"{read}, but not as on this board ({_ids(markers)}); check its squares and dictionary"
+
+
+def _other_boards(board: Board) -> Iterator[tuple[Board, str]]:
+    """Boards that a slip in the file may have meant, with the remedy."""
+    if board.squares[1] % 2 == 0:
+        other = replace(board, legacy_pattern=not board.legacy_pattern)
+        yield other, f"write 'legacy_pattern: {str(other.legacy_pattern).lower()}'"
+    for step in range(-_OTHER_COUNTS, _OTHER_COUNTS + 1):
+        n_x = board.squares[0] + step
+        if step and n_x >= 3:
+            yield _wider(board, n_x), f"it looks as if squares_x were {n_x}"
+
+
+def _wider(board: Board, n_x: int) -> Board:
+    # A board of too many markers cannot be; fewer rows do for the comparison.
+    most = 2 * board.n_markers // n_x
+    return replace(board, squares=(n_x, max(3, min(board.squares[1], most))))
+
+
+def why_no_markers(
+    image: GreyImage, marker_set: MarkerSet, markers: Markers, n_corners: int, min_corners: int
+) -> str:
+    """Return one clause on why there is no view of a set of markers.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    marker_set : MarkerSet
+        What was looked for.
+    markers : Markers
+        All markers of its family that were read.
+    n_corners, min_corners : int
+        How many corners were refined and needed.
+    """
+    ours = np.isin(markers.ids, marker_set.ids)
+    if np.any(ours):
+        return (
+            f"{np.count_nonzero(ours)} of the markers, but only {n_corners} clean corners, at "
+            f"least {min_corners} are needed; come nearer, or keep stripes and glare off them"
+        )
+    if len(markers) > 0:
+        return (
+            f"{len(markers)} markers of {marker_set.family}, but none of the file's "
+            f"({_ids(markers)}); check the ids"
+        )
+    return _no_markers(image, marker_set.family, 0)
+
+
+def _no_markers(image: GreyImage, dictionary: str, n_read: int) -> str:
+    for name in _LARGEST:
+        n_other = len(read_markers(image, name)) if _differs(name, dictionary) else 0
+        if n_other >= max(_ENOUGH, n_read + 1):
+            return f"{n_other} markers of {name}, not of {dictionary}; check the dictionary"
+    what = "no markers" if n_read == 0 else f"only {n_read} markers"
+    return f"{what} of {dictionary}; is the target in the picture, sharp and large enough?"
+
+
+def _differs(name: str, dictionary: str) -> bool:
+    """Whether two names are of different families: DICT_4X4_50 is the start of DICT_4X4_1000."""
+    return name.split("_")[:2] != dictionary.split("_")[:2] or "APRILTAG" in name
+
+
+def _ids(markers: Markers) -> str:
+    shown = ", ".join(str(number) for number in sorted(markers.ids)[:5])
+    return f"read: {shown}{', ...' if len(markers) > 5 else ''}"
+
+
+MIN_CORNERS = 6
+"""Fewer corners than this fix neither a pose nor their own mistakes."""
+
+
+def detect_board(
+    image: GreyImage, board: Board, name: str, *, min_corners: int = MIN_CORNERS
+) -> View | str:
+    """Find the inner corners of a board.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    board : Board
+        What to look for. A ChArUco board may be seen in part, a chessboard only whole.
+    name : str
+        How messages call the picture.
+    min_corners : int
+        Fewer corners are no view.
+
+    Returns
+    -------
+    View or str
+        Points in `board`, ids count the inner corners row by row; or, in a clause, why there is
+        none.
+    """
+    find = find_charuco if board.kind is BoardKind.CHARUCO else find_chessboard
+    grid = find(image, board)
+    n = int(np.count_nonzero(grid.known))
+    if n < min_corners:
+        return why_no_board(image, board, n, min_corners)
+    return _view(grid, board, name)
+
+
+def _view(grid: Grid, board: Board, name: str) -> View:
+    ids = np.flatnonzero(grid.known).astype(np.int64)
+    return View(name, ids, board.corner_points()[ids], grid.pixels.reshape(-1, 2)[ids], grid.notes)
+
+
+def detect_markers(
+    image: GreyImage, marker_set: MarkerSet, name: str, *, min_corners: int = MIN_CORNERS
+) -> View | str:
+    """Find the corners of the markers of a set.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    marker_set : MarkerSet
+        What to look for; other markers of the family are ignored.
+    name : str
+        How messages call the picture.
+    min_corners : int
+        Fewer corners are no view.
+
+    Returns
+    -------
+    View or str
+        Points in the set's frame, ids are four times the index in the set plus the corner's place;
+        or why there is none, in a clause. Corners that could not be refined cleanly, under a laser
+        stripe for example, are missing.
+    """
+    markers = read_markers(image, marker_set.family)
+    index = {int(number): i for i, number in enumerate(marker_set.ids)}
+    ours = np.array([i for i, number in enumerate(markers.ids) if int(number) in index], np.int64)
+    tags = refine_tags(image, markers.ids[ours], markers.corners[ours], marker_set.family)
+    places = np.array([index[int(number)] for number in markers.ids[ours]], np.int64)
+    ids = (4 * places[:, None] + np.arange(4))[tags.valid]
+    if len(ids) < min_corners:
+        return why_no_markers(image, marker_set, markers, len(ids), min_corners)
+    order = np.argsort(ids, kind="stable")
+    return View(name, ids[order], marker_set.points()[ids[order]], tags.pixels[tags.valid][order])

@@ -1,0 +1,414 @@
+"""Sub-pixel place of the corners where four squares of a chessboard meet.
+
+Around such a corner the picture is point-symmetric: blur, gamma and the printer's ink change the
+look of the edges but not their crossing. A small model of that neighbourhood, blur included, is
+fitted to the pixels by damped least squares (`saddle_model`); the markers of a ChArUco board, which
+begin a few pixels away on small squares, are part of the model instead of a disturbance.
+
+What small fits to pixels inside compiled kernels share: an edge, and what is no information.
+
+What a corner of a chessboard looks like, and the compiled fit of that look to pixels.
+
+Two straight edges cross; two opposite quadrants are light. On a ChArUco board a dark marker begins
+in each light quadrant, a margin away from both edges. The blur is Gaussian, the same everywhere,
+and the tones are a level, a contrast and a slope of the level.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.linear_algebra import factorise, solve_factorised
+
+LEAST_PIVOT = 1e-12
+"""A pivot of the normal matrix below this share of its diagonal is no information."""
+
+_SQRT_HALF = math.sqrt(0.5)
+_DENSITY_AT_ZERO = 1.0 / math.sqrt(2.0 * math.pi)
+# Farther than this many blurs from where it lies, an edge is over.
+_REACH = 4.0
+
+
+@inline_borrowing_kernel
+def blurred_edge(distance: float, blur: float) -> tuple[float, float]:
+    """Return a Gaussian edge's height, 0 to 1, and its slope by `distance`."""
+    t = distance / blur
+    if t > _REACH:
+        return 1.0, 0.0
+    if t < -_REACH:
+        return 0.0, 0.0
+    return 0.5 + 0.5 * math.erf(_SQRT_HALF * t), _DENSITY_AT_ZERO * math.exp(-0.5 * t * t) / blur
+
+
+U8Array = NDArray[np.uint8]
+
+# Unknowns: centre x, y; angles of the edges' normals; log of the blur; level, contrast, slopes.
+_N = 9
+_MAX_ROUNDS = 3
+_MAX_ITERATIONS = 12
+_SETTLED_PX = 4e-3
+_SETTLED_LOG_BLUR = 0.03
+_RECENTRE_PX = 0.6
+_RADIUS_LIMIT_PX = 8.0
+_RADIUS_SHARE = 0.47
+_MIN_RADIUS_PX = 2.4
+# Sine of the angle between the edges below which they no longer cross in a point.
+_MIN_SINE = 0.25
+# Where the fit of the blur starts, as a share of the square.
+_BLUR_SHARE = 0.06
+_MAX_STEP_PX = 2.0
+_MAX_STEP_ANGLE = 0.2
+_MAX_STEP_LOG_BLUR = 0.5
+_BLUR_PX = (0.25, 6.0)
+# Bits of a marker blur this many blurs into its border.
+_BITS_REACH = 2.0
+
+
+# The constants of one window, in this order, as kernels take them.
+_X, _Y, _RADIUS, _REACH_1, _REACH_2, _SIGN, _MARGIN, _BITS_FROM = range(8)
+
+
+@kernel
+def fit_saddles(
+    image: U8Array,
+    axes: FloatArray,
+    light_first: BoolArray,
+    margin: float,
+    bits_from: float,
+    pixels: FloatArray,
+    quality: FloatArray,
+) -> None:
+    """Move `pixels` (N, 2) onto the crossings; write sigma, residual share, turn, blur (N, 4).
+
+    Sigma stays 0 where nothing could be fitted; arguments as in `saddle_corners.refine_saddles`.
+    """
+    window, matrices, vectors = np.empty(8), np.empty((3, _N, _N)), np.empty((6, _N))
+    window[_MARGIN], window[_BITS_FROM] = margin, bits_from
+    best = vectors[0]
+    for i in range(len(pixels)):
+        window[_SIGN] = 1.0 if light_first[i] else -1.0
+        quality[i] = 0.0
+        if not _start(axes[i], pixels[i], window, best):
+            continue
+        turn_1, turn_2 = best[2], best[3]
+        sigma, share = _fit(image, window, matrices, vectors)
+        if not sigma > 0.0:
+            continue
+        pixels[i, 0], pixels[i, 1] = best[0], best[1]
+        quality[i, 0], quality[i, 1] = sigma, share
+        quality[i, 2] = max(abs(best[2] - turn_1), abs(best[3] - turn_2))
+        quality[i, 3] = math.exp(best[4])
+
+
+@inline_borrowing_kernel
+def _start(axes: FloatArray, pixel: FloatArray, window: FloatArray, unknowns: FloatArray) -> bool:
+    """Write where the fit starts; False where the axes span no area."""
+    area = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
+    side_1 = math.hypot(axes[0, 0], axes[1, 0])
+    side_2 = math.hypot(axes[0, 1], axes[1, 1])
+    if not abs(area) > _MIN_SINE * side_1 * side_2:
+        return False
+    window[_REACH_1], window[_REACH_2] = abs(area) / side_2, abs(area) / side_1
+    # The edge along the board's y separates its x: its normal points to +x, the other's to +y.
+    turn = 1.0 if area > 0.0 else -1.0
+    unknowns[0], unknowns[1] = pixel[0], pixel[1]
+    unknowns[2] = math.atan2(-turn * axes[0, 1], turn * axes[1, 1])
+    unknowns[3] = math.atan2(turn * axes[0, 0], -turn * axes[1, 0])
+    narrow = min(window[_REACH_1], window[_REACH_2])
+    unknowns[4] = math.log(min(max(_BLUR_SHARE * narrow, 0.7), 2.0))
+    return True
+
+
+@borrowing_kernel
+def _fit(
+    image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
+) -> tuple[float, float]:
+    """Fit one corner in vectors[0]; return sigma of a coordinate and the residual's share."""
+    best, unit, column = vectors[0], vectors[1], vectors[2]
+    rss, count = np.inf, 0
+    for _ in range(_MAX_ROUNDS):
+        if not _place_window(image, best, window):
+            return 0.0, 1.0
+        rss, count = _descend(image, window, matrices, vectors)
+        if not rss < np.inf:
+            return 0.0, 1.0
+        if max(abs(best[0] - window[_X]), abs(best[1] - window[_Y])) < _RECENTRE_PX:
+            break
+    if not best[6] > 0.0 or not factorise(matrices[0], 0.0, LEAST_PIVOT, matrices[2]):
+        return 0.0, 1.0
+    variance = rss / (count - _N)
+    spread = 0.0
+    for i in range(2):
+        unit[:] = 0.0
+        unit[i] = 1.0
+        solve_factorised(matrices[2], unit, column)
+        spread += 0.5 * variance * column[i]
+    return math.sqrt(spread), math.sqrt(variance) / best[6]
+
+
+@inline_borrowing_kernel
+def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> bool:
+    """Centre the window on the corner; False where the picture's border leaves too little.
+
+    The window stays symmetric about the corner, so that what the model leaves out cancels.
+    """
+    height, width = image.shape
+    if not (0.0 <= unknowns[0] <= width - 1.0 and 0.0 <= unknowns[1] <= height - 1.0):
+        return False
+    x, y = round(unknowns[0]), round(unknowns[1])
+    border = min(min(x, width - 1 - x), min(y, height - 1 - y)) + 0.5
+    narrow = _RADIUS_SHARE * min(window[_REACH_1], window[_REACH_2])
+    window[_X], window[_Y] = x, y
+    window[_RADIUS] = min(min(narrow, _RADIUS_LIMIT_PX), border)
+    return bool(window[_RADIUS] >= _MIN_RADIUS_PX)
+
+
+@borrowing_kernel
+def _descend(
+    image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
+) -> tuple[float, int]:
+    """Levenberg-Marquardt in one window; return the sum of squares and the number of pixels.
+
+    vectors[0] is the start and becomes the best; matrices[0] its normal matrix.
+    """
+    best, tried, gradient, step = vectors[0], vectors[1], vectors[2], vectors[4]
+    _first_tones(image, window, best)
+    rss, count = _sums(image, window, best, matrices[0], gradient, vectors[5])
+    damping = 1e-3
+    for _ in range(_MAX_ITERATIONS):
+        if count < 2 * _N or not factorise(matrices[0], damping, LEAST_PIVOT, matrices[2]):
+            return np.inf, 0
+        solve_factorised(matrices[2], gradient, step)
+        _advance(best, step, tried)
+        new_rss, _ = _sums(image, window, tried, matrices[1], vectors[3], vectors[5])
+        if new_rss <= rss:
+            settled = max(abs(step[0]), abs(step[1])) < _SETTLED_PX
+            settled = settled and abs(step[4]) < _SETTLED_LOG_BLUR
+            rss, damping = new_rss, 0.1 * damping
+            _keep(matrices, vectors)
+            if settled:
+                break
+        else:
+            damping = 10.0 * max(damping, 1e-3)
+    return rss, count
+
+
+@inline_borrowing_kernel
+def _keep(matrices: FloatArray, vectors: FloatArray) -> None:
+    """Make the trial the best, element by element: this kernel may not create arrays."""
+    for i in range(_N):
+        vectors[0, i], vectors[2, i] = vectors[1, i], vectors[3, i]
+        for j in range(i + 1):
+            matrices[0, i, j] = matrices[1, i, j]
+
+
+@inline_borrowing_kernel
+def _advance(best: FloatArray, step: FloatArray, tried: FloatArray) -> None:
+    """Write the next trial; it stays where the model still sees the edges."""
+    limit = _MAX_STEP_PX / max(_MAX_STEP_PX, math.hypot(step[0], step[1]))
+    for i in range(_N):
+        tried[i] = best[i] + limit * step[i]
+    for i in range(2, 4):
+        tried[i] = best[i] + min(max(step[i], -_MAX_STEP_ANGLE), _MAX_STEP_ANGLE)
+    log_blur = best[4] + min(max(step[4], -_MAX_STEP_LOG_BLUR), _MAX_STEP_LOG_BLUR)
+    tried[4] = min(max(log_blur, math.log(_BLUR_PX[0])), math.log(_BLUR_PX[1]))
+
+
+@borrowing_kernel
+def _first_tones(image: U8Array, window: FloatArray, unknowns: FloatArray) -> None:
+    """Write the level and contrast that the two kinds of quadrants have on average."""
+    radius = window[_RADIUS]
+    light, n_light, dark, n_dark = 0.0, 1e-9, 0.0, 1e-9
+    for dy in range(-int(radius), int(radius) + 1):
+        for dx in range(-int(radius), int(radius) + 1):
+            x, y = int(window[_X]) + dx, int(window[_Y]) + dy
+            d_1 = math.cos(unknowns[2]) * dx + math.sin(unknowns[2]) * dy
+            d_2 = math.cos(unknowns[3]) * dx + math.sin(unknowns[3]) * dy
+            closest = min(abs(d_1), abs(d_2)) / radius
+            if closest < 0.15 or dx * dx + dy * dy > radius * radius:
+                continue
+            if window[_SIGN] * d_1 * d_2 < 0.0:
+                dark, n_dark = dark + image[y, x], n_dark + 1.0
+            elif closest * radius < window[_MARGIN] * min(window[_REACH_1], window[_REACH_2]):
+                light, n_light = light + image[y, x], n_light + 1.0
+    unknowns[5] = dark / n_dark
+    unknowns[6] = max(light / n_light - unknowns[5], 1.0)
+    unknowns[7], unknowns[8] = 0.0, 0.0
+
+
+@borrowing_kernel
+def _sums(
+    image: U8Array,
+    window: FloatArray,
+    unknowns: FloatArray,
+    normal: FloatArray,
+    gradient: FloatArray,
+    row: FloatArray,
+) -> tuple[float, int]:
+    """Sum the squared residuals of the window, their normal matrix (lower half) and gradient."""
+    radius = window[_RADIUS]
+    cos_1, sin_1 = math.cos(unknowns[2]), math.sin(unknowns[2])
+    cos_2, sin_2 = math.cos(unknowns[3]), math.sin(unknowns[3])
+    blur, contrast = math.exp(unknowns[4]), unknowns[6]
+    normal[:, :] = 0.0
+    gradient[:] = 0.0
+    rss, count = 0.0, 0
+    for offset_y in range(-int(radius), int(radius) + 1):
+        for offset_x in range(-int(radius), int(radius) + 1):
+            if offset_x * offset_x + offset_y * offset_y > radius * radius:
+                continue
+            x, y = int(window[_X]) + offset_x, int(window[_Y]) + offset_y
+            dx, dy = x - unknowns[0], y - unknowns[1]
+            d_1, d_2 = cos_1 * dx + sin_1 * dy, cos_2 * dx + sin_2 * dy
+            if _among_bits(d_1, d_2, blur, window):
+                continue
+            value, by_1, by_2, by_blur = _lightness(d_1, d_2, blur, window)
+            row[0] = -contrast * (by_1 * cos_1 + by_2 * cos_2)
+            row[1] = -contrast * (by_1 * sin_1 + by_2 * sin_2)
+            row[2] = contrast * by_1 * (cos_1 * dy - sin_1 * dx)
+            row[3] = contrast * by_2 * (cos_2 * dy - sin_2 * dx)
+            row[4] = contrast * by_blur
+            row[5], row[6], row[7], row[8] = 1.0, value, offset_x, offset_y
+            model = unknowns[5] + contrast * value
+            model += unknowns[7] * offset_x + unknowns[8] * offset_y
+            residual = image[y, x] - model
+            rss += residual * residual
+            count += 1
+            # Away from the edges only the tones matter, which is most of the window.
+            first = 0 if by_1 != 0.0 or by_2 != 0.0 else 5
+            for i in range(first, _N):
+                gradient[i] += row[i] * residual
+                for j in range(first, i + 1):
+                    normal[i, j] += row[i] * row[j]
+    return rss, count
+
+
+@inline_borrowing_kernel
+def _among_bits(d_1: float, d_2: float, blur: float, window: FloatArray) -> bool:
+    """Whether a pixel belongs to, or is blurred with, a marker's bits, which the model ignores."""
+    if window[_SIGN] * d_1 * d_2 <= 0.0:
+        return False
+    u = (abs(d_1) + _BITS_REACH * blur) / window[_REACH_1]
+    v = (abs(d_2) + _BITS_REACH * blur) / window[_REACH_2]
+    return bool(min(u, v) > window[_BITS_FROM])
+
+
+@inline_borrowing_kernel
+def _lightness(
+    d_1: float, d_2: float, blur: float, window: FloatArray
+) -> tuple[float, float, float, float]:
+    """Return the light's share at signed distances from the edges, and its derivatives.
+
+    By the two distances and by the logarithm of the blur: a blurred edge changes with the latter
+    by minus its distance times its slope.
+    """
+    sign = window[_SIGN]
+    d_2 = sign * d_2
+    e_1, s_1 = blurred_edge(d_1, blur)
+    e_2, s_2 = blurred_edge(d_2, blur)
+    value = e_1 * e_2 + (1.0 - e_1) * (1.0 - e_2)
+    by_1, by_2 = s_1 * (2.0 * e_2 - 1.0), s_2 * (2.0 * e_1 - 1.0)
+    by_blur = -d_1 * by_1 - d_2 * by_2
+    if window[_MARGIN] < 1.0:
+        m_1, m_2 = window[_MARGIN] * window[_REACH_1], window[_MARGIN] * window[_REACH_2]
+        f_1, t_1 = blurred_edge(d_1 - m_1, blur)
+        f_2, t_2 = blurred_edge(d_2 - m_2, blur)
+        g_1, q_1 = blurred_edge(-d_1 - m_1, blur)
+        g_2, q_2 = blurred_edge(-d_2 - m_2, blur)
+        value -= f_1 * f_2 + g_1 * g_2
+        by_1 -= t_1 * f_2 - q_1 * g_2
+        by_2 -= f_1 * t_2 - g_1 * q_2
+        by_blur += (d_1 - m_1) * t_1 * f_2 + (d_2 - m_2) * f_1 * t_2
+        by_blur += (-d_1 - m_1) * q_1 * g_2 + (-d_2 - m_2) * g_1 * q_2
+    return value, by_1, sign * by_2, by_blur
+
+
+GreyImage = NDArray[np.uint8]
+"""A grey picture, shape (height, width)."""
+
+# What a fit must reach to be believed: share of the contrast that is left unexplained, how far
+# either edge turned, and the uncertainty of the crossing.
+_MAX_RESIDUAL_SHARE = 0.15
+_MAX_TURN = np.deg2rad(12.0)
+_MAX_SIGMA_PX = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class SaddleFit:
+    """Refined corners.
+
+    Attributes
+    ----------
+    pixels : array, shape (N, 2)
+        In `image`; the start where not valid.
+    sigma : array, shape (N,)
+        Standard deviation of a coordinate from the fit's own residual, in pixels.
+    blur : array, shape (N,)
+        Standard deviation of the blur across the edges, in pixels.
+    valid : bool array, shape (N,)
+        False where the pixels do not look like this corner, or it wandered off.
+    """
+
+    pixels: FloatArray
+    sigma: FloatArray
+    blur: FloatArray
+    valid: BoolArray
+
+
+def refine_saddles(
+    image: GreyImage,
+    starts: FloatArray,
+    axes: FloatArray,
+    light_first: BoolArray,
+    *,
+    margin: float,
+    bits_from: float,
+    max_wander: float = 0.25,
+) -> SaddleFit:
+    """Fit the crossing of the edges at each start.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    starts : array, shape (N, 2)
+        About where the corners are, in `image`, pixels.
+    axes : array, shape (N, 2, 2)
+        `axes[:, :, 0]` and `axes[:, :, 1]`: one square's side along the board's x and y, in pixels.
+    light_first : bool array, shape (N,)
+        Whether the square towards +x, +y of the board is light.
+    margin : float
+        Light margin around the marker in a light square, as a share of the square; 1 without
+        markers.
+    bits_from : float
+        From where in the square on its content is unknown, as a share of the square; 1 without
+        markers.
+    max_wander : float
+        Farthest that a corner may move away from its start, in sides of a square.
+
+    Returns
+    -------
+    SaddleFit
+        The refined corners; those that the picture does not bear out are not valid.
+    """
+    pixels = np.array(starts, dtype=np.float64, order="C")
+    quality = np.zeros((len(pixels), 4))
+    fit_saddles(
+        np.ascontiguousarray(image),
+        np.ascontiguousarray(axes, dtype=np.float64),
+        np.ascontiguousarray(light_first),
+        float(margin),
+        float(bits_from),
+        pixels,
+        quality,
+    )
+    sigma, residual_share, turn, blur = quality.T
+    side = np.sqrt(np.min(np.sum(np.square(axes), axis=1), axis=-1, initial=np.inf))
+    wander = np.linalg.norm(pixels - starts, axis=1)
+    valid = (sigma > 0.0) & (sigma < _MAX_SIGMA_PX) & (wander <= max_wander * side)
+    valid &= (residual_share < _MAX_RESIDUAL_SHARE) & (turn < _MAX_TURN)
+    return SaddleFit(np.where(valid[:, None], pixels, starts), sigma, blur, valid)

@@ -1,0 +1,432 @@
+"""`calibrate dome`: where the lens sits in the dome, and how the camera is turned (paper, 2.2).
+
+Boards seen through the dome at poses that are known, of which only the distance is known (the
+paper's rail), or of which nothing is known; in air, in water, or both in one solve. Tolerances of
+the dome and the covariance of the intrinsics are priors, so that what pictures cannot tell keeps
+the uncertainty it had.
+
+What a solved dome means, in plain words.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from aqualvs.calibration.dome.checks import (
+    check_media,
+    check_shared_errors,
+    check_solution,
+    check_start,
+    contradicted_distances,
+    distance_blocks,
+    noise_px,
+    solved_by_offset,
+)
+from aqualvs.calibration.dome.cross_validation import compare_with_bare_lens
+from aqualvs.calibration.dome.problem import (
+    LENS,
+    ROTATION,
+    BoardSet,
+    DomeOptions,
+    DomeProblem,
+    PoseKind,
+    check_sets,
+    dome_problem,
+    start_rigs,
+    with_leaning_as_found,
+)
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, BundleState
+from aqualvs.calibration.solver.covariance import Observability, considered, observability
+from aqualvs.calibration.solver.least_squares import Solution, solve
+from aqualvs.calibration.solver.priors import rig_difference
+from aqualvs.calibration.solver.result import (
+    DomeCalibration,
+    HeldBack,
+    SolvedMedium,
+    ViewFit,
+    view_fit,
+)
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.optics.solved import rig_uncertainty
+
+_DOME = ("inner_radius", "thickness", "n_acrylic")
+_WORDS = {
+    "inner_radius": "inner radius",
+    "thickness": "thickness",
+    "n_acrylic": "acrylic index",
+    "lens_x": "lens x",
+    "lens_y": "lens y",
+    "lens_z": "lens z",
+    "rotation_x": "rotation about x",
+    "rotation_y": "rotation about y",
+    "rotation_z": "rotation about z",
+}
+# Shares of the prior's sigma: nothing learnt, something learnt.
+_NOTHING, _SOMETHING = 0.9, 0.5
+_CORRELATED = 0.95
+_FAR_FROM_PRIOR = 3.5
+
+
+def findings(
+    problem: DomeProblem, solution: Solution[BundleState], result: DomeCalibration
+) -> list[str]:
+    """Return one sentence for everything worth knowing."""
+    bundle, uncertainty = problem.bundle, result.uncertainty
+    seen = observability(bundle, solution, uncertainty, _DOME)
+    lines = [_lens(result), _rotation(problem, result), *_dome(result, seen), *_untold(seen)]
+    lens = observability(bundle, solution, uncertainty, result.rig.lens.parameter_names)
+    lines += _intrinsics(problem, result, lens)
+    lines += _entangled(result)
+    lines += _media(problem, result)
+    lines += _against_priors(problem, solution)
+    lines += _held_back(result.held_back)
+    lines += [f"left out, {label}: {why}" for label, why in result.left_out.items()]
+    return lines
+
+
+def _lens(result: DomeCalibration) -> str:
+    sigmas = result.uncertainty.sigmas
+    position = 1e3 * result.rig.dome_from_cam.translation
+    told = ", ".join(
+        f"{axis} {value:.3f} ± {1e3 * sigmas[name]:.4f}"
+        for axis, value, name in zip("xyz", position, LENS, strict=True)
+    )
+    return f"lens position: {told} mm"
+
+
+def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
+    if not result.rotation_is_solved:
+        return (
+            "camera rotation: taken from the rig; boards at unknown poses say nothing about it, "
+            "and the lens position is told in axes turned by it"
+        )
+    sigma = np.rad2deg([result.uncertainty.sigmas[name] for name in ROTATION])
+    told = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
+    exact = any(shot.kind is PoseKind.EXACT for shot in problem.shots)
+    source = "boards at known poses" if exact else "most boards standing square to the dome"
+    return f"camera rotation: from {source}; uncertain by {told} deg about the dome's axes"
+
+
+def _dome(result: DomeCalibration, seen: Observability) -> list[str]:
+    lines = []
+    nothing = seen.undetermined(_DOME, _NOTHING)
+    some = [n for n in seen.undetermined(_DOME, _SOMETHING) if n not in nothing]
+    told = [n for n in _DOME if n in seen.shrinkage and n not in nothing and n not in some]
+    for names, what in (
+        (nothing, "not determined by the pictures, taken as given"),
+        (some, "hardly determined by the pictures, mostly taken as given"),
+        (told, "determined by the pictures"),
+    ):
+        if names:
+            listed = ", ".join(f"{_WORDS[name]} (± {_size(name, result)})" for name in names)
+            lines.append(f"{listed}: {what}")
+    exact = [_WORDS[name] for name in _DOME if name not in seen.shrinkage]
+    if exact:
+        lines.append(f"{', '.join(exact)}: taken as exact")
+    return lines
+
+
+def _size(name: str, result: DomeCalibration) -> str:
+    sigma = result.uncertainty.sigmas[name]
+    return f"{sigma:.4f}" if name == "n_acrylic" else f"{1e3 * sigma:.3f} mm"
+
+
+def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observability) -> list[str]:
+    names = result.rig.lens.parameter_names
+    refined = [name for name in names if name in seen.shrinkage]
+    if refined:
+        share = np.median([seen.shrinkage[name] for name in refined])
+        focal = result.uncertainty.sigmas["fx"] if "fx" in refined else float("nan")
+        return [
+            f"intrinsics: refined within what the camera's calibration says of them; their "
+            f"uncertainty is {100.0 * share:.0f} % of what it was, that of fx {focal:.2f} px"
+        ]
+    if problem.held.names:
+        return ["intrinsics: held as they were; their uncertainty is passed on to the result"]
+    return [
+        "intrinsics: taken as exact, as the rig does not say how well they are known; "
+        "calibrate the camera with this version to mend that"
+    ]
+
+
+def _untold(seen: Observability) -> list[str]:
+    """Name the combinations of which the pictures tell nothing."""
+    untold = seen.untold()
+    if not untold:
+        return []
+    told = "; ".join(" with ".join(_WORDS.get(n, n) for n in d.main) for d in untold)
+    return [
+        f"of the {len(seen.directions)} combinations of the dome's numbers the pictures tell "
+        f"{len(seen.directions) - len(untold)}; they tell nothing of: {told}"
+    ]
+
+
+def _entangled(result: DomeCalibration) -> list[str]:
+    """Name the pair of numbers that the data tell apart worst, if they hardly do."""
+    uncertainty = result.uncertainty
+    sigma = np.sqrt(np.diag(uncertainty.covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = uncertainty.covariance / np.outer(sigma, sigma)
+    worst, pair = _CORRELATED, None
+    for i, name in enumerate(uncertainty.names):
+        for j, other in enumerate(uncertainty.names):
+            if name in LENS and other not in LENS and abs(correlation[i, j]) > worst:
+                worst, pair = abs(float(correlation[i, j])), (name, other)
+    if pair is None:
+        return []
+    one, other = (_WORDS.get(name, name) for name in pair)
+    return [
+        f"{one} and {other}: known together only (correlation {worst:.3f}); an error of one is "
+        "made up for by the other"
+    ]
+
+
+def _media(problem: DomeProblem, result: DomeCalibration) -> list[str]:
+    return [
+        f"{medium.name}: n = {medium.n:.5f} ± {medium.sigma:.5f}"
+        for i, medium in enumerate(result.media)
+        if i in problem.bundle.free_media
+    ]
+
+
+def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> list[str]:
+    """Name what moved further than its prior allows."""
+    bundle = problem.bundle
+    names = [name for name in bundle.free if name in bundle.priors.names]
+    moved = rig_difference(bundle.start.rig, solution.state.rig, names)
+    sigmas = bundle.priors.sigmas
+    off = {n: float(m) / sigmas[n] for n, m in zip(names, moved, strict=True)}
+    return [
+        f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma of what was known of it; check "
+        "that figure"
+        for name, value in off.items()
+        if abs(value) > _FAR_FROM_PRIOR
+    ]
+
+
+def _held_back(held: HeldBack | None) -> list[str]:
+    if held is None:
+        return []
+    told = (
+        f"{held.n_points} corners of {held.n_views} views, each held back once, are predicted to "
+        f"{held.dome_rms_px:.3f} px with the dome, to {held.bare_rms_px:.3f} px with a bare lens; "
+        f"the dome is better in {held.n_dome_better} of the views"
+    )
+    if held.dome_is_better:
+        return [f"{told}: the dome model is needed"]
+    return [f"{told}: the pictures do not show that there is a dome"]
+
+
+# A solve that leaves less than this has found the place; one that leaves more may be elsewhere.
+_GOOD_NOISE_PX = 0.5
+# A view is bad if it is this many times noisier than the typical one, and noisier than this.
+_BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.5
+_BAD_SHARE = 1.0 / 3.0
+# A given distance this many sigmas off is a mistake.
+_WRONG_DISTANCE = 5.0
+
+
+def dome(
+    rig: Rig,
+    sets: Sequence[BoardSet],
+    options: DomeOptions | None = None,
+    known: RigUncertainty | None = None,
+) -> DomeCalibration:
+    """Solve lens position, camera rotation and all that goes with them.
+
+    Parameters
+    ----------
+    rig : Rig
+        Intrinsics from `calibrate camera`, the dome's nominal sizes, and any lens position inside
+        it. Without known poses its rotation is kept.
+    sets : sequence of BoardSet
+        One for each medium.
+    options : DomeOptions, optional
+    known : RigUncertainty, optional
+        Of the intrinsics (and of the rotation, where no pose is known); by default what the rig
+        itself has written down. Intrinsics without any are taken as exact.
+
+    Returns
+    -------
+    DomeCalibration
+
+    Raises
+    ------
+    CalibrationError
+        If the views do not determine the lens, or contradict the board's file, the given poses,
+        the medium or the dome.
+    """
+    check_sets(rig, sets)
+    options = options or DomeOptions()
+    known = rig_uncertainty(rig) if known is None else known
+    problem, solution = _solved(rig, sets, known, options)
+    problem, solution = _without_bad_views(problem, solution)
+    problem, solution = _without_wrong_distances(problem, solution, sets)
+    problem, solution = with_leaning_as_found(problem, solution, options.tilt_sigma)
+    names, covariance = considered(problem.bundle, solution, problem.held)
+    n_solved = len(solution.covariance)
+    doubts = check_shared_errors(problem, solution, covariance[:n_solved, :n_solved])
+    doubts += check_media(problem, solution, sets)
+    covariance[:n_solved, :n_solved] += _of_rail(problem, solution, options)
+    result = _result(problem, solution, sets, names, covariance)
+    check_solution(problem, solution, result.uncertainty)
+    if options.check_held_back:
+        result = replace(result, held_back=compare_with_bare_lens(problem, solution))
+    words = findings(problem, solution, result)
+    return replace(result, findings=(*doubts, *words))
+
+
+def _solved(
+    rig: Rig, sets: Sequence[BoardSet], known: RigUncertainty, options: DomeOptions
+) -> tuple[DomeProblem, Solution[BundleState]]:
+    """Solve from where the rig puts the lens, or else from the dome's centre."""
+    best: tuple[DomeProblem, Solution[BundleState]] | None = None
+    trouble: list[CalibrationError | RigError] = []
+    for start in start_rigs(rig):
+        try:
+            problem = dome_problem(start, sets, known, options)
+        except CalibrationError as error:
+            trouble.append(error)
+            continue
+        check_start(problem)
+        try:
+            solution = solve(problem.bundle, problem.bundle.start)
+        except (CalibrationError, RigError) as error:
+            trouble.append(error)
+            continue
+        if best is None or noise_px(solution) < noise_px(best[1]):
+            best = problem, solution
+        if solution.converged and noise_px(solution) < _GOOD_NOISE_PX:
+            break
+    if best is None:
+        raise trouble[0]
+    return best
+
+
+def _without_bad_views(
+    problem: DomeProblem, solution: Solution[BundleState]
+) -> tuple[DomeProblem, Solution[BundleState]]:
+    """Leave out views that fit far worse than the others, and solve again."""
+    n = len(problem.shots)
+    noise = CORNER_SIGMA_PX * np.array(solution.block_scales[:n])
+    typical = noise_px(solution)
+    bad = {}
+    for i in np.flatnonzero((noise > _BAD_VIEW * typical) & (noise > _BAD_NOISE_PX)):
+        bad[int(i)] = (
+            f"its corners are {noise[i]:.2g} px off, those of other views {typical:.2g} px; wrong "
+            "pose, bent board or blurred picture?"
+        )
+    if not bad or len(bad) > _BAD_SHARE * n:
+        return problem, solution
+    return _again(problem.without(bad), solution, [i for i in range(n) if i not in bad])
+
+
+def _without_wrong_distances(
+    problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
+) -> tuple[DomeProblem, Solution[BundleState]]:
+    """Forget given distances that the pictures contradict, if they are few."""
+    wrong = _wrong_distances(problem, solution)
+    if wrong and problem.held.names:
+        # Numbers that were held bend all distances; they must not be blamed for it.
+        free = problem.with_held_free()
+        wrong = _wrong_distances(free, solve(free.bundle, solution.state))
+    if not wrong:
+        return problem, solution
+    if len(wrong) > _BAD_SHARE * len(problem.measured_views):
+        raise contradicted_distances(problem, solution, sets)
+    reasons = {
+        f"distance of {problem.shots[i].label}": (
+            f"{1e3 * problem.given_distance(i):.2f} mm contradicts the pictures"
+        )
+        for i in wrong
+    }
+    forgotten = problem.without_distances(wrong)
+    forgotten = replace(forgotten, left_out={**problem.left_out, **reasons})
+    return _again(forgotten, solution, list(range(len(problem.shots))))
+
+
+def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> list[int]:
+    off = distance_blocks(problem, solution)
+    return [i for i, block in off.items() if block.lengths[0] > _WRONG_DISTANCE]
+
+
+def _again(
+    problem: DomeProblem, solution: Solution[BundleState], kept: Sequence[int]
+) -> tuple[DomeProblem, Solution[BundleState]]:
+    state = solution.state
+    start = replace(state, poses=tuple(state.poses[i] for i in kept))
+    return problem, solve(problem.bundle, start)
+
+
+def _of_rail(
+    problem: DomeProblem, solution: Solution[BundleState], options: DomeOptions
+) -> FloatArray:
+    """Return the covariance that an error shared by all given distances adds."""
+    by_offset = options.distance_offset_sigma * solved_by_offset(problem, solution)
+    return np.outer(by_offset, by_offset)
+
+
+def _result(
+    problem: DomeProblem,
+    solution: Solution[BundleState],
+    sets: Sequence[BoardSet],
+    names: tuple[str, ...],
+    covariance: FloatArray,
+) -> DomeCalibration:
+    bundle, state = problem.bundle, solution.state
+    n_free, n_held = len(bundle.free), len(problem.held.names)
+    columns = [*range(n_free), *range(len(covariance) - n_held, len(covariance))]
+    rig = state.rig.in_water(bundle.start.rig.n_water)
+    if len(bundle.free_media) == 1:
+        # The one medium that was solved for is the water that the rig will be used in.
+        rig = rig.in_water(float(state.media[bundle.free_media[0]]))
+        names, columns = (*names, "n_water"), [*columns, n_free]
+    return DomeCalibration(
+        rig=rig,
+        uncertainty=RigUncertainty(names, covariance[np.ix_(columns, columns)]),
+        media=_dome_media(problem, solution, sets, covariance),
+        views=_view_fits(problem, solution, covariance),
+        left_out=problem.left_out,
+        noise_px=noise_px(solution),
+        rotation_is_solved=problem.rotation_is_solved,
+        held_back=None,
+        findings=(),
+        n_iterations=solution.n_iterations,
+    )
+
+
+def _dome_media(
+    problem: DomeProblem,
+    solution: Solution[BundleState],
+    sets: Sequence[BoardSet],
+    covariance: FloatArray,
+) -> tuple[SolvedMedium, ...]:
+    media = []
+    for i, one in enumerate(sets):
+        column = problem.bundle.medium_columns(i)
+        sigma = float(np.sqrt(covariance[column[0], column[0]])) if len(column) else 0.0
+        media.append(SolvedMedium(one.name, float(solution.state.media[i]), sigma))
+    return tuple(media)
+
+
+def _view_fits(
+    problem: DomeProblem, solution: Solution[BundleState], covariance: FloatArray
+) -> tuple[ViewFit, ...]:
+    fits = []
+    for i, shot in enumerate(problem.shots):
+        columns = problem.bundle.pose_columns(i)
+        fits.append(
+            view_fit(
+                shot.label,
+                shot.view,
+                solution.state.poses[i],
+                covariance[np.ix_(columns, columns)],
+                solution.blocks[i],
+                solution.inliers[i],
+                solution.block_scales[i],
+            )
+        )
+    return tuple(fits)

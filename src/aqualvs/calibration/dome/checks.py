@@ -1,0 +1,544 @@
+"""Refusals of `calibrate dome`: no rig is better than a wrong one.
+
+Whether pictures were taken in the medium that they are said to have been taken in.
+
+Errors that all given distances of a rail share: its zero, and its scale against the board's.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+
+import numpy as np
+
+from aqualvs.calibration.dome.problem import LENS, BoardSet, DomeProblem, PoseKind
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, PRIORS, Bundle, BundleState
+from aqualvs.calibration.solver.covariance import (
+    all_alike,
+    length_ratio,
+    scale_fault,
+    unbelievable_distance,
+)
+from aqualvs.calibration.solver.initial_pose import start_pose
+from aqualvs.calibration.solver.least_squares import (
+    Block,
+    Solution,
+    cost,
+    inverse,
+    normal_equations,
+    solve,
+)
+from aqualvs.calibration.solver.priors import DISTANCES, plane_distance
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import RigUncertainty
+
+# An index this many sigmas from the stated one is not it.
+_SURE = 5.0
+MAX_NOISE_PX = 1.0
+"""Corners noisier than this mean that something else is wrong than noise."""
+# Differences that make a wrong rig, and that are worth a remark.
+_WRONG, _WORTH_SAYING = 0.02, 0.003
+# Between air and water.
+_HALFWAY = 1.15
+_AIR, _WATER = 1.0003, 1.3335
+# An index that the pictures tell worse than this, near the stated one, may be a wholly other one.
+_VAGUE = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class FittedIndex:
+    """The index that pictures call for, and how well they tell it."""
+
+    n: float
+    sigma: float
+
+
+def noise_px(solution: Solution[BundleState]) -> float:
+    """Return the typical standard deviation of a corner's coordinate, in pixels."""
+    return CORNER_SIGMA_PX * solution.scales[CORNERS]
+
+
+def check_media(
+    problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
+) -> list[str]:
+    """Compare every stated index with that which the pictures fit best.
+
+    Returns
+    -------
+    list of str
+        Doubts, in plain words.
+
+    Raises
+    ------
+    CalibrationError
+        If the pictures were taken in another medium.
+    """
+    doubts = []
+    for medium, one in enumerate(sets):
+        if _suspicion(problem, solution, medium, one) is _Suspicion.NONE:
+            continue
+        # Numbers that were held, and a rail's zero, bend the solution; the medium must not take
+        # the blame for them.
+        bare = problem.with_held_free().without_distances(problem.measured_views)
+        own = solve(bare.bundle, solution.state)
+        suspicion = _suspicion(bare, own, medium, one)
+        if suspicion is _Suspicion.OTHER:
+            doubts += _weighed_against_other(bare, own, medium, one)
+        elif suspicion is _Suspicion.NEARBY:
+            doubts += _weighed_against_best(bare, own, medium, one)
+    return doubts
+
+
+def in_other_medium(problem: DomeProblem, medium: int) -> Solution[BundleState] | None:
+    """Solve with a set's pictures in water for air, in air for water; None if that cannot be."""
+    start = problem.bundle.start
+    media = start.media.copy()
+    media[medium] = other_medium(float(media[medium]))
+    there = replace(start, media=media)
+    poses = list(there.poses)
+    for i, target in enumerate(problem.bundle.views):
+        if target.medium == medium and not target.fixed:
+            found = start_pose(there.camera(medium), target.view)
+            poses[i] = poses[i] if isinstance(found, str) else found.dome_from_target
+    exact = replace(problem.bundle, media_sigma=np.zeros(len(media)))
+    try:
+        solution = solve(exact, replace(there, poses=tuple(poses)))
+    except (CalibrationError, RigError):
+        return None
+    return solution if noise_px(solution) < MAX_NOISE_PX else None
+
+
+def other_medium(n: float) -> float:
+    """Return the index of water for air, and of air for water."""
+    return _WATER if n < _HALFWAY else _AIR
+
+
+def wrong_medium(one: BoardSet, index: float) -> CalibrationError:
+    """Return what to say of pictures that were taken in another medium than stated."""
+    crossed = (index < _HALFWAY) != (one.n_medium < _HALFWAY)
+    taken = "in air" if index < _HALFWAY else "in water"
+    remedy = (
+        f"were they taken {taken}?"
+        if crossed
+        else "check the medium, the dome's sizes and the camera's calibration"
+    )
+    return CalibrationError(
+        f"{one.name}: the pictures fit n = {index:.3f} far better than the stated "
+        f"{one.n_medium:.4f}; {remedy}"
+    )
+
+
+def _freed(bundle: Bundle, medium: int) -> Bundle:
+    sigma = bundle.media_sigma.copy()
+    sigma[medium] = np.inf
+    return replace(bundle, media_sigma=sigma)
+
+
+class _Suspicion(Enum):
+    NONE = auto()
+    NEARBY = auto()
+    """The residuals call for another index."""
+    OTHER = auto()
+    """The residuals do not tell the index, or there is something else wrong."""
+
+
+def _suspicion(
+    problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
+) -> _Suspicion:
+    near = _nearby(_freed(problem.bundle, medium), solution, medium, one.n_medium)
+    if near.sigma > _VAGUE or noise_px(solution) > MAX_NOISE_PX:
+        return _Suspicion.OTHER
+    far = abs(near.n - one.n_medium) > _SURE * near.sigma
+    return _Suspicion.NEARBY if far else _Suspicion.NONE
+
+
+def _nearby(
+    bundle: Bundle, solution: Solution[BundleState], medium: int, stated: float
+) -> FittedIndex:
+    """Return the index that the residuals call for: Newton's step from the solution."""
+    blocks = bundle.blocks(solution.state)
+    n_data = sum(1 for b in solution.blocks if b.group != PRIORS)
+    equations = normal_equations(
+        bundle.n_parameters,
+        blocks,
+        [*solution.inliers[:n_data], *(b.seen for b in blocks[n_data:])],
+        [*solution.block_scales[:n_data], *(1.0 for _ in blocks[n_data:])],
+    )
+    column = int(bundle.medium_columns(medium)[0])
+    if equations.information[column, column] == 0.0:
+        return FittedIndex(stated, float("inf"))
+    covariance = inverse(equations.information)
+    step = -float(covariance[column] @ equations.gradient)
+    sigma = float(np.sqrt(covariance[column, column]))
+    return FittedIndex(float(solution.state.media[medium]) + step, sigma)
+
+
+def _weighed_against_best(
+    problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
+) -> list[str]:
+    """Solve with the medium free, and compare."""
+    free = _freed(problem.bundle, medium)
+    try:
+        best = solve(free, solution.state)
+    except (CalibrationError, RigError):
+        return []
+    column = int(free.medium_columns(medium)[0])
+    n, sigma = float(best.state.media[medium]), float(np.sqrt(best.covariance[column, column]))
+    off = abs(n - one.n_medium)
+    sure = off > _SURE * float(np.hypot(sigma, one.sigma_medium))
+    if not sure or off < _WORTH_SAYING or _gain(solution, best) < 0.5 * _SURE**2:
+        return []
+    if off > _WRONG:
+        raise wrong_medium(one, n)
+    return [
+        f"{one.name}: the pictures fit n = {n:.4f} ± {sigma:.4f} rather than {one.n_medium:.4f}; "
+        "check temperature and salinity, or the dome's sizes"
+    ]
+
+
+def _weighed_against_other(
+    problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
+) -> list[str]:
+    """Solve with the other medium too, where a lens near the centre hides which one it is."""
+    rival = in_other_medium(problem, medium)
+    if rival is None:
+        return []
+    gain = _gain(solution, rival)
+    n = other_medium(one.n_medium)
+    if gain > 0.5 * _SURE**2:
+        raise wrong_medium(one, n)
+    if gain > -0.5 * _SURE**2:
+        return [
+            f"{one.name}: the pictures do not tell n = {one.n_medium:.4f} from {n:.4f}; the lens "
+            "position rests on the medium being the stated one"
+        ]
+    return []
+
+
+def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> float:
+    """Return how much better a rival explains all but the media; both at the smaller noise."""
+    # The prior of the media stands last, where there is one.
+    n = min(len(solution.blocks), len(rival.blocks))
+    pairs = zip(solution.block_scales[:n], rival.block_scales[:n], strict=True)
+    scales = [min(a, b) for a, b in pairs]
+    inliers = zip(solution.inliers[:n], rival.inliers[:n], strict=True)
+    both = [a & b for a, b in inliers]
+    own, its = (cost(s.blocks[:n], both, scales, 0.0) for s in (solution, rival))
+    return own - its
+
+
+_CHECK_SURE = 3.5
+# Shared errors beyond these (metres, share) make a wrong rig; smaller ones are worth a remark.
+_MAX_OFFSET, _MAX_SCALE = 1e-3, 0.005
+# Place of the shift along y in a step of a pose.
+_SHIFT_Y = 4
+
+
+@dataclass(frozen=True, slots=True)
+class SharedError:
+    """An error that all given distances share, as the pictures see it.
+
+    Attributes
+    ----------
+    value, sigma : float
+        In metres for an offset; a share for a scale. Given minus true.
+    """
+
+    value: float
+    sigma: float
+
+    @property
+    def sigmas(self) -> float:
+        """How many sigmas it is from none."""
+        return abs(self.value) / self.sigma
+
+
+def check_shared_errors(
+    problem: DomeProblem, solution: Solution[BundleState], covariance: FloatArray
+) -> list[str]:
+    """Compare the distances as a whole with the pictures.
+
+    Parameters
+    ----------
+    problem : DomeProblem
+    solution : Solution
+        Of it.
+    covariance : array, shape (P, P)
+        Of what was solved, with that of numbers that were held passed on.
+
+    Returns
+    -------
+    list of str
+        Doubts, in plain words.
+
+    Raises
+    ------
+    CalibrationError
+        If the distances are off together by more than a good rig can bear.
+    """
+    blocks = distance_blocks(problem, solution)
+    if len(blocks) < 2:
+        return []
+    given = {i: problem.given_distance(i) for i in blocks}
+    offset = _shared_error(covariance, blocks, dict.fromkeys(blocks, 1.0))
+    scale = _shared_error(covariance, blocks, given)
+    if max(offset.sigmas, scale.sigmas) < _CHECK_SURE:
+        return []
+    if offset.sigmas >= scale.sigmas:
+        told = (
+            f"all given distances are {1e3 * offset.value:+.2f} ± {1e3 * offset.sigma:.2f} mm off "
+            "together; they count from the dome's centre along its y axis, not from its front or "
+            "from the lens"
+        )
+        fatal = abs(offset.value) > _MAX_OFFSET
+    else:
+        told = (
+            f"all given distances are {100.0 * scale.value:+.2f} ± {100.0 * scale.sigma:.2f} % off "
+            "together, measured in the board's squares; measure the squares, and check the medium"
+        )
+        fatal = abs(scale.value) > _MAX_SCALE
+    if fatal:
+        raise CalibrationError(told)
+    return [told]
+
+
+def distance_blocks(problem: DomeProblem, solution: Solution[BundleState]) -> dict[int, Block]:
+    """Return the residuals of given distances by view."""
+    blocks = [block for block in solution.blocks if block.group == DISTANCES]
+    return dict(zip(problem.measured_views, blocks, strict=True))
+
+
+def solved_by_offset(problem: DomeProblem, solution: Solution[BundleState]) -> FloatArray:
+    """Return the derivative (P,) of what was solved by an error that all distances share."""
+    blocks = distance_blocks(problem, solution)
+    slopes, _, _ = _slopes(len(solution.covariance), blocks, dict.fromkeys(blocks, 1.0))
+    by_offset: FloatArray = solution.covariance @ slopes
+    return by_offset
+
+
+def _shared_error(
+    covariance: FloatArray, blocks: Mapping[int, Block], shape: Mapping[int, float]
+) -> SharedError:
+    """Fit an error of a given shape over the distances, from slopes at the solution."""
+    slopes, own, gradient = _slopes(len(covariance), blocks, shape)
+    left = own - float(slopes @ covariance @ slopes)
+    if left <= 1e-9 * own:
+        return SharedError(0.0, float("inf"))
+    return SharedError(gradient / left, 1.0 / float(np.sqrt(left)))
+
+
+def _slopes(
+    n_parameters: int, blocks: Mapping[int, Block], shape: Mapping[int, float]
+) -> tuple[FloatArray, float, float]:
+    """Return cross information with what was solved, own information, and minus the gradient."""
+    slopes, own, gradient = np.zeros(n_parameters), 0.0, 0.0
+    for i, block in blocks.items():
+        weight = float(block.loss.weight(block.lengths)[0])
+        # A given distance that is too large is mended by what a shift of the board along y does.
+        by_error = shape[i] * float(block.jacobian[0, 0, _SHIFT_Y])
+        slopes[block.columns] += weight * by_error * block.jacobian[0, 0]
+        own += weight * by_error**2
+        gradient -= weight * by_error * float(block.residuals[0, 0])
+    return slopes, own, gradient
+
+
+# A lens this near the inner surface (in radii) was stopped by it.
+_AT_THE_WALL = 0.995
+# A lens known worse than this (metres) costs 0.4 % of range.
+_MAX_LENS_SIGMA = 2e-3
+# Differences of scale that the sizes of boards and rails do not have by chance.
+_FINE_SCALE, _EXACT_SCALE = 0.003, 0.02
+# Before the solve a wrong medium or lens position may look like a wrong scale.
+_COARSE_SCALE = 0.5
+# Ratios of lengths that scatter less than this tell one wrong scale.
+_SAME_RATIO = 0.05
+# Distance from the image's centre, in its sizes, beyond which no start puts what can be seen.
+_SURELY_SEEN = 2.0
+# Typical residual of distances, in sigmas, that have nothing against a solution.
+_FITTING_DISTANCE = 1.5
+_POSE_RULES = (
+    "poses must be dome_from_board in millimetres, with OpenCV's board axes (x right, y down, z "
+    "into the board) and dome axes x right, y forward, z up"
+)
+
+
+def check_start(problem: DomeProblem) -> None:
+    """Refuse boards at distances that cannot be, or that given distances contradict grossly.
+
+    Raises
+    ------
+    CalibrationError
+        With the likely mistake.
+    """
+    _check_seen(problem)
+    views = problem.bundle.views
+    away = [float(np.linalg.norm(v.dome_from_target.apply(v.view.middle))) for v in views]
+    _refuse_if(unbelievable_distance(np.array(away), [shot.label for shot in problem.shots]))
+    exact = any(view.fixed for view in views)
+    if not exact and all_alike(
+        np.array([view.dome_from_target.rotation[:, 2] for view in views]), np.array(away)
+    ):
+        raise CalibrationError(
+            "all boards are parallel and at one distance, so that nothing checks the lens "
+            "position; tilt the board by 20 to 40 degrees, and show it from as near as possible to "
+            "the end of the working range"
+        )
+    boards = [i for i, shot in enumerate(problem.shots) if shot.kind is PoseKind.DISTANCE]
+    if boards:
+        given = np.array([problem.given_distance(i) for i in boards])
+        found = np.array([plane_distance(views[i].dome_from_target) for i in boards])
+        _refuse_if(_sign_fault(given))
+        _refuse_if(scale_fault(length_ratio(given, found), _COARSE_SCALE))
+
+
+def _check_seen(problem: DomeProblem) -> None:
+    """Refuse exact poses at which the camera cannot see the board at all."""
+    bundle = problem.bundle
+    fixed = [i for i, view in enumerate(bundle.views) if view.fixed]
+    unseen = []
+    for i in fixed:
+        view = bundle.views[i]
+        camera = bundle.start.camera(view.medium)
+        pixels, _ = camera.project(view.dome_from_target.apply(view.view.points))
+        # Far outside the picture is as good as not to be seen; NaN compares false.
+        off_centre = np.abs(pixels / camera.size_px - 0.5).max(axis=1)
+        if np.mean(off_centre < _SURELY_SEEN) < 0.5:
+            unseen.append(i)
+    if len(unseen) > 0.5 * len(fixed):
+        raise CalibrationError(
+            f"{problem.shots[unseen[0]].label}: the camera cannot see a board at the given pose; "
+            f"{_POSE_RULES}"
+        )
+
+
+def contradicted_distances(
+    problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
+) -> CalibrationError:
+    """Return what to say of given distances most of which the pictures contradict."""
+    for medium, one in enumerate(sets):
+        rival = in_other_medium(problem, medium)
+        if rival is not None and _distances_fit(problem, rival):
+            return wrong_medium(one, other_medium(one.n_medium))
+    return _wrong_lengths(problem, solution)
+
+
+def _distances_fit(problem: DomeProblem, solution: Solution[BundleState]) -> bool:
+    off = [block.lengths[0] for block in distance_blocks(problem, solution).values()]
+    return bool(np.median(off) < _FITTING_DISTANCE)
+
+
+def _wrong_lengths(problem: DomeProblem, solution: Solution[BundleState]) -> CalibrationError:
+    boards = [i for i, shot in enumerate(problem.shots) if shot.kind is PoseKind.DISTANCE]
+    free = problem.without_distances(boards)
+    try:
+        state = solve(free.bundle, solution.state).state
+    except CalibrationError:
+        state = solution.state
+    given = np.array([problem.given_distance(i) for i in boards])
+    found = np.array([plane_distance(state.poses[i]) for i in boards])
+    fault = scale_fault(length_ratio(given, found), _FINE_SCALE)
+    if fault is not None:
+        return CalibrationError(fault)
+    offset = 1e3 * float(np.median(found - given))
+    return CalibrationError(
+        f"the given distances contradict the pictures, typically by {offset:+.1f} mm (found minus "
+        "given); they count from the dome's centre along its y axis to the board's plane: measure "
+        "them again, or say that they are known less well"
+    )
+
+
+def check_solution(
+    problem: DomeProblem, solution: Solution[BundleState], uncertainty: RigUncertainty
+) -> None:
+    """Refuse a solution that does not explain the pictures, or that they do not determine.
+
+    Parameters
+    ----------
+    problem : DomeProblem
+    solution : Solution
+        Of it.
+    uncertainty : RigUncertainty
+        Of what was solved, with that of numbers that were held passed on.
+
+    Raises
+    ------
+    CalibrationError
+        With the likely cause and the remedy.
+    """
+    noise = noise_px(solution)
+    if noise > MAX_NOISE_PX:
+        _refuse_if(_exact_pose_fault(problem, solution))
+        raise CalibrationError(
+            f"no lens position explains the pictures: corners are {noise:.2g} px off (0.1 px is "
+            "usual); check the board's file against the print, the camera's calibration, the "
+            "dome's sizes and the medium"
+        )
+    if not solution.converged:
+        raise CalibrationError(
+            "the solve does not come to rest; add views at other distances and tilts, and check "
+            "the rig's dome"
+        )
+    _check_lens(problem, solution, uncertainty)
+
+
+def _check_lens(
+    problem: DomeProblem, solution: Solution[BundleState], uncertainty: RigUncertainty
+) -> None:
+    rig = solution.state.rig
+    lens = rig.dome_from_cam.translation
+    if rig.dome is not None and np.linalg.norm(lens) > _AT_THE_WALL * rig.dome.inner_radius:
+        raise CalibrationError(
+            f"the lens ends at the dome's wall, at {np.round(1e3 * lens, 1).tolist()} mm; check "
+            "the dome's inner radius, the board's square_mm, the given distances and the medium"
+        )
+    values, vectors = np.linalg.eigh(uncertainty.of(LENS))
+    sigma, axis = float(np.sqrt(values[-1])), vectors[:, -1] * np.sign(vectors[:, -1].sum())
+    if sigma > _MAX_LENS_SIGMA:
+        raise CalibrationError(
+            f"the pictures do not tell where the lens is: {1e3 * sigma:.1f} mm uncertain along "
+            f"{np.round(axis, 1).tolist()}; {_remedy(problem)}"
+        )
+
+
+def _remedy(problem: DomeProblem) -> str:
+    if all(shot.kind is PoseKind.UNKNOWN for shot in problem.shots):
+        return (
+            "give the boards' distances, show the board nearer and in more views, or take the "
+            "pictures in water, where refraction is five times stronger"
+        )
+    return "show more views, nearer, and with corners all over the picture"
+
+
+def _exact_pose_fault(problem: DomeProblem, solution: Solution[BundleState]) -> str | None:
+    """Return what is wrong with poses given as exact, compared with what each picture says."""
+    given, found = [], []
+    for i, shot in enumerate(problem.shots):
+        if shot.kind is not PoseKind.EXACT:
+            continue
+        pose = start_pose(solution.state.camera(shot.i_set), shot.view)
+        if not isinstance(pose, str):
+            middle = shot.view.middle
+            given.append(float(np.linalg.norm(solution.state.poses[i].apply(middle))))
+            found.append(float(np.linalg.norm(pose.dome_from_target.apply(middle))))
+    if not given:
+        return None
+    ratios = np.array(found) / np.array(given)
+    ratio = float(np.median(ratios))
+    one_scale = float(np.median(np.abs(ratios / ratio - 1.0))) < _SAME_RATIO
+    fault = scale_fault(ratio, _EXACT_SCALE) if one_scale else None
+    return fault or f"the given poses contradict the pictures; {_POSE_RULES}"
+
+
+def _sign_fault(given: FloatArray) -> str | None:
+    if np.all(given > 0.0):
+        return None
+    return (
+        f"a board at the distance {1e3 * float(given.min()):g} mm; distances count forward from "
+        "the dome's centre and are positive"
+    )
+
+
+def _refuse_if(fault: str | None) -> None:
+    if fault is not None:
+        raise CalibrationError(fault)

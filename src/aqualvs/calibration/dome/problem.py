@@ -1,0 +1,448 @@
+"""The problem of `calibrate dome`: what is free, what is known, and where to start.
+
+What `calibrate dome` is given: sets of views of boards, each in one medium, and options.
+
+How well boards were set up square to the rail, as the boards themselves tell.
+
+Most boards of a rail stand square, some lean by a degree or more. How closely the good ones agree
+is not known beforehand: it is estimated by likelihood, on a ladder of scales.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+
+from aqualvs.calibration.solver.bundle import Bundle, BundleState, PoseTerm, TargetView
+from aqualvs.calibration.solver.covariance import unbelievable_distance
+from aqualvs.calibration.solver.initial_pose import (
+    StartPose,
+    square_rotation,
+    start_pose,
+    turned_square,
+)
+from aqualvs.calibration.solver.least_squares import Solution, solve
+from aqualvs.calibration.solver.priors import TILTS, KnownDistance, SquareBoard
+from aqualvs.calibration.targets.targets import View
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.rig import Rig, RigUncertainty, combined
+
+_MIN_VIEWS = 3
+_MIN_POINTS = 60
+
+
+class GivenPose(Protocol):
+    """What was measured of a board's pose beforehand."""
+
+    @property
+    def dome_from_board(self) -> SE3 | None:
+        """The whole pose, or None."""
+
+    @property
+    def distance(self) -> float | None:
+        """Where the board's plane meets the dome's y axis, in metres, or None."""
+
+
+class PoseKind(StrEnum):
+    """How much is known of a board's pose."""
+
+    EXACT = "exact"
+    DISTANCE = "distance"
+    UNKNOWN = "unknown"
+
+
+def kind_of(given: GivenPose | None) -> PoseKind:
+    """Return how much is known of a pose."""
+    if given is None:
+        return PoseKind.UNKNOWN
+    if given.dome_from_board is not None:
+        return PoseKind.EXACT
+    return PoseKind.UNKNOWN if given.distance is None else PoseKind.DISTANCE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardSet:
+    """Views taken in one medium.
+
+    Attributes
+    ----------
+    name : str
+        For messages: "air", "pool", a folder.
+    views : tuple of View
+        One for each picture.
+    poses : tuple of GivenPose or None
+        What is known of each view's board; empty where nothing is known of any.
+    n_medium : float
+        Index outside the dome (vacuum = 1).
+    sigma_medium : float
+        How well it is known; 0 takes it as exact.
+    """
+
+    name: str
+    views: tuple[View, ...]
+    poses: Sequence[GivenPose | None] = ()
+    n_medium: float = 1.0003
+    sigma_medium: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.poses and len(self.poses) != len(self.views):
+            raise ValueError(f"{len(self.poses)} poses given for {len(self.views)} views")
+
+    def given(self, i_view: int) -> GivenPose | None:
+        """Return what is known of a view's board."""
+        return self.poses[i_view] if self.poses else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DomeOptions:
+    """What `calibrate dome` assumes and does; SI units and radians.
+
+    Attributes
+    ----------
+    inner_radius_sigma, thickness_sigma : float
+        How well the dome's sizes are known; 0 takes one as exact.
+    n_acrylic_sigma : float
+        How well the dome's index is known.
+    distance_sigma : float
+        How well given distances are known, one apart from the other.
+    distance_offset_sigma : float
+        How well the point is known that they are all measured from: an error that they share
+        shifts the lens as a whole.
+    tilt_sigma : float
+        How square to the dome boards at known distances stand that were set up well, about each
+        axis. Boards that were not may be off by any amount, as long as they are a minority.
+    refine_intrinsics : bool
+        Whether intrinsics move within what the camera's calibration says of them. If not, they are
+        held, and their uncertainty is passed on to the result.
+    check_held_back : bool
+        Whether the dome is compared with a bare lens on views held back.
+    """
+
+    inner_radius_sigma: float = 1e-4
+    thickness_sigma: float = 1e-4
+    n_acrylic_sigma: float = 3e-3
+    distance_sigma: float = 2e-4
+    distance_offset_sigma: float = 2e-4
+    tilt_sigma: float = field(default=float(np.deg2rad(0.2)))
+    refine_intrinsics: bool = True
+    check_held_back: bool = True
+
+    def __post_init__(self) -> None:
+        if self.distance_sigma <= 0.0 or self.tilt_sigma <= 0.0:
+            raise CalibrationError(
+                f"distances known to {1e3 * self.distance_sigma:g} mm and boards square to "
+                f"{np.rad2deg(self.tilt_sigma):g} deg; both must be positive"
+            )
+
+
+def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
+    """Refuse a rig without a dome, and sets that hold too little.
+
+    Raises
+    ------
+    CalibrationError
+        With what there is and what it takes.
+    """
+    if rig.dome is None:
+        raise CalibrationError(
+            f"rig {rig.name} has no dome; write its inner_radius_mm, thickness_mm and n_acrylic "
+            "into the rig file"
+        )
+    views = [view for one in sets for view in one.views]
+    exact = any(
+        kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))
+    )
+    needed = 1 if exact else _MIN_VIEWS
+    if len(views) < needed:
+        raise CalibrationError(
+            f"{len(views)} pictures show the board; the dome needs {needed} at least, and 10 to 15 "
+            "at distances all over the working range to be good"
+        )
+    points = sum(len(view) for view in views)
+    if points < _MIN_POINTS:
+        raise CalibrationError(
+            f"{points} board corners in {len(views)} pictures; the dome needs {_MIN_POINTS} at "
+            "least; show more of the board, or more often"
+        )
+
+
+LENS = ("lens_x", "lens_y", "lens_z")
+ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+# Wherever the lens is, poses of a board that is what it is said to be come nearer than this.
+_MAX_MISFIT_PX = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One view with its set and what is given of its board; `label` names it in messages."""
+
+    label: str
+    view: View
+    i_set: int
+    given: GivenPose | None
+
+    @property
+    def kind(self) -> PoseKind:
+        """How much is known of the board's pose."""
+        return kind_of(self.given)
+
+
+@dataclass(frozen=True, slots=True)
+class DomeProblem:
+    """A bundle with what it was made of.
+
+    Attributes
+    ----------
+    bundle : Bundle
+    shots : tuple of Shot
+        One for each of the bundle's views.
+    held : RigUncertainty
+        Numbers that are taken as they are though they are not exact.
+    left_out : dict
+        Labels of views that could not be used, and why.
+    """
+
+    bundle: Bundle
+    shots: tuple[Shot, ...]
+    held: RigUncertainty
+    left_out: dict[str, str]
+
+    @property
+    def rotation_is_solved(self) -> bool:
+        """Whether boards tell the camera's rotation."""
+        return any(shot.kind is not PoseKind.UNKNOWN for shot in self.shots)
+
+    @property
+    def measured_views(self) -> list[int]:
+        """Views whose board's distance is given and believed."""
+        return [
+            i
+            for i, view in enumerate(self.bundle.views)
+            if any(isinstance(term, KnownDistance) for term in view.known)
+        ]
+
+    def given_distance(self, i_view: int) -> float:
+        """Return the given distance of a view's board; NaN where none is given."""
+        given = self.shots[i_view].given
+        return float("nan") if given is None or given.distance is None else given.distance
+
+    def without(self, bad: dict[int, str]) -> "DomeProblem":
+        """Return the problem without some of its views, with the reasons."""
+        reasons = {self.shots[i].label: why for i, why in bad.items()}
+        part = self.only([i for i in range(len(self.shots)) if i not in bad])
+        return replace(part, left_out={**self.left_out, **reasons})
+
+    def only(self, keep: Sequence[int]) -> "DomeProblem":
+        """Return the problem of some of its views."""
+        start = replace(self.bundle.start, poses=tuple(self.bundle.start.poses[i] for i in keep))
+        views = tuple(self.bundle.views[i] for i in keep)
+        return replace(
+            self,
+            bundle=replace(self.bundle, views=views, start=start),
+            shots=tuple(self.shots[i] for i in keep),
+        )
+
+    def with_held_free(self) -> "DomeProblem":
+        """Return the problem with what is held solved for, within what is known of it."""
+        bundle = replace(
+            self.bundle,
+            free=(*self.bundle.free, *self.held.names),
+            priors=combined(self.bundle.priors, self.held),
+        )
+        return replace(self, bundle=bundle, held=RigUncertainty.none())
+
+    def without_distances(self, wrong: Sequence[int]) -> "DomeProblem":
+        """Return the problem with some of the given distances forgotten."""
+        views = list(self.bundle.views)
+        for i in wrong:
+            known = tuple(t for t in views[i].known if not isinstance(t, KnownDistance))
+            views[i] = replace(views[i], known=known)
+        return replace(self, bundle=replace(self.bundle, views=tuple(views)))
+
+    def with_lean_sigma(self, sigma: float) -> "DomeProblem":
+        """Return the problem with other expectations of how boards lean that stand well."""
+        views = []
+        for view in self.bundle.views:
+            known = tuple(
+                replace(term, lean_sigma=sigma) if isinstance(term, SquareBoard) else term
+                for term in view.known
+            )
+            views.append(replace(view, known=known))
+        return replace(self, bundle=replace(self.bundle, views=tuple(views)))
+
+
+def shots_of(sets: Sequence[BoardSet]) -> list[Shot]:
+    """Return all views of all sets."""
+    return [
+        Shot(f"{one.name}: {view.name}" if len(sets) > 1 else view.name, view, i_set, one.given(i))
+        for i_set, one in enumerate(sets)
+        for i, view in enumerate(one.views)
+    ]
+
+
+def start_rigs(rig: Rig) -> Iterator[Rig]:
+    """Yield the rig, then the same with its lens at the dome's centre, from where solves find home.
+
+    A lens that is said to sit far to the wrong side may leave no pose of a board to start from.
+    """
+    yield rig
+    yield replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
+
+
+def dome_problem(
+    rig: Rig, sets: Sequence[BoardSet], known: RigUncertainty, options: DomeOptions
+) -> DomeProblem:
+    """Set the problem up, with starting poses.
+
+    Parameters
+    ----------
+    rig : Rig
+        Where it starts: its lens lies inside the dome.
+    sets : sequence of BoardSet
+    known : RigUncertainty
+        Of the rig beforehand: intrinsics from the camera's calibration.
+    options : DomeOptions
+
+    Raises
+    ------
+    CalibrationError
+        If no view has a pose to start from.
+    """
+    shots, poses, left_out = _started(rig, sets)
+    boards = [i for i, shot in enumerate(shots) if shot.kind is PoseKind.DISTANCE]
+    exact = any(shot.kind is PoseKind.EXACT for shot in shots)
+    square = square_rotation([poses[i].rotation for i in boards or range(len(poses))])
+    if boards and not exact:
+        rig, poses = turned_square(rig, poses, square, boards, options.tilt_sigma)
+    solves_rotation = bool(boards) or exact
+    priors, held = _priors(rig, known, options, solves_rotation)
+    rotation = tuple(name for name in ROTATION if solves_rotation or name in priors.names)
+    free = (*LENS, *rotation, *(name for name in priors.names if name not in ROTATION))
+    views = tuple(
+        TargetView(
+            shot.view,
+            shot.i_set,
+            pose,
+            fixed=shot.kind is PoseKind.EXACT,
+            known=_known(shot, square, options),
+        )
+        for shot, pose in zip(shots, poses, strict=True)
+    )
+    media = np.array([one.n_medium for one in sets], np.float64)
+    sigma = np.array([one.sigma_medium for one in sets], np.float64)
+    bundle = Bundle(views, free, BundleState(rig, media, tuple(poses)), priors, sigma)
+    return DomeProblem(bundle, tuple(shots), held, left_out)
+
+
+def _started(rig: Rig, sets: Sequence[BoardSet]) -> tuple[list[Shot], list[SE3], dict[str, str]]:
+    cameras = [rig.in_water(one.n_medium).camera() for one in sets]
+    shots, poses, left_out = [], [], {}
+    misfits = []
+    for shot in shots_of(sets):
+        start = _start(cameras[shot.i_set], shot)
+        if isinstance(start, str):
+            left_out[shot.label] = start
+            continue
+        shots.append(shot)
+        poses.append(start.dome_from_target)
+        misfits.append(start.median_px)
+    if not shots:
+        raise CalibrationError(_why_none(rig, sets) or next(iter(left_out.values())))
+    if np.median(misfits) > _MAX_MISFIT_PX:
+        raise CalibrationError(
+            f"no pose of the board explains the pictures: corners are {np.median(misfits):.0f} px "
+            "off; check the board's file against the print, and the camera's calibration"
+        )
+    return shots, poses, left_out
+
+
+def _why_none(rig: Rig, sets: Sequence[BoardSet]) -> str | None:
+    """Return why no board has a pose outside the dome, from its size without one."""
+    bare = rig.bare_camera()
+    found = {}
+    for shot in shots_of(sets):
+        start = start_pose(bare, shot.view)
+        if not isinstance(start, str):
+            middle = start.dome_from_target.apply(shot.view.middle)
+            found[shot.label] = float(np.linalg.norm(middle - rig.dome_from_cam.translation))
+    return unbelievable_distance(np.array([*found.values()]), [*found]) if found else None
+
+
+def _start(camera: Camera, shot: Shot) -> StartPose | str:
+    if shot.given is not None and shot.given.dome_from_board is not None:
+        return StartPose(shot.given.dome_from_board, 0.0)
+    return start_pose(camera, shot.view)
+
+
+def _known(shot: Shot, square: FloatArray, options: DomeOptions) -> tuple[PoseTerm, ...]:
+    if shot.given is None or shot.given.distance is None or shot.kind is PoseKind.EXACT:
+        return ()
+    return (
+        KnownDistance(shot.given.distance, options.distance_sigma),
+        SquareBoard(square, options.tilt_sigma, options.tilt_sigma),
+    )
+
+
+def _priors(
+    rig: Rig, known: RigUncertainty, options: DomeOptions, solves_rotation: bool
+) -> tuple[RigUncertainty, RigUncertainty]:
+    """Return what is known of numbers that are solved for, and of those that are held."""
+    intrinsics = [n for n in rig.lens.parameter_names if known.sigmas.get(n, 0.0) > 0.0]
+    rotation = [n for n in ROTATION if known.sigmas.get(n, 0.0) > 0.0 and not solves_rotation]
+    tolerances = {
+        "inner_radius": options.inner_radius_sigma,
+        "thickness": options.thickness_sigma,
+        "n_acrylic": options.n_acrylic_sigma,
+    }
+    dome = RigUncertainty.independent({n: s for n, s in tolerances.items() if s > 0.0})
+    moving = known.only(rotation + (intrinsics if options.refine_intrinsics else []))
+    held = known.only([] if options.refine_intrinsics else intrinsics)
+    return combined(dome, moving), held
+
+
+# Nobody sets up boards better than this: 0.9 mm a metre.
+_FINEST = float(np.deg2rad(0.05))
+_STEP = 0.5
+# A finer scale must explain the boards so much better (natural logarithm): odds of 20 to 1.
+_EVIDENCE = 3.0
+
+
+def with_leaning_as_found(
+    problem: DomeProblem, solution: Solution[BundleState], sigma: float
+) -> tuple[DomeProblem, Solution[BundleState]]:
+    """Solve with a finer scale of leaning as long as boards agree that closely.
+
+    Parameters
+    ----------
+    problem, solution
+        Solved with `sigma`.
+    sigma : float
+        Scale of leaning, in radians.
+
+    Returns
+    -------
+    problem, solution
+        The same, where boards do not agree better, or nothing is known of their poses.
+    """
+    while sigma * _STEP >= _FINEST * (1.0 - 1e-9):
+        finer = problem.with_lean_sigma(sigma * _STEP)
+        trial = solve(finer.bundle, solution.state)
+        gain = _misfit(solution, sigma) - _misfit(trial, sigma * _STEP)
+        if not (trial.converged and gain > _EVIDENCE):
+            break
+        problem, solution, sigma = finer, trial, sigma * _STEP
+    return problem, solution
+
+
+def _misfit(solution: Solution[BundleState], sigma: float) -> float:
+    """Negative log likelihood of two-dimensional Cauchy leaning, but for a constant."""
+    leaning = [block.residuals[0] for block in solution.blocks if block.group == TILTS]
+    if not leaning:
+        return 0.0
+    squares = np.sum(np.square(leaning), axis=1)
+    return float(1.5 * np.sum(np.log1p(squares)) + 2.0 * len(leaning) * np.log(sigma))

@@ -1,0 +1,1 @@
+"""Calibration of the laser sheets from stripes on boxes, boards and walls."""

@@ -1,0 +1,379 @@
+"""Calibrating lasers: from pictures of a box or a board that the lasers shine on, to planes.
+
+The paper's automatic calibration (section 3.3) with all lasers on at once, several pictures in one
+solve, and an uncertainty that carries the camera's along.
+
+How good lasers are on pictures that they were not calibrated from: leave one out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.lasers.candidates import plane_residuals_px
+from aqualvs.calibration.lasers.checks import (
+    check_count,
+    check_distances,
+    check_poses,
+    check_size,
+    far_apart,
+    like,
+    loose_words,
+    match_to_rig,
+    named,
+)
+from aqualvs.calibration.lasers.covariance import CameraDoubt, joint_uncertainty
+from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, LaserSplit, split_lasers
+from aqualvs.calibration.lasers.report import (
+    LaserCalibration,
+    LaserFigures,
+    Solved,
+    ViewFigures,
+    laser_figures,
+    view_figures,
+)
+from aqualvs.calibration.lasers.solve import Start, paper_planes, solve_lasers, tolerance_px
+from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes, Surfaces
+from aqualvs.calibration.lasers.views import LaserView, PlacedView, place_views, pooled
+from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty
+
+# Corners that miss by more than this, in pixels, tell of a wrong rig, medium or target.
+_BAD_CORNERS_PX = 0.5
+# Likewise stripes; paint and speckle leave a tenth to a third.
+_BAD_STRIPES_PX = 0.7
+# A metre away this is 7 mm: too much to call a laser calibrated.
+_UNCERTAIN_NORMAL = np.deg2rad(0.4)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaserOptions:
+    """Options of `calibrate_lasers`.
+
+    Attributes
+    ----------
+    n_lasers : int or None
+        How many lasers shine. None for as many as the rig has, or, if it has none, as many as can
+        be told apart.
+    n_medium : float or None
+        Index of the medium in the pictures; None for the rig's own water.
+    sigma_n_medium : float
+        Its standard deviation; where it is the rig's own water, its uncertainty counts instead.
+    refine : bool
+        Whether the camera's uncertain numbers are solved along, with what is known of them as
+        prior; else they are held, and their uncertainty is passed on.
+    stripe_bias_px : float
+        Standard deviation of the error that all centres of one laser's stripe share on one
+        surface: the light's glow in the water, a slope of the surface's lightness.
+    loose : bool or None
+        Whether a board may lie unevenly on the surface that the stripes are on, or bend. None to
+        let the pictures say: where stripes and corners contradict each other, it does.
+    """
+
+    n_lasers: int | None = None
+    n_medium: float | None = None
+    sigma_n_medium: float = 0.0
+    refine: bool = False
+    stripe_bias_px: float = 0.03
+    loose: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if self.n_lasers is not None and self.n_lasers < 1:
+            raise OptionError(f"n_lasers is {self.n_lasers}; use 1 or more")
+        if not self.sigma_n_medium >= 0.0:
+            raise OptionError(f"sigma_n_medium is {self.sigma_n_medium}; use 0 or more")
+        if not self.stripe_bias_px >= 0.0:
+            raise OptionError(f"stripe_bias_px is {self.stripe_bias_px}; use 0 or more")
+
+
+def calibrate_lasers(
+    rig: Rig,
+    views: Sequence[LaserView],
+    surfaces: Surfaces,
+    *,
+    options: LaserOptions | None = None,
+    uncertainty: RigUncertainty | None = None,
+) -> LaserCalibration:
+    """Solve the lasers of a rig from pictures of a target that they shine on.
+
+    Parameters
+    ----------
+    rig : Rig
+        Camera, dome and media; lasers that it has give their names, order and windows.
+    views : sequence of LaserView
+        Corners and stripes of every picture.
+    surfaces : Surfaces
+        Of the target: `box_surfaces` or `board_surface`.
+    options : LaserOptions, optional
+    uncertainty : RigUncertainty, optional
+        How well the camera's numbers are known; exactly if left out.
+
+    Returns
+    -------
+    LaserCalibration
+
+    Raises
+    ------
+    CalibrationError
+        If the pictures do not tell enough, or contradict what is expected.
+    OptionError
+        If refinement is asked for and nothing is uncertain.
+    """
+    options = options or LaserOptions()
+    doubt = _doubt(rig, options, uncertainty or RigUncertainty.none())
+    check_size(views)
+    seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
+    placed, left_out = place_views(seen_rig.camera(), views, surfaces)
+    check_poses(placed)
+    check_distances(placed, rig)
+    lasers, laser_of, warnings = _sorted_stripes(rig, placed, surfaces, options)
+    start = Start(seen_rig, surfaces, tuple(placed), doubt if options.refine else None)
+    solved, words = solve_lasers(start, lasers, laser_of, options.loose)
+    result = _result_rig(rig, solved, lasers, start.doubt)
+    joint = joint_uncertainty(
+        solved.solution,
+        solved.problem,
+        doubt,
+        result.lasers,
+        refined=options.refine,
+        stripe_bias_px=options.stripe_bias_px,
+    )
+    figures = laser_figures(solved, joint, result.lasers, paper_planes(solved), words)
+    pictures = view_figures(solved)
+    return LaserCalibration(
+        rig=result,
+        uncertainty=joint.uncertainty,
+        lasers=tuple(figures),
+        views=tuple(pictures),
+        left_out=tuple(left_out),
+        warnings=(*warnings, *_warnings(solved, figures, pictures)),
+        refined=options.refine,
+    )
+
+
+def _doubt(rig: Rig, options: LaserOptions, uncertainty: RigUncertainty) -> CameraDoubt:
+    doubt = CameraDoubt.of(rig, uncertainty, options.n_medium, options.sigma_n_medium)
+    if options.refine and not doubt.n_columns:
+        raise OptionError(
+            "refinement is asked for, but the rig says of none of its camera's numbers how well "
+            "it is known; calibrate the camera and dome first, or leave refinement out"
+        )
+    return doubt
+
+
+def _sorted_stripes(
+    rig: Rig, views: Sequence[PlacedView], surfaces: Surfaces, options: LaserOptions
+) -> tuple[list[Laser], IntArray, list[str]]:
+    """Return the lasers with rough planes, which of them each point is of, and warnings."""
+    split, warnings = _split(rig, views, surfaces, options)
+    if len(rig.lasers) == len(split.planes):
+        order = [i for i in match_to_rig(rig, split.planes) if i is not None]
+        lasers = [
+            replace(laser, plane=like(split.planes[i], laser.plane))
+            for laser, i in zip(rig.lasers, order, strict=True)
+        ]
+        warnings += [
+            f"laser '{old.name}' is far from where the rig had it; check that it is the same one"
+            for old, new in zip(rig.lasers, lasers, strict=True)
+            if far_apart(old, new.plane)
+        ]
+    else:
+        order, lasers = named(split.planes)
+    place = np.full(len(order) + 1, -1)
+    place[order] = np.arange(len(order))
+    return lasers, place[split.laser], warnings
+
+
+def _split(
+    rig: Rig, views: Sequence[PlacedView], surfaces: Surfaces, options: LaserOptions
+) -> tuple[LaserSplit, list[str]]:
+    """Split the stripes, leniently if a board that leans may have torn lasers apart."""
+    expected = options.n_lasers or len(rig.lasers) or None
+    stripes, lens = pooled(views, surfaces), rig.dome_from_cam.translation
+
+    def split_within(tolerance: float) -> LaserSplit:
+        return split_lasers(stripes, lens, n_lasers=expected, tolerance_px=tolerance)
+
+    split = split_within(tolerance_px(rig.lasers))
+    if len(surfaces.planes) == 1 and (split.torn or len(split.planes) < (expected or 1)):
+        lenient = split_within(BENT_TOLERANCE_PX)
+        try:
+            return lenient, check_count(lenient, expected, rig, views, surfaces)
+        except CalibrationError:
+            # What can be said of the stricter split is the plainer complaint.
+            pass
+    return split, check_count(split, expected, rig, views, surfaces)
+
+
+def _result_rig(
+    rig: Rig, solved: Solved, lasers: Sequence[Laser], doubt: CameraDoubt | None
+) -> Rig:
+    state = solved.state
+    found = tuple(sheet.laser(laser) for laser, sheet in zip(lasers, state.sheets, strict=True))
+    if doubt is None:
+        return replace(rig, lasers=found)
+    n_water = float(state.bundle.media[0]) if doubt.medium_is_water else rig.n_water
+    return replace(state.bundle.rig, lasers=found, n_water=n_water)
+
+
+def _warnings(
+    solved: Solved, lasers: Sequence[LaserFigures], views: Sequence[ViewFigures]
+) -> list[str]:
+    words = [
+        f"{view.name}: corners miss by {view.rms_corners_px:.2f} px (rms); check the rig, the "
+        "medium and the target's file"
+        for view in views
+        if view.rms_corners_px > _BAD_CORNERS_PX
+    ]
+    words += [
+        f"laser '{figures.laser.name}' is known to {np.rad2deg(figures.sigma_normal):.2f} deg "
+        "only; add pictures in which its stripe lies on planes further apart"
+        for figures in lasers
+        if figures.sigma_normal > _UNCERTAIN_NORMAL
+    ]
+    words += [
+        f"stripes of laser '{figures.laser.name}' miss by {figures.rms_px:.2f} px (rms); check "
+        "the planes in the target's file, or whether the laser's window is in the rig"
+        for figures in lasers
+        if figures.rms_px > _BAD_STRIPES_PX
+    ]
+    if solved.problem.slack is not None:
+        words.append(loose_words(solved))
+    if not solved.solution.converged:
+        words.append("the solve did not settle; look at the residuals before using this rig")
+    return words
+
+
+# Where the board says that a laser's stripe is, to tell the lasers from each other.
+_NEAR_PX = 8.0
+_FEWEST_POINTS = 20
+_N_FITS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutView:
+    """One picture, measured by lasers that were calibrated from the others.
+
+    Attributes
+    ----------
+    name : str
+        File name.
+    n_lasers : int
+        Lasers that were seen in it.
+    by_lasers, by_board : Plane
+        The surface in `dome` as the lasers measure it, and as the board's corners tell it.
+    range_error, pitch_error, yaw_error : float
+        Lasers minus board, in metres and radians; of the board's own errors, too.
+    """
+
+    name: str
+    n_lasers: int
+    by_lasers: Plane
+    by_board: Plane
+    range_error: float
+    pitch_error: float
+    yaw_error: float
+
+
+def leave_one_out(
+    rig: Rig,
+    views: Sequence[LaserView],
+    surfaces: Surfaces,
+    *,
+    options: LaserOptions | None = None,
+    uncertainty: RigUncertainty | None = None,
+) -> list[HeldOutView]:
+    """Calibrate without each picture in turn, and measure that picture's board with the lasers.
+
+    Parameters
+    ----------
+    rig, views, surfaces, options, uncertainty
+        As `calibrate_lasers`; the target must be a board.
+
+    Returns
+    -------
+    list of HeldOutView
+        One for each picture.
+
+    Raises
+    ------
+    CalibrationError
+        If a calibration fails, or a picture shows too little to be measured.
+    """
+    if len(surfaces.planes) != 1:
+        raise CalibrationError("pictures are left out in turn only with a board, not with a box")
+    found = []
+    for i, view in enumerate(views):
+        others = [*views[:i], *views[i + 1 :]]
+        calibration = calibrate_lasers(
+            rig, others, surfaces, options=options, uncertainty=uncertainty
+        )
+        found.append(_measured(calibration, view, surfaces, options or LaserOptions()))
+    return found
+
+
+def _measured(
+    calibration: LaserCalibration, view: LaserView, surfaces: Surfaces, options: LaserOptions
+) -> HeldOutView:
+    rig = calibration.rig
+    seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
+    placed = place_views(seen_rig.camera(), [view], surfaces)[0][0]
+    planes = [figures.laser.plane for figures in calibration.lasers]
+    points, laser = _triangulated(seen_rig, placed, pooled([placed], surfaces), planes)
+    if len(points) < _FEWEST_POINTS or len(np.unique(laser)) < 2:
+        raise CalibrationError(
+            f"{view.view.name}: {len(points)} points on {len(np.unique(laser))} stripes; a plane "
+            "needs two stripes"
+        )
+    by_lasers = fitted(points)
+    by_board = surfaces.placed(0, placed.dome_from_target).facing_origin()
+    ours, theirs = posture(by_lasers), posture(by_board)
+    return HeldOutView(
+        name=view.view.name,
+        n_lasers=len(np.unique(laser)),
+        by_lasers=by_lasers,
+        by_board=by_board,
+        range_error=ours[0] - theirs[0],
+        pitch_error=ours[1] - theirs[1],
+        yaw_error=ours[2] - theirs[2],
+    )
+
+
+def _triangulated(
+    rig: Rig, view: PlacedView, stripes: PooledStripes, planes: Sequence[Plane]
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (N, 3) where pixels meet their laser's plane, and which laser's it is."""
+    residuals = np.abs(plane_residuals_px(stripes.placed, planes))
+    nearest = np.argmin(residuals, axis=1)
+    near = residuals[np.arange(len(nearest)), nearest] <= _NEAR_PX
+    laser = nearest[near]
+    rays = rig.camera().rays(view.stripes.pixels[stripes.placed.index[near]])
+    points = np.full((len(laser), 3), np.nan)
+    for i, plane in enumerate(planes):
+        mine = laser == i
+        points[mine] = plane.intersect(rays)[0][mine]
+    seen = np.all(np.isfinite(points), axis=1)
+    return points[seen], laser[seen]
+
+
+def fitted(points: FloatArray) -> Plane:
+    """Fit a plane to points (N, 3), robustly (Cauchy weights); it faces away from the origin."""
+    weights = np.ones(len(points))
+    for _ in range(_N_FITS):
+        middle = weights @ points / weights.sum()
+        offsets = points - middle
+        normal = np.linalg.eigh((weights[:, None] * offsets).T @ offsets)[1][:, 0]
+        distance = offsets @ normal
+        scale = max(1.4826 * float(np.median(np.abs(distance))), 1e-9)
+        weights = 1.0 / (1.0 + (distance / scale) ** 2)
+    return Plane(normal, float(normal @ middle)).facing_origin()
+
+
+def posture(plane: Plane) -> tuple[float, float, float]:
+    """Return range (m), pitch and yaw (radians) of a plane, as docs/conventions.md has them."""
+    n = plane.normal
+    return plane.offset, float(np.arctan2(n[2], n[1])), float(np.arctan2(n[0], n[1]))

@@ -1,0 +1,555 @@
+"""Laser planes that straight stripes suggest, and the evidence for each of them.
+
+A line on one surface and a line on another span a plane. Such a pair meets by accident now and
+then; the plane of a laser is told by the lines of further surfaces that it meets as well. How much
+each of them says is counted by how often planes of accidental pairs meet it: an a-contrario test
+(Desolneux, Moisan & Morel 2000, doi:10.1023/A:1026593302236), whose chance rates come from the
+pictures themselves. The number of points plays no part in it.
+
+Straight lines among stripe points on one flat surface: where laser planes cut it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import gammaln
+
+from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledStripes
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+
+# Points this near to a line, in pixels across their stripe, belong to it.
+_TOLERANCE_PX = 2.0
+# Points this near are taken away with it: the halo of a stripe is no second one.
+_HALO_PX = 6.0
+# A point's stripe runs along the line to within this tangent, as seen in the image.
+_ALIGNED = 0.35
+_MIN_POINTS = 12
+_MIN_LENGTH_PX = 20.0
+_MAX_LINES = 40
+_N_GUESSES, _N_SAMPLED, _N_FITS = 800, 600, 3
+
+
+@dataclass(frozen=True, slots=True)
+class StripeLine:
+    """A straight stripe on a surface.
+
+    Attributes
+    ----------
+    patch : int
+        Which surface of which view.
+    members : int array, shape (M,)
+        Indices of its points among those of all patches.
+    """
+
+    patch: int
+    members: IntArray
+
+
+def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list[StripeLine]:
+    """Find the straight stripes among points of one surface.
+
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all patches.
+    members : int array, shape (M,)
+        Which points lie on the surface.
+    patch : int
+        Its number.
+
+    Returns
+    -------
+    list of StripeLine
+        The longest first; no point belongs to two.
+    """
+    placed, normal = pooled.placed, pooled.patch_planes[patch].normal
+    points, across = placed.points_in_dome[members], placed.by_across[members]
+    along = placed.by_along[members]
+    some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
+    i, j = _pairs(pooled.chain[members], patch)
+    guessed, offsets = _guesses(points, normal, i, j)
+    # Most pairs are of two stripes, which do not run along the line through both points.
+    good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
+    guessed, offsets = guessed[good], offsets[good]
+    votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
+    counts = np.count_nonzero(votes, axis=0)
+    lines: list[StripeLine] = []
+    free = np.ones(len(members), np.bool_)
+    while len(lines) < _MAX_LINES and len(guessed):
+        best = int(np.argmax(counts))
+        m, c = guessed[best], float(offsets[best])
+        for _ in range(_N_FITS):
+            near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
+            if np.count_nonzero(near) < _MIN_POINTS:
+                return lines
+            m, c = _fitted(points[near], across[near], normal, m)
+        near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
+        if _length_px(points[near], along[near]) >= _MIN_LENGTH_PX:
+            lines.append(StripeLine(patch, members[near]))
+        taken = free & (near | _near(points, across, along, m[None], c, _HALO_PX)[:, 0])
+        free &= ~taken
+        counts -= np.count_nonzero(votes[taken[some]], axis=0)
+    return lines
+
+
+def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
+    """Return random pairs of points (N), half of them within a chain."""
+    n = len(chain)
+    if n < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    rng = np.random.default_rng(seed)
+    i, j = rng.integers(0, n, (2, _N_GUESSES))
+    half = slice(0, _N_GUESSES // 2)
+    order = np.argsort(chain, kind="stable")
+    first = np.searchsorted(chain[order], chain[i[half]], "left")
+    last = np.searchsorted(chain[order], chain[i[half]], "right")
+    j[half] = order[rng.integers(first, last)]
+    return i, j
+
+
+def _guesses(
+    points: FloatArray, normal: FloatArray, i: IntArray, j: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return lines m·X = c through pairs of points, m in the surface; NaN for equal points."""
+    m = np.cross(normal, points[j] - points[i])
+    length = np.linalg.norm(m, axis=1)
+    m /= np.where(length > 1e-6, length, np.nan)[:, None]
+    return m, np.einsum("ni,ni->n", m, points[i])
+
+
+def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
+    """Return which points (N) have a stripe that runs along their line (N)."""
+    gain = np.abs(np.einsum("ni,ni->n", across, m))
+    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _ALIGNED * gain
+    return aligned
+
+
+def _near(
+    points: FloatArray,
+    across: FloatArray,
+    along: FloatArray,
+    m: FloatArray,
+    c: FloatArray | float,
+    tolerance_px: float,
+) -> BoolArray:
+    """Return which points (N) are near which lines (H) and run along them, shape (N, H)."""
+    gain = np.abs(across @ m.T)
+    near: BoolArray = np.abs(points @ m.T - c) <= tolerance_px * gain
+    near &= np.abs(along @ m.T) <= _ALIGNED * gain
+    return near
+
+
+def _fitted(
+    points: FloatArray, across: FloatArray, normal: FloatArray, m: FloatArray
+) -> tuple[FloatArray, float]:
+    """Fit a line by least squares, weighing points as the image measures them."""
+    weight = 1.0 / np.maximum(np.abs(across @ m), 1e-9) ** 2
+    middle = weight @ points / weight.sum()
+    t = np.cross(m, normal)
+    u, v = (points - middle) @ t, (points - middle) @ m
+    turned = m - t * float(weight @ (u * v)) / max(float(weight @ (u * u)), 1e-30)
+    turned /= np.linalg.norm(turned)
+    return turned, float(turned @ middle)
+
+
+def _length_px(points: FloatArray, along: FloatArray) -> float:
+    """Return how long a line is in the image, roughly."""
+    if not len(points):
+        return 0.0
+    spread = points.max(axis=0) - points.min(axis=0)
+    per_px = float(np.median(np.linalg.norm(along, axis=1)))
+    return float(np.linalg.norm(spread)) / per_px
+
+
+# Surfaces of which the normals differ by less (sine), at one distance (metres), are one surface.
+_SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
+_CANDIDATES_N_FITS = 5
+# A point's stripe runs along the plane's to within this tangent, as seen in the image.
+_CANDIDATES_ALIGNED = 0.35
+# More pairs than this are sampled; so many planes are tried at a time.
+_MOST_PLANES, _AT_ONCE = 6000, 500
+# Where few accidents are seen, their rate is that of lines spread over so many pixels, with the
+# weight of so many observed planes. By how many pixels, and how often, lines of so many pairs are
+# moved at random to see whether they meet by accident.
+_SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
+_MOVED_PX, _N_MOVES, _MOST_MOVED = 250.0, 8, 1000
+# A line nearer than this share of the tolerance is no better evidence: poses are no better.
+_NEAREST = 0.1
+# A line is met by accident as often as those of its surface that have this share of its length.
+_AS_LONG = 0.5
+# Rounds in which lines of planes that were found are taken out of the accidents.
+_N_ROUNDS = 3
+_MOST_TRIALS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneCandidate:
+    """A plane that may be a laser's.
+
+    Attributes
+    ----------
+    plane : Plane
+        In `dome`.
+    lines : int array, shape (K,)
+        Indices of the lines in it.
+    log_false_alarms : float
+        Natural logarithm of how many planes as good as this one accidents are expected to make in
+        these pictures.
+    residual_px : float
+        Root mean square over surfaces of how far lines are from the plane, at their worst end.
+    """
+
+    plane: Plane
+    lines: IntArray
+    log_false_alarms: float
+    residual_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class LineTable:
+    """Ends and middles of lines, L of them: what planes are guessed from and tried on.
+
+    Attributes
+    ----------
+    patch : int array, shape (L,)
+        Which surface of which view a line lies on.
+    length : array, shape (L,)
+        In metres.
+    points : array, shape (L, 3, 3)
+        Ends and middle, in `dome`.
+    by_across : array, shape (L, 3, 3)
+        How they move with their pixel across the stripe, metres per pixel.
+    """
+
+    patch: IntArray
+    length: FloatArray
+    points: FloatArray
+    by_across: FloatArray
+
+    @classmethod
+    def of(cls, pooled: PooledStripes, lines: Sequence[StripeLine]) -> "LineTable":
+        """Return the table of some lines."""
+        points, by_across = np.zeros((len(lines), 3, 3)), np.zeros((len(lines), 3, 3))
+        for i, line in enumerate(lines):
+            mine = pooled.placed.points_in_dome[line.members]
+            middle = mine.mean(axis=0)
+            direction = np.linalg.svd(mine - middle, full_matrices=False)[2][0]
+            way = (mine - middle) @ direction
+            ends = np.quantile(way, [0.02, 0.5, 0.98])
+            points[i] = middle + ends[:, None] * direction
+            nearest = np.argmin(np.abs(way[:, None] - ends), axis=0)
+            by_across[i] = pooled.placed.by_across[line.members][nearest]
+        return cls(
+            np.array([line.patch for line in lines], np.int64),
+            np.linalg.norm(points[:, 2] - points[:, 0], axis=1),
+            points,
+            by_across,
+        )
+
+    def worst_px(self, normals: FloatArray, offsets: FloatArray) -> FloatArray:
+        """Return how far each line (L) is from planes (H) at its worst end, shape (H, L)."""
+        distance = np.abs(np.einsum("hi,lki->hlk", normals, self.points) - offsets[:, None, None])
+        gain = np.abs(np.einsum("hi,lki->hlk", normals, self.by_across))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            worst: FloatArray = np.max(distance / gain, axis=2)
+        return np.nan_to_num(worst, nan=np.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class _Hypotheses:
+    """Planes through pairs of lines that meet, H of them."""
+
+    pairs: IntArray
+    worst: FloatArray
+    normals: FloatArray
+    offsets: FloatArray
+    n_expected: float
+    kept_share: float
+
+    @classmethod
+    def of(cls, pooled: PooledStripes, table: LineTable, tolerance_px: float) -> "_Hypotheses":
+        pairs = _candidates_pairs(pooled, table)
+        n_expected = len(pairs) * _meeting_rate(table, pairs, tolerance_px)
+        normals, offsets = _planes_of_pairs(table, pairs)
+        meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
+        kept = np.flatnonzero(meet)
+        share = min(1.0, _MOST_PLANES / max(len(kept), 1))
+        if share < 1.0:
+            kept = np.sort(np.random.default_rng(0).choice(kept, _MOST_PLANES, replace=False))
+        pairs, normals, offsets = pairs[kept], normals[kept], offsets[kept]
+        worst = np.empty((len(kept), len(table.patch)))
+        for first in range(0, len(kept), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            worst[some] = table.worst_px(normals[some], offsets[some])
+        return cls(pairs, worst, normals, offsets, n_expected, share)
+
+
+@dataclass(frozen=True, slots=True)
+class _Accidents:
+    """How often planes and lines meet without being of one laser.
+
+    Attributes
+    ----------
+    rate : array, shape (L,)
+        Probability that an accidental plane meets a line as long as this one on its surface.
+    n_planes : float
+        How many accidental pairs of lines meet.
+    """
+
+    rate: FloatArray
+    n_planes: float
+
+
+def find_candidates(
+    pooled: PooledStripes, lines: Sequence[StripeLine], tolerance_px: float
+) -> list[PlaneCandidate]:
+    """Find planes that straight stripes lie in, the best first; no line is used twice.
+
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all views.
+    lines : sequence of StripeLine
+        Straight stripes of all surfaces.
+    tolerance_px : float
+        How far a stripe may be from its plane.
+
+    Returns
+    -------
+    list of PlaneCandidate
+        Those of which accidents would make fewer than one.
+    """
+    table = LineTable.of(pooled, lines)
+    planes = _Hypotheses.of(pooled, table, tolerance_px)
+    found: list[PlaneCandidate] = []
+    if not len(planes.pairs):
+        return found
+    accidental = np.zeros(len(planes.pairs), np.bool_)
+    for _ in range(_N_ROUNDS):
+        accidents = _accidents(table, planes, accidental, tolerance_px)
+        found = _collected(pooled, lines, table, planes, accidents, tolerance_px)
+        accidental = _accidental(len(lines), planes.pairs, found)
+    return found
+
+
+def _accidental(n_lines: int, pairs: IntArray, found: Sequence[PlaneCandidate]) -> BoolArray:
+    """Return which pairs (H,) are not of two lines of one found plane."""
+    owner = np.full(n_lines, -1)
+    for i, candidate in enumerate(found):
+        owner[candidate.lines] = i
+    of_pair = owner[pairs]
+    accidental: BoolArray = (of_pair[:, 0] != of_pair[:, 1]) | (of_pair[:, 0] < 0)
+    return accidental
+
+
+def _accidents(
+    table: LineTable, planes: _Hypotheses, accidental: BoolArray, tolerance_px: float
+) -> _Accidents:
+    """Count how often planes of accidental pairs (H,) meet lines."""
+    n = np.count_nonzero(accidental)
+    met = np.count_nonzero(planes.worst[accidental] <= tolerance_px, axis=0)
+    # A pair's own lines are met by construction.
+    met = met - np.bincount(planes.pairs[accidental].ravel(), minlength=len(table.patch))
+    prior = min(1.0, 2.0 * tolerance_px / _SPREAD_PX)
+    own_rate = (np.maximum(met, 0) + _PRIOR_WEIGHT * prior) / (n + _PRIOR_WEIGHT)
+    as_long = table.length[None] >= _AS_LONG * table.length[:, None]
+    rivals = (table.patch[:, None] == table.patch[None]) & as_long
+    rate = np.minimum(rivals @ own_rate, 1.0)
+    # Of pairs that meet one is the plane's own; lines elsewhere would meet as often.
+    n_planes = max(n / planes.kept_share, planes.n_expected)
+    return _Accidents(rate, float(n_planes))
+
+
+def _collected(
+    pooled: PooledStripes,
+    lines: Sequence[StripeLine],
+    table: LineTable,
+    planes: _Hypotheses,
+    accidents: _Accidents,
+    tolerance_px: float,
+) -> list[PlaneCandidate]:
+    """Take the best plane and its lines away, as long as one is better than accidents."""
+    found: list[PlaneCandidate] = []
+    free = np.ones(len(lines), np.bool_)
+    alive = np.ones(len(planes.pairs), np.bool_)
+    nearness = _nearness(planes.worst, tolerance_px)
+    for _ in range(_MOST_TRIALS):
+        alive &= np.all(free[planes.pairs], axis=1)
+        alarms = _log_false_alarms(table, np.where(free, nearness, np.inf), accidents)
+        alarms[~alive] = np.inf
+        best = int(np.argmin(alarms))
+        if not np.isfinite(alarms[best]):
+            break
+        alive[best] = False
+        start = Plane(planes.normals[best], float(planes.offsets[best]))
+        candidate = _candidates_fitted(pooled, lines, table, free, start, accidents, tolerance_px)
+        if candidate is None:
+            continue
+        if candidate.log_false_alarms > 0.0:
+            if alarms[best] > 0.0:
+                break
+            continue
+        found.append(candidate)
+        free[candidate.lines] = False
+    return sorted(found, key=lambda candidate: candidate.log_false_alarms)
+
+
+def _nearness(worst: FloatArray, tolerance_px: float) -> FloatArray:
+    """Return distances (H, L) as a share of the tolerance; infinite beyond it."""
+    near: FloatArray = np.maximum(worst / tolerance_px, _NEAREST)
+    near[near > 1.0] = np.inf
+    return near
+
+
+def _log_false_alarms(table: LineTable, nearness: FloatArray, accidents: _Accidents) -> FloatArray:
+    """Return the logarithm of the expected number (H,) of accidents as good as these planes.
+
+    Two lines make a plane, and only how well they meet is evidence; of all further ones, whichever
+    surfaces they are on, it is that they are met and how well.
+    """
+    order = np.argsort(table.patch, kind="stable")
+    starts = np.flatnonzero(np.diff(table.patch[order], prepend=-1))
+    chance = np.minimum(nearness * accidents.rate, 1.0)[:, order]
+    by_patch = np.minimum.reduceat(chance, starts, axis=1)
+    by_patch.sort(axis=1)
+    # The two most telling lines count as those that make the plane.
+    further = by_patch[:, 2:]
+    n, k = further.shape[1], np.count_nonzero(further < 1.0, axis=1)
+    choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
+    alarms: FloatArray = np.log(accidents.n_planes) + choices + np.log(further).sum(axis=1)
+    meeting = np.where(np.isfinite(nearness), nearness, 0.0).max(axis=1)
+    return alarms + np.where(k == 0, np.log(np.maximum(meeting, _NEAREST)), 0.0)
+
+
+def _candidates_fitted(
+    pooled: PooledStripes,
+    lines: Sequence[StripeLine],
+    table: LineTable,
+    free: BoolArray,
+    plane: Plane,
+    accidents: _Accidents,
+    tolerance_px: float,
+) -> PlaneCandidate | None:
+    """Fit a plane to the points of the free lines near it, and weigh it anew."""
+    worst, mine = np.zeros((1, len(lines))), np.zeros(0, np.int64)
+    for _ in range(_CANDIDATES_N_FITS):
+        worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
+        mine = np.flatnonzero(free & (worst[0] <= tolerance_px))
+        if not _on_two_surfaces(pooled, table.patch[mine]):
+            return None
+        members = np.concatenate([lines[int(i)].members for i in mine])
+        plane = fitted_plane(pooled.placed, members, plane)
+    worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
+    mine = np.flatnonzero(free & (worst[0] <= tolerance_px))
+    if not _on_two_surfaces(pooled, table.patch[mine]):
+        return None
+    nearness = np.where(free, _nearness(worst, tolerance_px), np.inf)
+    alarms = _log_false_alarms(table, nearness, accidents)
+    residual = float(np.sqrt(np.mean(worst[0, mine] ** 2)))
+    return PlaneCandidate(plane, mine, float(alarms[0]), residual)
+
+
+def _candidates_pairs(pooled: PooledStripes, table: LineTable) -> IntArray:
+    """Return pairs of lines (P, 2) that lie on different surfaces."""
+    different = ~_same_surfaces(pooled.patch_planes)
+    i, j = np.triu_indices(len(table.patch), 1)
+    keep = different[table.patch[i], table.patch[j]]
+    return np.stack([i[keep], j[keep]], axis=-1)
+
+
+def _planes_of_pairs(table: LineTable, pairs: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return planes (P, 3), (P,) through two lines each, by their ends."""
+    ends = table.points[pairs][:, :, [0, 2]].reshape(len(pairs), 4, 3)
+    middle = ends.mean(axis=1)
+    offsets = ends - middle[:, None]
+    normals = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets)[1][:, :, 0]
+    distances: FloatArray = np.einsum("hi,hi->h", normals, middle)
+    return normals, distances
+
+
+def _pairs_meet(
+    table: LineTable,
+    pairs: IntArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+    tolerance_px: float,
+) -> BoolArray:
+    """Return which pairs (P,) lie in their plane to within the tolerance."""
+    distance = np.abs(
+        np.einsum("pi,pski->psk", normals, table.points[pairs]) - offsets[:, None, None]
+    )
+    gain = np.abs(np.einsum("pi,pski->psk", normals, table.by_across[pairs]))
+    meet: BoolArray = np.all(distance <= tolerance_px * gain, axis=(1, 2))
+    return meet
+
+
+def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> float:
+    """Return how often pairs (P, 2) of lines would meet if one were moved at random.
+
+    Parallel lines always meet; the farther from parallel, the less.
+    """
+    if not len(pairs):
+        return 0.0
+    rng = np.random.default_rng(1)
+    some = pairs[rng.permutation(len(pairs))[:_MOST_MOVED]]
+    met = 0
+    for _ in range(_N_MOVES):
+        moves = rng.uniform(-_MOVED_PX, _MOVED_PX, len(some))[:, None, None]
+        points = table.points[some].copy()
+        points[:, 1] += moves * table.by_across[some[:, 1]]
+        moved = replace(
+            table,
+            points=points.reshape(-1, 3, 3),
+            by_across=table.by_across[some].reshape(-1, 3, 3),
+        )
+        own = np.arange(2 * len(some)).reshape(-1, 2)
+        met += int(
+            np.count_nonzero(_pairs_meet(moved, own, *_planes_of_pairs(moved, own), tolerance_px))
+        )
+    return (met + 1.0) / (_N_MOVES * len(some) + 1.0)
+
+
+def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:
+    """Return which patches (P, P) lie in one plane of `dome`, nearly."""
+    normals = np.array([p.normal for p in planes]).reshape(-1, 3)
+    offsets = np.array([p.offset for p in planes])
+    sine = np.linalg.norm(np.cross(normals[:, None], normals[None]), axis=2)
+    apart = np.abs(np.abs(offsets[:, None]) - np.abs(offsets[None]))
+    same: BoolArray = (sine < _SAME_NORMAL) & (apart < _SAME_OFFSET)
+    return same
+
+
+def _on_two_surfaces(pooled: PooledStripes, patches: IntArray) -> bool:
+    some = np.unique(patches)
+    if len(some) < 2:
+        return False
+    return not bool(np.all(_same_surfaces([pooled.patch_planes[i] for i in some])))
+
+
+def fitted_plane(placed: PlacedStripes, members: IntArray, start: Plane) -> Plane:
+    """Fit a plane to some of the points, each weighed as the image measures it."""
+    points = placed.points_in_dome[members]
+    gain = np.abs(placed.by_across[members] @ start.normal)
+    weight = 1.0 / np.maximum(gain, 1e-9) ** 2
+    middle = weight @ points / weight.sum()
+    offsets = points - middle
+    normal = np.linalg.eigh((weight[:, None] * offsets).T @ offsets)[1][:, 0]
+    normal = normal if normal @ start.normal > 0.0 else -normal
+    return Plane(normal, float(normal @ middle))
+
+
+def plane_residuals_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
+    """Return how far points are from the stripes of planes, across their own stripe, (N, L) px.
+
+    Infinite where a point's stripe runs along none of the directions that the plane's could.
+    """
+    normals = np.array([p.normal for p in planes]).reshape(-1, 3)
+    offsets = np.array([p.offset for p in planes])
+    gain = np.abs(placed.by_across @ normals.T)
+    slant = np.abs(placed.by_along @ normals.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residuals: FloatArray = (placed.points_in_dome @ normals.T - offsets) / gain
+        residuals[~(slant <= _CANDIDATES_ALIGNED * gain)] = np.inf
+    return residuals

@@ -1,0 +1,341 @@
+"""What cannot be calibrated from, and what to tell the user about it.
+
+Which found plane is which laser of the rig, and names for lasers that the rig has not.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserSplit, Verdict
+from aqualvs.calibration.lasers.report import Solved
+from aqualvs.calibration.lasers.stripes_on_planes import Surfaces
+from aqualvs.calibration.lasers.views import LaserView, PlacedView
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Laser, Rig
+
+# Half a radian and a tenth of a metre are as far apart as a laser is ever remounted.
+_FAR_ANGLE, _FAR_OFFSET = 0.5, 0.1
+# A sheet's normal this near to an axis of `dome` (cosine) makes its stripes level or upright.
+_ALONG_AXIS = 0.9
+
+
+def match_to_rig(rig: Rig, planes: Sequence[Plane]) -> list[int | None]:
+    """Return for every laser of the rig which plane is nearest to it, each plane used once.
+
+    None for lasers that are left over where there are fewer planes.
+    """
+    costs = np.array([[_apart(laser.plane, plane) for plane in planes] for laser in rig.lasers])
+    matched: list[int | None] = [None] * len(rig.lasers)
+    if costs.size:
+        for i_laser, i_plane in zip(*linear_sum_assignment(costs), strict=True):
+            matched[int(i_laser)] = int(i_plane)
+    return matched
+
+
+def far_apart(laser: Laser, plane: Plane) -> bool:
+    """Return whether a plane is so far from where the rig has the laser that it may be another."""
+    return _apart(laser.plane, plane) > 1.0
+
+
+def named(planes: Sequence[Plane]) -> tuple[list[int], list[Laser]]:
+    """Name lasers after the directions of their stripes, or number them.
+
+    A single plane near level is `horizontal`, near upright `vertical`, between them `diagonal`;
+    where two would have one name, all are numbered from the left.
+
+    Returns
+    -------
+    order : list of int
+        Index into `planes` of every laser.
+    lasers : list of Laser
+    """
+    words = [_word(plane) for plane in planes]
+    if len(set(words)) == len(words):
+        order = sorted(range(len(planes)), key=lambda i: _WORDS.index(words[i]))
+        return order, [Laser(words[i], positive(planes[i])) for i in order]
+    order = sorted(range(len(planes)), key=lambda i: _place(planes[i]))
+    return order, [Laser(f"laser_{k + 1}", positive(planes[i])) for k, i in enumerate(order)]
+
+
+def positive(plane: Plane) -> Plane:
+    """Return the plane with the largest component of its normal positive."""
+    if plane.normal[int(np.argmax(np.abs(plane.normal)))] < 0.0:
+        return Plane(-plane.normal, -plane.offset)
+    return plane
+
+
+def like(plane: Plane, other: Plane) -> Plane:
+    """Return the plane with its normal on the same side as another's."""
+    if plane.normal @ other.normal < 0.0:
+        return Plane(-plane.normal, -plane.offset)
+    return plane
+
+
+_WORDS = ("horizontal", "vertical", "diagonal")
+
+
+def _word(plane: Plane) -> str:
+    if abs(plane.normal[2]) > _ALONG_AXIS:
+        return _WORDS[0]
+    return _WORDS[1] if abs(plane.normal[0]) > _ALONG_AXIS else _WORDS[2]
+
+
+def _place(plane: Plane) -> float:
+    """Where the plane crosses the view half a metre ahead: from the left, or from the top."""
+    ahead = plane.offset - 0.5 * plane.normal[1]
+    if abs(plane.normal[0]) >= abs(plane.normal[2]):
+        return float(ahead / plane.normal[0])
+    return float(-ahead / plane.normal[2]) + 1e3
+
+
+def _apart(a: Plane, b: Plane) -> float:
+    b = like(b, a)
+    sine = float(np.linalg.norm(np.cross(a.normal, b.normal)))
+    cosine = float(a.normal @ b.normal)
+    angle = float(np.arctan2(sine, cosine)) / _FAR_ANGLE
+    return float(np.hypot(angle, (a.offset - b.offset) / _FAR_OFFSET))
+
+
+# Targets beyond these sizes, in metres, have their lengths in another unit than they say.
+_SMALLEST, _LARGEST = 0.02, 10.0
+# Stripes at so many times the working range are no stripes that the rig is made for.
+_NEARER, _FARTHER = 0.2, 5.0
+# Corners that fit so many times worse with stripes than without contradict them; and stripes that
+# fit a plane so many times worse than each a line contradict each other.
+_CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
+_FEWEST_BINS = 5
+# No detection is as bad as this, in pixels.
+_IMPOSSIBLE_PX = 2.0
+# A stripe with this share of the points that the weakest laser has in a picture is mentioned.
+_AS_STRONG = 0.5
+
+
+def check_size(views: Sequence[LaserView]) -> None:
+    """Refuse targets of a size that tells of a wrong unit.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    points = [v.view.points for v in views if len(v.view)]
+    if not points:
+        return
+    everything = np.concatenate(points)
+    size = float(np.max(everything.max(axis=0) - everything.min(axis=0)))
+    if not _SMALLEST <= size <= _LARGEST:
+        raise CalibrationError(
+            f"the target's points span {size * 1e3:.4g} mm; lengths in its file are millimetres: "
+            "check them against the print"
+        )
+
+
+def check_poses(views: Sequence[PlacedView]) -> None:
+    """Refuse pictures of which the corners contradict the rig, the medium or the target's file.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    misses = float(np.median([view.rms_px for view in views]))
+    if misses > _IMPOSSIBLE_PX:
+        raise CalibrationError(
+            f"corners miss by {misses:.1f} px (rms, median of {len(views)} pictures); the rig, the "
+            "medium (air or water?) or the target's file is wrong"
+        )
+
+
+def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
+    """Refuse stripes at distances that tell of a wrong unit, or of no stripes on the target.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    if not any(len(view.placed) for view in views):
+        raise CalibrationError(
+            f"{views[0].view.name}: no stripe lies on the target's surfaces; switch the lasers on, "
+            "and let them shine on it"
+        )
+    points = np.concatenate([view.placed.points_in_dome for view in views])
+    distance = float(np.median(np.linalg.norm(points, axis=1)))
+    near, far = rig.working_range
+    if not _NEARER * near <= distance <= _FARTHER * far:
+        raise CalibrationError(
+            f"stripes lie {distance * 1e3:.4g} mm away, but the rig works from {near * 1e3:.4g} "
+            f"to {far * 1e3:.4g} mm; check the units of the target's file and of the rig"
+        )
+
+
+def check_count(
+    split: LaserSplit,
+    expected: int | None,
+    rig: Rig,
+    views: Sequence[PlacedView],
+    surfaces: Surfaces,
+) -> list[str]:
+    """Refuse fewer or more lasers than expected, or an undecided number; warn about the rest.
+
+    Raises
+    ------
+    CalibrationError
+        If there are fewer, more, or none, or planes of light of which the pictures do not tell
+        whether they are lasers.
+    """
+    found = len(split.planes)
+    if found < (expected or 1):
+        raise CalibrationError(_too_few(split, expected, rig, views, surfaces))
+    if expected is not None and found > expected:
+        raise CalibrationError(
+            f"more than {expected} lasers are seen: {found} planes of light explain the stripes; "
+            "correct the number of lasers, or cover what reflects them"
+        )
+    if expected is None and split.undecided:
+        several = "another plane" if len(split.undecided) == 1 else "further planes"
+        raise CalibrationError(
+            f"{found} {'laser is' if found == 1 else 'lasers are'} certain, but {several} of light "
+            "may be of lasers as well: "
+            f"{_planes(split.undecided, views, surfaces)}; give --lasers N, how many there are, or "
+            f"{_remedy(surfaces)}"
+        )
+    words = [
+        f"a plane of light ({_plane(plane, views, surfaces)}) is not taken for a laser: {plane.why}"
+        for plane in split.spare
+        if plane.verdict is Verdict.OTHER or plane in split.undecided
+    ]
+    taken = [line for plane in split.spare for line in plane.members.tolist()]
+    counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
+    unmatched = [
+        line
+        for line in split.unmatched
+        # The lasers' counts are of all pictures, a line is of one.
+        if len(line.members) >= _AS_STRONG * counts.min() / len(views)
+        and not np.isin(line.members, taken).any()
+    ]
+    if unmatched:
+        longest = max(unmatched, key=lambda line: len(line.members))
+        alone = len(unmatched) == 1
+        rest = "belongs" if alone else f"and {len(unmatched) - 1} shorter ones belong"
+        words.append(
+            f"a stripe of {len(longest.members)} points "
+            f"({_where(longest.patch, views, surfaces)}) {rest} to no laser; "
+            f"{'a reflection' if alone else 'reflections'}, perhaps"
+        )
+    return words
+
+
+def _planes(planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+    some = [f"{_plane(plane, views, surfaces)}: {plane.why}" for plane in planes[:3]]
+    more = [f"and {len(planes) - 3} more"] if len(planes) > 3 else []
+    return "; ".join(some + more)
+
+
+def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+    """Return how many points a plane has, and where it is seen."""
+    patches = plane.patches
+    rest = f" and {len(patches) - 1} others" if len(patches) > 1 else ""
+    return f"{len(plane.members)} points in {_where(patches[0], views, surfaces)}{rest}"
+
+
+def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
+    """Return what a pose by corners alone leaves of them in each direction, in pixels."""
+    return float(np.median([view.rms_px for view in views]) / np.sqrt(2.0))
+
+
+def contradicts(solved: Solved) -> bool:
+    """Return whether corners and stripes of a board cannot both be right.
+
+    Then stripes pull corners from where these alone would put the board, or stripes, though each
+    is straight, do not fit together.
+    """
+    corners = _corners_px(solved) / _alone_px(solved)
+    return corners > _CORNERS_CONTRADICT or _stripes_misfit(solved) > _STRIPES_CONTRADICT
+
+
+def _stripes_misfit(solved: Solved) -> float:
+    """Return how many times stripes miss their plane more than they miss straight lines."""
+    from_plane = from_line = 0.0
+    for i, group in enumerate(solved.problem.groups):
+        residuals, _ = solved.stripe_residuals_px(i)
+        seen = np.isfinite(residuals)
+        if np.count_nonzero(seen) < _FEWEST_BINS:
+            continue
+        weights = 1.0 / group.sigma_px[seen]
+        along = group.pixels[seen] - group.pixels[seen].mean(axis=0)
+        way = along @ np.linalg.svd(along, full_matrices=False)[2][0]
+        basis = np.stack([np.ones(len(way)), way], axis=-1) * weights[:, None]
+        values = residuals[seen] * weights
+        left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+        from_plane += float(values @ values)
+        from_line += float(left @ left)
+    return float(np.sqrt(from_plane / max(from_line, 1e-12)))
+
+
+def loose_words(solved: Solved) -> str:
+    """Return the warning that a board is taken to lie unevenly on its surface."""
+    slack = solved.state.slack
+    tilt = np.rad2deg(np.sqrt(np.mean(np.sum(slack[:, :2] ** 2, axis=1))))
+    offset = np.sqrt(np.mean(slack[:, 2] ** 2)) * 1e3
+    return (
+        "the board is taken to lie unevenly on the surface that the stripes are on, or to bend, "
+        f"because stripes and corners contradict each other; by {tilt:.1f} deg and {offset:.1f} mm "
+        "(rms). Fix a flat board to a flat wall for better lasers"
+    )
+
+
+def _corners_px(solved: Solved) -> float:
+    n_groups = len(solved.problem.groups)
+    blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
+    squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
+    return float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
+
+
+def _alone_px(solved: Solved) -> float:
+    return float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
+
+
+def _too_few(
+    split: LaserSplit,
+    expected: int | None,
+    rig: Rig,
+    views: Sequence[PlacedView],
+    surfaces: Surfaces,
+) -> str:
+    which = ""
+    if split.planes and len(rig.lasers) == expected:
+        matched = match_to_rig(rig, split.planes)
+        missing = [laser.name for laser, i in zip(rig.lasers, matched, strict=True) if i is None]
+        which = f" (not: {', '.join(missing)})"
+    seen = f"{len(split.planes)} of {expected}" if expected is not None else "none"
+    lonely = ""
+    if split.unmatched:
+        where = sorted({_where(line.patch, views, surfaces) for line in split.unmatched[:4]})
+        what = "seen on one plane only" if len(where) == 1 else "that no certain plane explains"
+        lonely = f"; stripes {what}: {'; '.join(where)}"
+    wanted = "on two places of the board that differ"
+    if len(surfaces.planes) > 1:
+        wanted = "on two planes of the box"
+    if split.possible:
+        lonely += f"; undecided: {_planes(split.possible, views, surfaces)}"
+    told = "give --lasers N, how many there are, or " if split.possible and not expected else ""
+    return (
+        f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; "
+        f"{told}{_remedy(surfaces)}"
+    )
+
+
+def _remedy(surfaces: Surfaces) -> str:
+    if len(surfaces.planes) > 1:
+        return "add pictures in which every stripe crosses from one plane to another"
+    return "add pictures with the board nearer, farther or tilted another way"
+
+
+def _where(patch: int, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+    i_view, i_surface = divmod(patch, len(surfaces.planes))
+    return f"{views[i_view].view.name}, plane '{surfaces.names[i_surface]}'"

@@ -1,0 +1,283 @@
+"""What a laser calibration knows in the end: one joint covariance of camera, medium and lasers.
+
+The camera's numbers come from another calibration, with their own uncertainty. Either they are
+held, and their uncertainty is carried into the planes to first order (a "consider" covariance,
+Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4), or they are refined with it as their prior.
+In both cases planes and camera remain correlated, and the result says so. What centres of stripes
+have in common, on each surface, is carried along in the same way: more points do not reduce it.
+
+What is uncertain of the camera that lasers are calibrated with.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.lasers.problem import N_LASER, LaserProblem, LaserState
+from aqualvs.calibration.lasers.stripes_on_planes import StripeGroup, correlation_factor
+from aqualvs.calibration.solver.least_squares import Block, Solution, inverse, normal_equations
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.optics.camera import parameter_names
+from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDoubt:
+    """Which of the camera's numbers are uncertain, and the medium's index.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the rig, the medium's index not among them.
+    sigma_medium : float
+        Standard deviation of the index of the medium in the pictures; 0 if exact.
+    medium_is_water : bool
+        Whether that medium is the rig's own water, so that both are the same number.
+    given : RigUncertainty
+        What was known beforehand.
+    """
+
+    names: tuple[str, ...]
+    sigma_medium: float
+    medium_is_water: bool
+    given: RigUncertainty
+
+    @classmethod
+    def of(
+        cls, rig: Rig, given: RigUncertainty, n_medium: float | None, sigma_medium: float
+    ) -> "CameraDoubt":
+        """Sort out what is uncertain.
+
+        Parameters
+        ----------
+        rig : Rig
+            As the calibration starts.
+        given : RigUncertainty
+            Of the rig.
+        n_medium : float or None
+            Index of the medium in the pictures; None for the rig's own water.
+        sigma_medium : float
+            Its standard deviation, where it is not the rig's water.
+        """
+        # What was known of the lasers before is replaced.
+        given = given.only([name for name in given.names if ":" not in name])
+        sigmas = given.sigmas
+        known = set(parameter_names(rig.camera())) - {"n_water"}
+        names = tuple(n for n in given.names if n in known and sigmas[n] > 0.0)
+        is_water = n_medium is None and rig.dome is not None
+        if is_water:
+            sigma_medium = sigmas.get("n_water", 0.0)
+        return cls(names, sigma_medium if rig.dome is not None else 0.0, is_water, given)
+
+    @property
+    def n_columns(self) -> int:
+        """How many numbers are uncertain."""
+        return len(self.names) + (self.sigma_medium > 0.0)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the uncertain numbers as the problem's first columns have them."""
+        covariance = np.zeros((self.n_columns, self.n_columns))
+        n = len(self.names)
+        covariance[:n, :n] = self.given.of(self.names)
+        if self.sigma_medium > 0.0 and self.medium_is_water:
+            covariance[:] = self.given.of((*self.names, "n_water"))
+        elif self.sigma_medium > 0.0:
+            covariance[n, n] = self.sigma_medium**2
+        return covariance
+
+    def with_given(self) -> FloatArray:
+        """Return the covariance (C, U) of the uncertain numbers with all that are given."""
+        names = (*self.names, "n_water") if self.medium_is_water else self.names
+        rows = [self.given.names.index(n) for n in names[: self.n_columns]]
+        crossed = np.zeros((self.n_columns, len(self.given.names)))
+        crossed[: len(rows)] = self.given.covariance[rows]
+        return crossed
+
+
+@dataclass(frozen=True, slots=True)
+class JointResult:
+    """Covariances of a solved problem.
+
+    Attributes
+    ----------
+    uncertainty : RigUncertainty
+        Of all given numbers and all lasers' planes together; windows are taken as given.
+    lasers : array, shape (3 L, 3 L)
+        Its part for the lasers.
+    correlation : tuple of float
+        For every laser, how many binned residuals say as much as one independent.
+    """
+
+    uncertainty: RigUncertainty
+    lasers: FloatArray
+    correlation: tuple[float, ...]
+
+
+def joint_uncertainty(
+    solution: Solution[LaserState],
+    problem: LaserProblem,
+    doubt: CameraDoubt,
+    lasers: Sequence[Laser],
+    *,
+    refined: bool,
+    stripe_bias_px: float,
+) -> JointResult:
+    """Work out the joint covariance.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of `problem`.
+    problem : LaserProblem
+        With the uncertain numbers free if `refined`, else held.
+    doubt : CameraDoubt
+        What was uncertain beforehand.
+    lasers : sequence of Laser
+        In the order of the problem's.
+    refined : bool
+        Whether the solve moved the uncertain numbers.
+    stripe_bias_px : float
+        Standard deviation of the error that all centres of one laser's stripe share on one
+        surface, across the stripe.
+    """
+    correlation = _correlation(solution, problem)
+    information = _data_information(solution, problem, doubt, correlation)
+    covariance = _all_covariance(information, problem, doubt, stripe_bias_px, refined)
+    # Poses, slack and bias are integrated out.
+    n, mine = doubt.n_columns, np.arange(N_LASER * problem.n_lasers)
+    mine += problem.laser_columns(0)[0] + n - problem.bundle.n_shared
+    kept = np.concatenate([np.arange(n), mine])
+    joint = _with_given(covariance[np.ix_(kept, kept)], doubt)
+    names = [f"{laser.name}:{name}" for laser in lasers for name in LASER_PARAMETERS]
+    return JointResult(
+        RigUncertainty((*doubt.given.names, *names), joint),
+        covariance[np.ix_(mine, mine)],
+        correlation,
+    )
+
+
+def _all_covariance(
+    information: FloatArray,
+    problem: LaserProblem,
+    doubt: CameraDoubt,
+    stripe_bias_px: float,
+    refined: bool,
+) -> FloatArray:
+    """Covariance of everything, from what the data alone say."""
+    n, n_bias = doubt.n_columns, problem.n_lasers * len(problem.surfaces.planes)
+    bias = np.arange(len(information) - n_bias, len(information))
+    bias_prior = np.diag(np.full(n_bias, stripe_bias_px**2))
+    if refined:
+        informed = information.copy()
+        informed[:n, :n] += inverse(doubt.covariance)
+        return _considered(informed, bias, bias_prior)
+    prior = np.zeros((n + n_bias, n + n_bias))
+    prior[:n, :n], prior[n:, n:] = doubt.covariance, bias_prior
+    return _considered(information, np.concatenate([np.arange(n), bias]), prior)
+
+
+def _correlation(solution: Solution[LaserState], problem: LaserProblem) -> tuple[float, ...]:
+    if problem.slack is not None:
+        # The noise of stripes then holds what their bins share.
+        return (1.0,) * problem.n_lasers
+    sequences: list[list[FloatArray]] = [[] for _ in range(problem.n_lasers)]
+    n_groups = len(problem.groups)
+    parts = zip(
+        problem.groups,
+        solution.blocks[:n_groups],
+        solution.inliers[:n_groups],
+        solution.block_scales[:n_groups],
+        strict=True,
+    )
+    for group, block, inside, scale in parts:
+        residuals = np.where(inside, block.residuals[:, 0] / scale, np.nan)
+        for i in np.unique(group.surface):
+            sequences[group.laser].append(residuals[group.surface == i])
+    return tuple(correlation_factor(mine) for mine in sequences)
+
+
+def _data_information(
+    solution: Solution[LaserState],
+    problem: LaserProblem,
+    doubt: CameraDoubt,
+    correlation: Sequence[float],
+) -> FloatArray:
+    """Information of stripes, corners and slack; first the uncertain numbers, last the biases."""
+    bundle = replace(
+        problem.bundle,
+        free=doubt.names,
+        priors=RigUncertainty.none(),
+        media_sigma=np.array([doubt.sigma_medium]),
+    )
+    full = replace(problem, bundle=bundle)
+    blocks = full.blocks(solution.state)
+    n_data = len(problem.groups) + len(bundle.views)
+    n_slack = 0 if problem.slack is None else len(bundle.views)
+
+    def of_interest(n_blocks: int) -> list[int]:
+        # Priors of the camera, of which the two problems have different ones, stand in between.
+        return [*range(n_data), *range(n_blocks - n_slack, n_blocks)]
+
+    then = of_interest(len(solution.blocks))
+    scales = [solution.block_scales[i] for i in then]
+    taken = [blocks[i] for i in of_interest(len(blocks))]
+    n_surfaces = len(problem.surfaces.planes)
+    for i, group in enumerate(problem.groups):
+        scales[i] *= float(np.sqrt(correlation[group.laser]))
+        first = full.n_parameters + n_surfaces * group.laser
+        taken[i] = _with_bias(taken[i], group, np.arange(first, first + n_surfaces))
+    inliers = [solution.inliers[i] for i in then]
+    n_all = full.n_parameters + n_surfaces * problem.n_lasers
+    return normal_equations(n_all, taken, inliers, scales).information
+
+
+def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
+    """Return a stripe's block with a shift across the stripe for each surface, in pixels."""
+    by_bias = np.zeros((len(group), 1, len(columns)))
+    by_bias[np.arange(len(group)), 0, group.surface] = 1.0 / group.sigma_px
+    return replace(
+        block,
+        columns=np.concatenate([block.columns, columns]),
+        jacobian=np.concatenate([block.jacobian, by_bias], axis=2),
+    )
+
+
+def _considered(information: FloatArray, held: IntArray, prior: FloatArray) -> FloatArray:
+    """Covariance of all numbers where some were held at values with covariance `prior`."""
+    solved = np.setdiff1d(np.arange(len(information)), held)
+    noise = inverse(information[np.ix_(solved, solved)])
+    by_held = -noise @ information[np.ix_(solved, held)]
+    covariance = np.empty_like(information)
+    covariance[np.ix_(held, held)] = prior
+    covariance[np.ix_(solved, held)] = by_held @ prior
+    covariance[np.ix_(held, solved)] = (by_held @ prior).T
+    covariance[np.ix_(solved, solved)] = noise + by_held @ prior @ by_held.T
+    return covariance
+
+
+def _with_given(covariance: FloatArray, doubt: CameraDoubt) -> FloatArray:
+    """Covariance of all given numbers and the lasers, from that of the uncertain and the lasers.
+
+    What the solve did not know follows what it did by the correlation given beforehand.
+    """
+    n, n_given = doubt.n_columns, len(doubt.given.names)
+    crossed = doubt.with_given()
+    follow = crossed.T @ _pseudo_inverse(doubt.covariance)
+    joint = np.empty((n_given + len(covariance) - n,) * 2)
+    rest = doubt.given.covariance - follow @ crossed
+    joint[:n_given, :n_given] = rest + follow @ covariance[:n, :n] @ follow.T
+    joint[:n_given, n_given:] = follow @ covariance[:n, n:]
+    joint[n_given:, :n_given] = joint[:n_given, n_given:].T
+    joint[n_given:, n_given:] = covariance[n:, n:]
+    symmetric: FloatArray = 0.5 * (joint + joint.T)
+    return symmetric
+
+
+def _pseudo_inverse(covariance: FloatArray) -> FloatArray:
+    """Invert a covariance whose numbers have units of many sizes, and may be tied to each other."""
+    sigma = np.sqrt(np.diag(covariance))
+    size = np.outer(sigma, sigma)
+    inverted: FloatArray = np.linalg.pinv(covariance / size, rcond=1e-10) / size
+    return inverted

@@ -1,0 +1,441 @@
+"""Which stripe points belong to which laser, when all lasers shine at once.
+
+Points on known surfaces fall apart into laser planes in space. On each surface a laser plane draws
+a straight line; lines on different surfaces tell which planes there are, and how many lasers.
+
+Which of the planes that stripes suggest are lasers, which are not, and which may be.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from aqualvs.calibration.lasers.candidates import (
+    PlaneCandidate,
+    StripeLine,
+    find_candidates,
+    fitted_plane,
+    lines_on_patch,
+    plane_residuals_px,
+)
+from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledStripes
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+
+# Share of false planes among those that are taken for lasers (Benjamini & Hochberg 1995,
+# doi:10.1111/j.2517-6161.1995.tb02031.x); planes of fewer points in all are no lasers.
+_FALSE_SHARE = 1e-3
+_LEAST_POINTS = 40
+# Light nearer to another laser's stripe than this, in pixels, is its halo; the same light on other
+# surfaces, where that laser is not seen, is perhaps the same laser on a board that is not flat.
+_HALO_PX, _TORN_PX = 6.0, 15.0
+# Points and surfaces that agree on this are enough of them.
+_MOST = 0.8
+# Stripes of one laser overlap by no more than this share of their length where it goes on from the
+# target to what lies behind or before it; of two lasers, most of it.
+# A kink leaves them alike to within this cosine.
+_LITTLE, _ALIKE = 0.15, 0.8
+# A stripe that stays in one place of the target to within this, in pixels, may be print.
+_FIXED_PX = 1.5
+# A plane nearer to the lens, in metres, shows its stripe in one place of the picture: no laser that
+# measures, but a scratch or a text in the picture.
+_LEAST_BASELINE = 2e-3
+# Light that misses its plane so many times more than the best laser's misses its own lies on
+# something else. Poses leave a tenth of a pixel, whatever the stripe.
+_POORER, _LEAST_RESIDUAL_PX = 5.0, 0.1
+
+
+class Verdict(Enum):
+    """What a plane of light is taken for."""
+
+    LASER = "laser"
+    WEAK = "plane of little evidence"
+    DOUBTFUL = "plane that something speaks against"
+    TORN = "perhaps part of another laser"
+    OTHER = "no laser of its own"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedPlane:
+    """A plane of light and what it is taken for.
+
+    Attributes
+    ----------
+    candidate : PlaneCandidate
+    members : int array, shape (M,)
+        Indices of its points.
+    patches : tuple of int
+        Which surfaces of which views it is seen on.
+    verdict : Verdict
+    why : str
+        In words, why it is no laser or may be none; empty for lasers.
+    """
+
+    candidate: PlaneCandidate
+    members: IntArray
+    patches: tuple[int, ...]
+    verdict: Verdict
+    why: str = ""
+
+
+def judged(
+    pooled: PooledStripes,
+    lines: Sequence[StripeLine],
+    candidates: Sequence[PlaneCandidate],
+    lens_in_dome: FloatArray,
+) -> list[JudgedPlane]:
+    """Judge planes by their evidence, and by each other.
+
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all views.
+    lines : sequence of StripeLine
+        Of all surfaces.
+    candidates : sequence of PlaneCandidate
+        As `find_candidates` returns them.
+    lens_in_dome : array, shape (3,)
+        The lens's projection centre.
+
+    Returns
+    -------
+    list of JudgedPlane
+        By verdict, and the better before the worse.
+    """
+    alarms = np.array([c.log_false_alarms for c in candidates])
+    n_sure = _n_sure(alarms)
+    seen: list[JudgedPlane] = []
+    for i in _by_target(pooled, lines, candidates):
+        candidate = candidates[i]
+        members = _members(lines, candidate)
+        fault = _fault(pooled, candidate, members, seen)
+        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < _LEAST_BASELINE:
+            fault = Verdict.OTHER, "it stays in one place of the picture, near or far"
+        if fault is None and i >= n_sure:
+            fault = Verdict.WEAK, "too few stripes lie in it to tell it from an accident"
+        verdict, why = fault or (Verdict.LASER, "")
+        patches = tuple(np.unique(pooled.patch[members]).tolist())
+        seen.append(JudgedPlane(candidate, members, patches, verdict, why))
+    ranks = list(Verdict)
+    return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
+
+
+def _n_sure(log_alarms: FloatArray) -> int:
+    """Return how many of the best planes hold no more false ones than is allowed."""
+    allowed = _FALSE_SHARE * np.arange(1, len(log_alarms) + 1)
+    good = np.flatnonzero(np.exp(np.sort(log_alarms)) <= allowed)
+    return int(good[-1]) + 1 if len(good) else 0
+
+
+def _members(lines: Sequence[StripeLine], candidate: PlaneCandidate) -> IntArray:
+    return np.concatenate([lines[int(i)].members for i in candidate.lines])
+
+
+def _by_target(
+    pooled: PooledStripes, lines: Sequence[StripeLine], candidates: Sequence[PlaneCandidate]
+) -> list[int]:
+    """Return the order of judgement: planes with light on the target before those beside it."""
+    beside = [
+        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _MOST for c in candidates
+    ]
+    return sorted(range(len(candidates)), key=lambda i: (beside[i], i))
+
+
+def _fault(
+    pooled: PooledStripes,
+    candidate: PlaneCandidate,
+    members: IntArray,
+    seen: Sequence[JudgedPlane],
+) -> tuple[Verdict, str] | None:
+    """Return what speaks against a plane's being a laser of its own."""
+    if len(members) < _LEAST_POINTS:
+        return Verdict.OTHER, f"it has {len(members)} points only"
+    if _is_fixed(pooled, members):
+        return Verdict.DOUBTFUL, (
+            "its stripe stays in one place of the target, as print or an edge would; move the "
+            "camera sideways, or turn it, between pictures"
+        )
+    for other in seen:
+        if other.verdict is Verdict.OTHER:
+            continue
+        fault = _same_light(pooled, members, other)
+        if fault is not None:
+            return fault
+    best = min(
+        (other.candidate.residual_px for other in seen if other.verdict is Verdict.LASER),
+        default=np.inf,
+    )
+    if candidate.residual_px > _POORER * max(best, _LEAST_RESIDUAL_PX):
+        return Verdict.DOUBTFUL, (
+            f"its stripes miss a plane by {candidate.residual_px:.1f} px, those of another laser "
+            f"by {best:.1f} px; they may lie on something else than the target"
+        )
+    return None
+
+
+def _same_light(
+    pooled: PooledStripes,
+    members: IntArray,
+    other: JudgedPlane,
+) -> tuple[Verdict, str] | None:
+    """Return what shows that a plane's stripes may be of another plane's laser."""
+    mine = set(pooled.patch[members].tolist())
+    shared = mine & set(other.patches)
+    away = plane_residuals_px(pooled.placed, [other.candidate.plane])[members, 0]
+    distance = float(np.median(np.abs(away)))
+    if distance <= _HALO_PX and shared:
+        return Verdict.OTHER, "it is the halo of another stripe"
+    if distance <= _TORN_PX and len(shared) <= (1.0 - _MOST) * len(mine):
+        return Verdict.TORN, (
+            f"it is {distance:.0f} px away from a laser that is seen in other pictures"
+        )
+    goes_on = sum(_goes_on(pooled, members, other.members, patch) for patch in shared)
+    if len(shared) >= 2 and goes_on >= _MOST * len(mine):
+        return Verdict.OTHER, "it begins where another stripe ends, as that laser's light does on "
+    return None
+
+
+def _goes_on(pooled: PooledStripes, members: IntArray, others: IntArray, patch: int) -> bool:
+    """Return whether a stripe of a surface lies before or behind another one's end."""
+    points = pooled.placed.points_in_dome
+    mine = points[members[pooled.patch[members] == patch]]
+    theirs = points[others[pooled.patch[others] == patch]]
+    middle, direction = theirs.mean(axis=0), _direction(theirs)
+    if abs(float(direction @ _direction(mine))) < _ALIKE:
+        return False
+    first, last = np.quantile((theirs - middle) @ direction, [0.02, 0.98])
+    way = (mine - middle) @ direction
+    return float(np.mean((way >= first) & (way <= last))) <= _LITTLE
+
+
+def _direction(points: FloatArray) -> FloatArray:
+    """Return the unit vector along points (N, 3) of a line."""
+    offsets = points - points.mean(axis=0)
+    direction: FloatArray = np.linalg.svd(offsets, full_matrices=False)[2][0]
+    return direction
+
+
+def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
+    """Return whether the points of every surface are on one line of the target in all views."""
+    worst = 0.0
+    several = False
+    for surface in np.unique(pooled.placed.surface[members]):
+        mine = members[pooled.placed.surface[members] == surface]
+        views = np.unique(pooled.view[mine])
+        if len(views) < 2:
+            continue
+        several = True
+        points = pooled.points_in_target[mine]
+        size = np.linalg.norm(pooled.placed.by_across[mine], axis=1)
+        middle = np.array([points[pooled.view[mine] == v].mean(axis=0) for v in views])
+        offsets = points - middle.mean(axis=0)
+        across = np.linalg.svd(offsets, full_matrices=False)[2][1]
+        by_view = [offsets[pooled.view[mine] == v] @ across for v in views]
+        sizes = [float(np.median(size[pooled.view[mine] == v])) for v in views]
+        rms = [np.sqrt(np.mean(d**2)) / px for d, px in zip(by_view, sizes, strict=True)]
+        worst = max(worst, float(np.sqrt(np.mean(np.square(rms)))))
+    return several and worst <= _FIXED_PX
+
+
+TOLERANCE_PX = 3.0
+"""A stripe this near to a plane may be the plane's; poses add to the noise of stripes."""
+BENT_TOLERANCE_PX = 10.0
+"""Likewise where the light may be bent at a window, so that no plane fits well."""
+# Points this near to the stripe of a second laser have its light in their centre.
+_CROSSING_PX = 9.0
+_N_FITS = 5
+# A straight stripe holds this share of the chains that it is cut from, or is a chord of a curve.
+_LEAST_OF_CHAIN = 0.25
+# Accidents are so many times as likely (natural logarithm) to make a plane that is clearly worse.
+_CLEARLY_WORSE = 3.0
+# Accidents that a plane which is asked for may be expected to be, at most, and how many times as
+# long as its own a stripe in no plane may be: tuned on 24 simulated scenes of one picture of a box
+# with glints. Accidents that a plane which has to be asked about may be expected to be.
+_TOLD = float(np.log(0.2))
+_LONGER = 1.5
+_HARDLY_AN_ACCIDENT = float(np.log(0.05))
+
+
+@dataclass(frozen=True, slots=True)
+class LaserSplit:
+    """Points sorted by laser.
+
+    Attributes
+    ----------
+    planes : tuple of Plane
+        Rough planes of the lasers, the one with the best evidence first.
+    laser : int array, shape (N,)
+        Index into `planes`; -1 for points of none, or near where two stripes cross.
+    unmatched : tuple of StripeLine
+        Long stripes that belong to none of the planes, the longest first.
+    spare : tuple of JudgedPlane
+        Further planes of light, which are not taken for lasers; undecided ones first.
+    """
+
+    planes: tuple[Plane, ...]
+    laser: IntArray
+    unmatched: tuple[StripeLine, ...]
+    spare: tuple[JudgedPlane, ...] = ()
+
+    @property
+    def undecided(self) -> tuple[JudgedPlane, ...]:
+        """Planes that accidents hardly make, and that may be lasers nevertheless."""
+        return self._undecided(_HARDLY_AN_ACCIDENT)
+
+    @property
+    def possible(self) -> tuple[JudgedPlane, ...]:
+        """Planes that may be lasers if there must be more of them."""
+        return self._undecided(_TOLD)
+
+    def _undecided(self, most: float) -> tuple[JudgedPlane, ...]:
+        return tuple(
+            plane
+            for plane in self.spare
+            if plane.verdict is not Verdict.OTHER and plane.candidate.log_false_alarms <= most
+        )
+
+    @property
+    def torn(self) -> bool:
+        """Whether a laser seems to lie in several planes, as on a board that is not flat."""
+        return any(plane.verdict is Verdict.TORN for plane in self.spare)
+
+
+def split_lasers(
+    pooled: PooledStripes,
+    lens_in_dome: FloatArray,
+    *,
+    n_lasers: int | None = None,
+    tolerance_px: float = TOLERANCE_PX,
+) -> LaserSplit:
+    """Sort stripe points by the laser plane that they lie in.
+
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all views.
+    lens_in_dome : array, shape (3,)
+        The lens's projection centre; a plane through it is no laser.
+    n_lasers : int, optional
+        How many lasers shine; if left out, all planes of which the evidence is clear.
+    tolerance_px : float
+        How far a stripe may be from its plane.
+
+    Returns
+    -------
+    LaserSplit
+        All planes that are clear, be there more than `n_lasers`. Where there are fewer, the best
+        undecided ones, if they are clearly better than the rest of those.
+    """
+    lines = _all_lines(pooled)
+    found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
+    taken = [plane for plane in found if plane.verdict is Verdict.LASER]
+    in_planes = {int(i) for plane in found for i in plane.candidate.lines}
+    lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
+    longest = max(lonely, default=0)
+    perhaps = [plane for plane in found if _may_be_laser(plane, lines, longest)]
+    missing = 0 if n_lasers is None else max(n_lasers - len(taken), 0)
+    if 0 < missing <= len(perhaps):
+        best, rest = perhaps[:missing], perhaps[missing:]
+        if not any(_as_good(plane, best[-1]) for plane in rest):
+            taken += best
+    planes = _refined(pooled, [plane.candidate.plane for plane in taken], tolerance_px)
+    laser = assigned(pooled, planes, tolerance_px)
+    spare = tuple(plane for plane in found if plane not in taken)
+    return LaserSplit(tuple(planes), laser, _unmatched(lines, laser), spare)
+
+
+def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
+    """Return whether a plane can be a laser if there are known to be more of them.
+
+    Not if a much longer stripe, of `longest` points, is in no plane: then that may be the laser,
+    seen on one surface only.
+    """
+    perhaps = plane.verdict in (Verdict.WEAK, Verdict.DOUBTFUL)
+    own = max(len(lines[int(i)].members) for i in plane.candidate.lines)
+    return perhaps and plane.candidate.log_false_alarms <= _TOLD and longest <= _LONGER * own
+
+
+def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
+    """Return whether a plane is nearly as good as another that is a little better."""
+    worse = plane.candidate.log_false_alarms - other.candidate.log_false_alarms
+    return plane.verdict is other.verdict and worse < _CLEARLY_WORSE
+
+
+def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
+    lines = []
+    n_of_chain = _counts_on_patch(pooled)
+    for patch in range(len(pooled.patch_planes)):
+        members = np.flatnonzero(pooled.patch == patch)
+        lines += [
+            line
+            for line in lines_on_patch(pooled, members, patch)
+            if _share_of_chains(pooled, line, n_of_chain) >= _LEAST_OF_CHAIN
+        ]
+    return lines
+
+
+def _counts_on_patch(pooled: PooledStripes) -> IntArray:
+    """Return how many points (N,) of its own chain lie on a point's surface."""
+    n_chains = int(pooled.chain.max(initial=-1)) + 1
+    _, place, counts = np.unique(
+        pooled.patch * n_chains + pooled.chain, return_inverse=True, return_counts=True
+    )
+    n_of_chain: IntArray = counts[place]
+    return n_of_chain
+
+
+def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArray) -> float:
+    """Return which share of its chains' points a line holds, the mean over its points."""
+    chains, place = np.unique(pooled.chain[line.members], return_inverse=True)
+    mine = np.bincount(place, minlength=len(chains))[place]
+    return float(np.mean(mine / n_of_chain[line.members]))
+
+
+def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) -> list[Plane]:
+    """Fit planes to all points near them and near no other."""
+    for _ in range(_N_FITS):
+        laser = assigned(pooled, planes, tolerance_px)
+        planes = [
+            fitted_plane(pooled.placed, np.flatnonzero(laser == i), plane)
+            if np.count_nonzero(laser == i) >= _LEAST_POINTS
+            else plane
+            for i, plane in enumerate(planes)
+        ]
+    return planes
+
+
+def assigned(
+    pooled: PooledStripes, planes: Sequence[Plane], tolerance_px: float = TOLERANCE_PX
+) -> IntArray:
+    """Return which plane each point (N,) belongs to; -1 for none, or where stripes cross."""
+    n = len(pooled.patch)
+    if not planes:
+        return np.full(n, -1)
+    residuals = np.abs(plane_residuals_px(pooled.placed, planes))
+    nearest = np.argmin(residuals, axis=1)
+    clear = residuals[np.arange(n), nearest] <= tolerance_px
+    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _CROSSING_PX, axis=1) <= 1
+    laser: IntArray = np.where(clear, nearest, -1)
+    return laser
+
+
+def _crossed_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
+    """Return how far points are from where planes cut their surface, in pixels, (N, L)."""
+    normals = np.array([p.normal for p in planes])
+    offsets = np.array([p.offset for p in planes])
+    gain = np.hypot(placed.by_across @ normals.T, placed.by_along @ normals.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance: FloatArray = np.abs(placed.points_in_dome @ normals.T - offsets) / gain
+    return np.nan_to_num(distance, nan=np.inf)
+
+
+def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine, ...]:
+    """Return lines of which hardly a point was given to a laser."""
+    free = [
+        line
+        for line in lines
+        if len(line.members) >= _LEAST_POINTS and np.mean(laser[line.members] >= 0) < 0.2
+    ]
+    return tuple(sorted(free, key=lambda line: -len(line.members)))

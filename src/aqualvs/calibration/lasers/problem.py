@@ -1,0 +1,304 @@
+"""The joint problem of `calibrate lasers`: corners and stripes, poses, laser sheets and camera.
+
+A stripe's pixel sees one point of a surface of the target; the laser's sheet should pass through
+it. The residual is its distance from the sheet, told in pixels across the stripe as it was
+measured. All of it hangs on the target's pose, on the camera's numbers and on the sheet's.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    StripeGroup,
+    Surfaces,
+    points_on,
+    solve_on_surface,
+)
+from aqualvs.calibration.solver.bundle import Bundle, BundleState, point_by_pose
+from aqualvs.calibration.solver.least_squares import Block, Loss
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Camera, parameter_names
+from aqualvs.optics.rig import LASER_PARAMETERS, tangent_basis
+from aqualvs.optics.sheet import Sheet
+
+N_LASER = len(LASER_PARAMETERS)
+N_SLACK = 3
+SLACK = "slack"
+"""Group of what is said beforehand about how a board lies on its surface."""
+
+
+def stripes_group(i_laser: int) -> str:
+    """Return the name of the group of residuals of a laser."""
+    return f"stripes of laser {i_laser}"
+
+
+@dataclass(frozen=True, slots=True)
+class Slack:
+    """How well a board lies on the surface that its stripes lie on, as standard deviations.
+
+    Attributes
+    ----------
+    tilt : float
+        Of the angle between them about either axis of the board, in radians.
+    offset : float
+        Of the distance at the board's middle, in metres.
+    """
+
+    tilt: float
+    offset: float
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Of a view's slack, shape (3,)."""
+        return np.array([self.tilt, self.tilt, self.offset])
+
+
+@dataclass(frozen=True, slots=True)
+class LaserState:
+    """What is solved for.
+
+    Attributes
+    ----------
+    bundle : BundleState
+        Camera, medium and poses.
+    sheets : tuple of Sheet
+        Light of every laser.
+    slack : array, shape (V, 3)
+        How the surface that stripes lie on differs from the target's own in every view: two tilts
+        about the target's middle (radians), and an offset away from the camera (metres).
+    """
+
+    bundle: BundleState
+    sheets: tuple[Sheet, ...]
+    slack: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Distances:
+    """How far a group's points (N) are from their sheet, and its derivatives."""
+
+    distance: FloatArray
+    by_point: FloatArray
+    by_laser: FloatArray
+    by_water: FloatArray
+    by_air: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LaserProblem:
+    """The problem; see `least_squares.solve`.
+
+    Columns: those of `bundle`, then `LASER_PARAMETERS` of every laser, then, with slack, three of
+    every view.
+
+    Attributes
+    ----------
+    bundle : Bundle
+        Corners and what is known beforehand; all views in its first medium.
+    surfaces : Surfaces
+        Of the target.
+    groups : tuple of StripeGroup
+        Stripes; their residuals come before the corners'.
+    n_lasers : int
+    slack : Slack or None
+        How well the target lies on the surface; None where the target is the surface.
+    """
+
+    bundle: Bundle
+    surfaces: Surfaces
+    groups: tuple[StripeGroup, ...]
+    n_lasers: int
+    slack: Slack | None = None
+
+    @property
+    def n_parameters(self) -> int:
+        """Length of a step."""
+        n_slack = 0 if self.slack is None else N_SLACK * len(self.bundle.views)
+        return self.bundle.n_parameters + N_LASER * self.n_lasers + n_slack
+
+    def laser_columns(self, i_laser: int) -> IntArray:
+        """Return the columns of a laser."""
+        first = self.bundle.n_parameters + N_LASER * i_laser
+        return np.arange(first, first + N_LASER)
+
+    def slack_columns(self, i_view: int) -> IntArray:
+        """Return the columns of a view's slack; none where there is no slack."""
+        if self.slack is None:
+            return np.zeros(0, np.int64)
+        first = self.bundle.n_parameters + N_LASER * self.n_lasers + N_SLACK * i_view
+        return np.arange(first, first + N_SLACK)
+
+    def blocks(self, state: LaserState) -> list[Block]:
+        """Return the residuals of all stripes, then those of the bundle, then of slack."""
+        camera = state.bundle.camera(0)
+        seen = self._seen(state, camera)
+        lit = self._lit(state, [points for points, _ in seen])
+        blocks = [
+            self._stripe_block(group, moves, distances)
+            for group, (_, moves), distances in zip(self.groups, seen, lit, strict=True)
+        ]
+        blocks += self.bundle.blocks(state.bundle)
+        if self.slack is not None:
+            sigma = self.slack.sigmas
+            blocks += [
+                Block(
+                    SLACK,
+                    self.slack_columns(i),
+                    (row / sigma)[None],
+                    np.diag(1.0 / sigma)[None],
+                    Loss.SQUARE,
+                    scaled=False,
+                )
+                for i, row in enumerate(state.slack)
+            ]
+        return blocks
+
+    def moved(self, state: LaserState, step: FloatArray) -> LaserState:
+        """Return the state moved by a step (P,)."""
+        n = self.bundle.n_parameters
+        bundle = self.bundle.moved(state.bundle, step[:n])
+        sheets = []
+        for i, sheet in enumerate(state.sheets):
+            moves = np.zeros(len(sheet.parameter_names))
+            moves[:N_LASER] = step[self.laser_columns(i)]
+            moved = replace(sheet, n_air=bundle.rig.n_air, n_water=float(bundle.media[0]))
+            sheets.append(moved.moved_by(moves))
+        slack = state.slack
+        if self.slack is not None:
+            slack = slack + step[-slack.size :].reshape(slack.shape)
+        return LaserState(bundle, tuple(sheets), slack)
+
+    def surface_planes(self, state: LaserState, i_view: int) -> list[Plane]:
+        """Return the surfaces that stripes lie on in a view, in `dome`."""
+        pose, slack = state.bundle.poses[i_view], state.slack[i_view]
+        planes = [self.surfaces.placed(i, pose) for i in range(len(self.surfaces.planes))]
+        if self.slack is None:
+            return planes
+        middle = pose.apply(self.bundle.views[i_view].view.points.mean(axis=0))
+        return [_slackened(plane, self._tangents(pose), middle, slack) for plane in planes]
+
+    def _tangents(self, pose: SE3) -> FloatArray:
+        """Axes of the tilts in `dome`, (2, 3): fixed to the target."""
+        return pose.rotate(tangent_basis(self.surfaces.planes[0].normal))
+
+    def _seen(self, state: LaserState, camera: Camera) -> list[tuple[FloatArray, FloatArray]]:
+        """Return for every group its points and how they move, see `_moves`."""
+        found: dict[int, tuple[FloatArray, FloatArray]] = {}
+        for i_view in range(len(self.bundle.views)):
+            mine = [i for i, group in enumerate(self.groups) if group.view == i_view]
+            if not mine:
+                continue
+            groups = [self.groups[i] for i in mine]
+            pixels = np.concatenate([group.pixels for group in groups])
+            surface = np.concatenate([group.surface for group in groups])
+            planes = self.surface_planes(state, i_view)
+            points, normals = points_on(camera, pixels, surface, planes)
+            moves = self._moves(i_view, points, normals, camera, state.bundle.poses[i_view])
+            for i, rows in zip(mine, _rows(groups), strict=True):
+                found[i] = points[rows], moves[rows]
+        return [found[i] for i in range(len(self.groups))]
+
+    def _lit(self, state: LaserState, points: Sequence[FloatArray]) -> list[_Distances]:
+        """Return for every group how far its points are from their sheet, with derivatives."""
+        found: dict[int, _Distances] = {}
+        for i_laser, sheet in enumerate(state.sheets):
+            mine = [i for i, group in enumerate(self.groups) if group.laser == i_laser]
+            if not mine:
+                continue
+            distance, by_point, by_laser = sheet.signed_distance_with_parameter_jacobian(
+                np.concatenate([points[i] for i in mine])
+            )
+            by_water = np.zeros(len(distance))
+            if not sheet.is_plane:
+                by_water = by_laser[:, sheet.parameter_names.index("n_water")]
+            by_air = -by_water * (sheet.n_water / sheet.n_air)
+            for i, rows in zip(mine, _rows([self.groups[i] for i in mine]), strict=True):
+                found[i] = _Distances(
+                    distance[rows],
+                    by_point[rows],
+                    by_laser[rows, :N_LASER],
+                    by_water[rows],
+                    by_air[rows],
+                )
+        return [found[i] for i in range(len(self.groups))]
+
+    def _stripe_block(self, group: StripeGroup, moves: FloatArray, lit: _Distances) -> Block:
+        bundle = self.bundle
+        slopes = np.einsum("ni,nic->nc", lit.by_point, moves)
+        # A window bends light by the ratio of the two.
+        if bundle.free_media:
+            slopes[:, len(bundle.free)] += lit.by_water
+        if "n_air" in bundle.free:
+            slopes[:, bundle.free.index("n_air")] += lit.by_air
+        slopes = np.concatenate([slopes, lit.by_laser], axis=1)
+        columns = [
+            np.arange(bundle.n_shared),
+            bundle.pose_columns(group.view),
+            self.slack_columns(group.view),
+            self.laser_columns(group.laser),
+        ]
+        unit = group.gain * group.sigma_px
+        return Block(
+            stripes_group(group.laser),
+            np.concatenate(columns),
+            (lit.distance / unit)[:, None],
+            (slopes / unit[:, None])[:, None, :],
+            # With slack, the noise of stripes is what their residuals cannot tell.
+            scaled=self.slack is None,
+        )
+
+    def _moves(
+        self, i_view: int, points: FloatArray, normals: FloatArray, camera: Camera, pose: SE3
+    ) -> FloatArray:
+        """How points (N, 3, C) move with shared numbers and the pose while their pixels stay."""
+        bundle, view = self.bundle, self.bundle.views[i_view]
+        n_free, n_shared = len(bundle.free), bundle.n_shared
+        n_pose = 0 if view.fixed else 6
+        n_slack = len(self.slack_columns(i_view))
+        right = np.zeros((len(points), 3, n_shared + n_pose + n_slack))
+        if n_shared:
+            _, _, by_point, by_number = camera.project_with_parameter_jacobian(points)
+            names = parameter_names(camera)
+            wanted = [names.index(name) for name in bundle.free]
+            right[:, :2, :n_free] = -by_number[..., wanted]
+            if bundle.free_media:
+                right[:, :2, n_free] = -by_number[..., names.index("n_water")]
+        else:
+            _, _, by_point = camera.project_with_jacobian(points)
+        if n_pose:
+            middle = pose.apply(view.view.points.mean(axis=0))
+            by_pose = point_by_pose(points, middle)
+            right[:, 2, n_shared : n_shared + n_pose] = np.einsum("ni,nic->nc", normals, by_pose)
+        if n_slack:
+            offsets = points - pose.apply(view.view.points.mean(axis=0))
+            right[:, 2, -N_SLACK:-1] = -offsets @ self._tangents(pose).T
+            right[:, 2, -1] = 1.0
+        return solve_on_surface(by_point, normals, right)
+
+
+def _rows(groups: Sequence[StripeGroup]) -> list[slice]:
+    """Return the rows of every group where all are joined."""
+    ends = np.cumsum([0, *[len(group) for group in groups]]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def _slackened(plane: Plane, tangents: FloatArray, middle: FloatArray, slack: FloatArray) -> Plane:
+    """Return the plane tilted about the foot of `middle`, and moved along its normal.
+
+    The normal's length is left to grow, so that slack enters linearly.
+    """
+    foot = middle - float(plane.signed_distance(middle)) * plane.normal
+    normal = plane.normal + slack[:2] @ tangents
+    return Plane(normal, float(normal @ foot) + float(slack[2]))
+
+
+def distances_of(problem: LaserProblem, state: LaserState, group: StripeGroup) -> FloatArray:
+    """Return the distances (B,) of a group's bins from their sheet, in metres."""
+    planes = problem.surface_planes(state, group.view)
+    points, _ = points_on(state.bundle.camera(0), group.pixels, group.surface, planes)
+    return state.sheets[group.laser].signed_distance(points)

@@ -1,0 +1,345 @@
+"""Solving lasers from placed stripes: poses and planes together, in as many rounds as it takes.
+
+Whether the light of a laser behind a window is a plane in the water: by the residuals.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.lasers.checks import contradicts, like, typical_corner_error_px
+from aqualvs.calibration.lasers.covariance import CameraDoubt
+from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
+from aqualvs.calibration.lasers.problem import N_SLACK, LaserProblem, LaserState, Slack
+from aqualvs.calibration.lasers.report import Solved
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    Surfaces,
+    binned,
+    correlation_factor,
+    points_on,
+    with_gain,
+    with_shared_error,
+)
+from aqualvs.calibration.lasers.views import PlacedView, pooled, replaced, split_by_view
+from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
+from aqualvs.calibration.solver.least_squares import solve
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty
+from aqualvs.optics.sheet import Sheet, sheet_in
+
+# Difference of the Bayesian information criterion (Kass & Raftery 1995,
+# doi:10.1080/01621459.1995.10476572) from which the evidence is strong.
+_STRONG = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    rms_px: float
+    n_effective: float
+
+
+def start_sheets(rig: Rig, lasers: Sequence[Laser], *, bent: bool) -> tuple[Sheet, ...]:
+    """Return the sheets to start from: planes, or bent where a laser has a window.
+
+    Parameters
+    ----------
+    rig : Rig
+        In the medium of the pictures.
+    lasers : sequence of Laser
+        `plane` is the one that fits the light in that medium.
+    bent : bool
+        Whether windows count.
+    """
+    sheets = []
+    for laser in lasers:
+        flat = Sheet(plane=laser.plane, window=None, n_air=rig.n_air, n_water=rig.n_water)
+        sheets.append(_bent(rig, laser) if bent and laser.window is not None else flat)
+    return tuple(sheets)
+
+
+def _bent(rig: Rig, laser: Laser) -> Sheet:
+    """Find the plane in air of which the light in the medium is nearly `laser.plane`."""
+    in_air = laser.plane
+    for _ in range(5):
+        sheet = sheet_in(Laser(laser.name, in_air, laser.window), rig.n_air, rig.n_water)
+        reached = like(sheet.best_plane(rig.camera(), rig.working_range), laser.plane)
+        in_air = Plane.from_normal(
+            in_air.normal + laser.plane.normal - reached.normal,
+            in_air.offset + laser.plane.offset - reached.offset,
+        )
+    return sheet_in(Laser(laser.name, in_air, laser.window), rig.n_air, rig.n_water)
+
+
+def choose_sheets(
+    flat: Solved,
+    rig: Rig,
+    lasers: Sequence[Laser],
+    solve_with: Callable[[tuple[Sheet, ...]], Solved],
+) -> tuple[Solved, list[str]]:
+    """Choose plane or bent sheet for every laser that has a window.
+
+    Parameters
+    ----------
+    flat : Solved
+        With all lasers as planes.
+    rig : Rig
+        In the medium of the pictures.
+    lasers : sequence of Laser
+        With their windows, and the planes of `flat`.
+    solve_with : callable
+        Solves again with the sheets it is given as start.
+
+    Returns
+    -------
+    solved : Solved
+        With the chosen sheets.
+    words : list of str
+        For every laser, what was chosen and why.
+    """
+    if all(laser.window is None for laser in lasers):
+        return flat, ["plane"] * len(lasers)
+    bent = solve_with(start_sheets(rig, lasers, bent=True))
+    chosen, words = [], []
+    for i, laser in enumerate(lasers):
+        if laser.window is None:
+            chosen.append(flat.state.sheets[i])
+            words.append("plane")
+            continue
+        keep_window, why = _choice(_fit(flat, i), _fit(bent, i))
+        chosen.append((bent if keep_window else flat).state.sheets[i])
+        words.append(why)
+    return solve_with(tuple(chosen)), words
+
+
+def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
+    # Both have three unknowns, so that only the residuals weigh.
+    n = min(flat.n_effective, bent.n_effective)
+    evidence = 2.0 * n * float(np.log(max(flat.rms_px, 1e-9) / max(bent.rms_px, 1e-9)))
+    residuals = f"residuals {bent.rms_px:.3f} px if bent at the window, {flat.rms_px:.3f} px if not"
+    if evidence > _STRONG:
+        return True, f"bent at its window: {residuals}"
+    if evidence < -_STRONG:
+        return False, f"plane, its window left out: {residuals}"
+    return True, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
+
+
+def _fit(solved: Solved, i_laser: int) -> _Fit:
+    squares: list[FloatArray] = []
+    sequences: list[FloatArray] = []
+    for i in solved.groups_of(laser=i_laser):
+        residuals, inside = solved.stripe_residuals_px(i)
+        squares.append(residuals[inside] ** 2)
+        surface = solved.problem.groups[i].surface
+        known = np.where(inside, residuals, np.nan)
+        sequences += [known[surface == k] for k in np.unique(surface)]
+    everything = np.concatenate(squares)
+    # Bent light fitted by a plane leaves long waves; only their shape counts, not how many points.
+    n_effective = len(everything) / correlation_factor(sequences)
+    return _Fit(float(np.sqrt(np.mean(everything))), n_effective)
+
+
+# A board fixed by hand, of paper or foam: how it lies on a wall.
+_LOOSE = Slack(float(np.deg2rad(1.0)), 2e-3)
+# A laser with fewer points in a view says nothing there.
+_FEWEST_POINTS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What solves begin with.
+
+    Attributes
+    ----------
+    rig : Rig
+        In the medium of the pictures.
+    surfaces : Surfaces
+        Of the target.
+    views : tuple of PlacedView
+    doubt : CameraDoubt or None
+        What is refined along; None where the camera is held.
+    slack : Slack or None
+        How well a board lies on its surface; None where it is the surface.
+    shared_error_px : float
+        What shifts or turns a whole stripe in its picture.
+    """
+
+    rig: Rig
+    surfaces: Surfaces
+    views: tuple[PlacedView, ...]
+    doubt: CameraDoubt | None
+    slack: Slack | None = None
+    shared_error_px: float = 0.0
+
+    def planes(self, view: PlacedView) -> list[Plane]:
+        """Return the surfaces in `dome`."""
+        n = len(self.surfaces.planes)
+        return [self.surfaces.placed(i, view.dome_from_target) for i in range(n)]
+
+    def bundle(self) -> Bundle:
+        """Return the problem of the corners alone."""
+        doubt = self.doubt
+        return Bundle(
+            views=tuple(TargetView(v.view, 0, v.dome_from_target) for v in self.views),
+            free=() if doubt is None else doubt.names,
+            start=self.state(),
+            priors=RigUncertainty.none() if doubt is None else doubt.given,
+            media_sigma=np.array([0.0 if doubt is None else doubt.sigma_medium]),
+        )
+
+    def state(self) -> BundleState:
+        """Return camera, medium and poses to start from."""
+        poses = tuple(v.dome_from_target for v in self.views)
+        return BundleState(self.rig, np.array([self.rig.n_water]), poses)
+
+
+def tolerance_px(lasers: Sequence[Laser]) -> float:
+    """Return how far a stripe may be from its plane to be sorted to it, in pixels."""
+    bent = any(laser.window is not None for laser in lasers)
+    return BENT_TOLERANCE_PX if bent else TOLERANCE_PX
+
+
+def solve_lasers(
+    start: Start, lasers: Sequence[Laser], laser_of: IntArray, loose: bool | None
+) -> tuple[Solved, list[str]]:
+    """Solve lasers: first as planes, then with points sorted anew by those, then their sheets.
+
+    Parameters
+    ----------
+    start : Start
+    lasers : sequence of Laser
+        `plane` fits the light in the medium of the pictures roughly.
+    laser_of : int array, shape (N,)
+        Which laser each stripe point of all views is of; -1 for none.
+    loose : bool or None
+        As `LaserOptions.loose`.
+
+    Returns
+    -------
+    solved : Solved
+    words : list of str
+        For every laser, which sheet was taken and why.
+    """
+    names = [laser.name for laser in lasers]
+    first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of, names)
+    if len(start.surfaces.planes) == 1 and (contradicts(first) if loose is None else loose):
+        error = typical_corner_error_px(start.views)
+        again = replace(start, slack=_LOOSE, shared_error_px=error)
+    else:
+        again, laser_of = _sorted_again(start, first, laser_of, tolerance_px(lasers))
+    flat = _solve_from(again, first.state.sheets, laser_of, names)
+    found = [
+        replace(laser, plane=sheet.plane)
+        for laser, sheet in zip(lasers, flat.state.sheets, strict=True)
+    ]
+    return choose_sheets(
+        flat, start.rig, found, lambda sheets: _solve_from(again, sheets, laser_of, names)
+    )
+
+
+def _sorted_again(
+    start: Start, solved: Solved, laser_of: IntArray, tolerance: float
+) -> tuple[Start, IntArray]:
+    """Return the start with solved poses, and which laser each point is of by solved planes.
+
+    Both as they were if a laser would lose its points by it.
+    """
+    state = solved.state
+    camera = state.bundle.camera(0)
+    views = tuple(
+        replaced(camera, view, pose, start.surfaces)
+        for view, pose in zip(start.views, state.bundle.poses, strict=True)
+    )
+    planes = [sheet.plane for sheet in state.sheets]
+    sorted_anew = assigned(pooled(views, start.surfaces), planes, tolerance)
+    counts = np.bincount(sorted_anew[sorted_anew >= 0], minlength=len(planes))
+    if counts.min() < _FEWEST_POINTS:
+        return start, laser_of
+    return replace(start, views=views), sorted_anew
+
+
+def _solve_from(
+    start: Start, sheets: tuple[Sheet, ...], laser_of: IntArray, names: Sequence[str]
+) -> Solved:
+    camera, groups = start.rig.camera(), []
+    for i_view, mine in enumerate(split_by_view(laser_of, start.views)):
+        view = start.views[i_view]
+        planes = start.planes(view)
+        for i_laser, sheet in enumerate(sheets):
+            members = np.flatnonzero(mine == i_laser)
+            if len(members) >= _FEWEST_POINTS:
+                stripes = view.stripes.at(view.placed.index[members])
+                group = binned(i_view, i_laser, stripes, view.placed.surface[members])
+                group = with_shared_error(group, start.shared_error_px)
+                groups.append(with_gain(group, camera, planes, sheet))
+    problem = LaserProblem(start.bundle(), start.surfaces, tuple(groups), len(sheets), start.slack)
+    slack = np.zeros((len(start.views), N_SLACK))
+    state = LaserState(start.state(), sheets, slack)
+    solution = solve(problem, state, remedy=lambda i: free_words(problem, names, start.views, i))
+    return Solved(problem, solution, start.views)
+
+
+def free_words(
+    problem: LaserProblem, names: Sequence[str], views: Sequence[PlacedView], parameter: int
+) -> str:
+    """Return what to do about a parameter of the problem that the pictures do not tell.
+
+    Parameters
+    ----------
+    problem : LaserProblem
+    names : sequence of str
+        Of the lasers.
+    views : sequence of PlacedView
+        The pictures.
+    parameter : int
+        Its column.
+    """
+    for i, name in enumerate(names):
+        if parameter in problem.laser_columns(i):
+            seen = [group for group in problem.groups if group.laser == i]
+            points = sum(int(group.counts.sum()) for group in seen)
+            return (
+                f"laser '{name}' cannot be solved from its {points} points in {len(seen)} "
+                "pictures; take more pictures in which its stripe crosses the target, with the "
+                "target nearer, farther and tilted, or correct the number of lasers (--lasers N)"
+            )
+    for i, view in enumerate(views):
+        if parameter in problem.bundle.pose_columns(i):
+            return (
+                f"{view.view.name}: its {len(view.view)} corners do not tell where the target is; "
+                "leave this picture out, or show more of the target in it"
+            )
+    return (
+        "the pictures do not tell the camera's numbers that are to be refined; leave --refine "
+        "out, or add pictures with the target nearer, farther and tilted"
+    )
+
+
+def paper_planes(solved: Solved) -> list[Plane]:
+    """Return the planes of all lasers by the paper's way (Eq. 33-36)."""
+    camera = solved.problem.bundle.start.camera(0)
+    surfaces, planes = solved.problem.surfaces, []
+    spatial = [
+        [surfaces.placed(i, view.spatial.dome_from_target) for i in range(len(surfaces.planes))]
+        for view in solved.views
+    ]
+    for i, sheet in enumerate(solved.state.sheets):
+        groups = [solved.problem.groups[k] for k in solved.groups_of(laser=i)]
+        points = [
+            points_on(camera, group.pixels, group.surface, spatial[group.view])[0]
+            for group in groups
+        ]
+        planes.append(like(paper_plane(np.concatenate(points)), sheet.plane))
+    return planes
+
+
+def paper_plane(points_in_dome: FloatArray) -> Plane:
+    """Fit a plane to points (N, 3) by the paper's pseudo-inverse (Eq. 35-36).
+
+    It minimises neither distances in space nor in the picture, and fails for planes through the
+    dome's centre; kept for comparison.
+    """
+    finite = points_in_dome[np.all(np.isfinite(points_in_dome), axis=1)]
+    normal_over_offset = np.linalg.lstsq(finite, np.ones(len(finite)), rcond=None)[0]
+    return Plane.from_normal(normal_over_offset, 1.0)

@@ -1,0 +1,512 @@
+"""Which surface of a target a stripe's light lies on, and where.
+
+What one picture says of the lasers: points on stripes, whichever laser drew them.
+
+Stripe points of one laser in one picture, in bins: what the joint problem measures.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane, Rays
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.sheet import Sheet
+
+
+@dataclass(frozen=True, slots=True)
+class StripePoints:
+    """Points on laser stripes, found in one picture.
+
+    Attributes
+    ----------
+    name : str
+        File name of the picture, for messages and reports.
+    pixels : array, shape (N, 2)
+        Sub-pixel centres, in `image`.
+    across : array, shape (N, 2)
+        Unit vectors in `image` at right angles to the stripe: only along these is a point measured.
+    chain : int array, shape (N,)
+        Which unbroken piece of a stripe a point belongs to; pieces may bend.
+    sigma_px : array, shape (N,)
+        Nominal standard deviation along `across`; solves estimate the real one.
+    """
+
+    name: str
+    pixels: FloatArray
+    across: FloatArray
+    chain: IntArray
+    sigma_px: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.chain)
+
+    def thinned(self, n_points: int) -> "StripePoints":
+        """Return every second, third... point, so that hardly more than `n_points` are left."""
+        every = -(-len(self) // n_points) if len(self) else 1
+        return self if every == 1 else self.where(np.arange(len(self)) % every == 0)
+
+    def where(self, keep: BoolArray) -> "StripePoints":
+        """Return the points that `keep` (N,) marks."""
+        return self.at(np.flatnonzero(keep))
+
+    def at(self, index: IntArray) -> "StripePoints":
+        """Return the points with these indices (M,)."""
+        return StripePoints(
+            self.name,
+            self.pixels[index],
+            self.across[index],
+            self.chain[index],
+            self.sigma_px[index],
+        )
+
+
+# Points this near to where two surfaces meet may be light of the other one, or of both.
+_EDGE = 0.006
+# An open side of a box ends this share of the box's size beyond the outermost marker.
+_RIM_SHARE = 0.02
+_ON_PLANE = 1e-4
+_PIXEL_STEPS: FloatArray = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Surfaces:
+    """The flat surfaces of a target that stripes are seen on, in the target's frame.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What messages call them.
+    planes : tuple of Plane
+        Normals point away from the side that is seen.
+    lowest, highest : array, shape (3,)
+        Stripes outside these bounds, in metres, lie on something else.
+    """
+
+    names: tuple[str, ...]
+    planes: tuple[Plane, ...]
+    lowest: FloatArray
+    highest: FloatArray
+
+    def hits(self, rays_in_target: Rays) -> tuple[FloatArray, IntArray]:
+        """Find where rays meet the surfaces.
+
+        Returns
+        -------
+        points : array, shape (N, 3)
+            In the target's frame; NaN where a ray meets none.
+        surface : int array, shape (N,)
+            Index of the surface; -1 where there is none, or the hit lies near another surface.
+        """
+        n = len(rays_in_target.origins)
+        points, surface = np.full((n, 3), np.nan), np.full(n, -1)
+        for i, plane in enumerate(self.planes):
+            there, valid = plane.intersect(rays_in_target)
+            valid &= rays_in_target.directions @ plane.normal > 0.0
+            valid &= self._inside(there, i) & (surface < 0)
+            points[valid], surface[valid] = there[valid], i
+        return points, surface
+
+    def placed(self, i_surface: int, dome_from_target: SE3) -> Plane:
+        """Return the plane of a surface in `dome`."""
+        plane = self.planes[i_surface]
+        normal = dome_from_target.rotate(plane.normal)
+        return Plane(normal, plane.offset + float(normal @ dome_from_target.translation))
+
+    def _inside(self, points: FloatArray, i_own: int) -> BoolArray:
+        with np.errstate(invalid="ignore"):
+            inside: BoolArray = np.all((points >= self.lowest) & (points <= self.highest), axis=1)
+            for i, plane in enumerate(self.planes):
+                if i != i_own:
+                    inside &= plane.signed_distance(points) <= -_EDGE
+        return inside
+
+
+def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> Surfaces:
+    """Return the surfaces of an open box.
+
+    Parameters
+    ----------
+    planes : mapping of str to Plane
+        In `box`; normals may point either way. Surfaces end where they meet.
+    points : array, shape (N, 3)
+        All corners of all markers, in `box`. On its open sides the box is taken to end just beyond
+        the outermost of them, along the axes of `box`.
+
+    Raises
+    ------
+    CalibrationError
+        If there are fewer than two planes, or markers on both sides of one.
+    """
+    if len(planes) < 2:
+        raise CalibrationError(
+            f"the box has {len(planes)} plane; a laser's plane needs stripes on two or more"
+        )
+    outward = []
+    for name, plane in planes.items():
+        beyond = plane.signed_distance(points)
+        if beyond.max() > _ON_PLANE and beyond.min() < -_ON_PLANE:
+            raise CalibrationError(
+                f"plane '{name}' of the box has markers {beyond.max() * 1e3:.1f} mm on one side "
+                f"and {-beyond.min() * 1e3:.1f} mm on the other; correct its normal, its d, or "
+                "the markers' corners"
+            )
+        outward.append(plane if beyond.max() <= _ON_PLANE else Plane(-plane.normal, -plane.offset))
+    lowest, highest = points.min(axis=0), points.max(axis=0)
+    rim = _RIM_SHARE * float(np.max(highest - lowest))
+    return Surfaces(tuple(planes), tuple(outward), lowest - rim, highest + rim)
+
+
+def board_surface(*, thickness: float = 0.0) -> Surfaces:
+    """Return the surface that a board lies on, with its stripes beside or on the board.
+
+    Parameters
+    ----------
+    thickness : float
+        How far the board's printed face stands in front of the surface that the stripes lie on, in
+        metres; 0 where the print is on the surface itself.
+    """
+    far = np.full(3, np.inf)
+    # A board's z axis points into it (OpenCV).
+    return Surfaces(("board",), (Plane(np.array([0.0, 0.0, 1.0]), thickness),), -far, far)
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedStripes:
+    """Stripe points of one picture on the surfaces of its target, N of them.
+
+    Attributes
+    ----------
+    index : int array, shape (N,)
+        Which of the `StripePoints` they are: those that lie on a surface.
+    surface : int array, shape (N,)
+        Index into `Surfaces`.
+    points_in_dome : array, shape (N, 3)
+        In metres.
+    by_pixel : array, shape (N, 3, 2)
+        How a point moves on its surface with its pixel, metres per pixel.
+    across : array, shape (N, 2)
+        As `StripePoints.across`.
+    """
+
+    index: IntArray
+    surface: IntArray
+    points_in_dome: FloatArray
+    by_pixel: FloatArray
+    across: FloatArray
+
+    @property
+    def by_across(self) -> FloatArray:
+        """How points move on their surface with their pixel across the stripe, shape (N, 3)."""
+        moved: FloatArray = np.einsum("nij,nj->ni", self.by_pixel, self.across)
+        return moved
+
+    @property
+    def by_along(self) -> FloatArray:
+        """How points move on their surface with their pixel along the stripe, shape (N, 3)."""
+        along = np.stack([-self.across[:, 1], self.across[:, 0]], axis=-1)
+        moved: FloatArray = np.einsum("nij,nj->ni", self.by_pixel, along)
+        return moved
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.index)
+
+
+@dataclass(frozen=True, slots=True)
+class PooledStripes:
+    """Stripe points of all views, on all surfaces.
+
+    Attributes
+    ----------
+    placed : PlacedStripes
+        N points of all views; `index` counts within each view.
+    patch : int array, shape (N,)
+        Which surface of which view a point lies on, counted through.
+    patch_planes : tuple of Plane
+        Surface of every patch, in `dome`.
+    view : int array, shape (N,)
+        Which view a point is of.
+    points_in_target : array, shape (N, 3)
+        In metres.
+    on_target : bool array, shape (N,)
+        Whether a point lies within the bounds of the target's corners, and not beside them.
+    chain : int array, shape (N,)
+        Unbroken piece of a stripe, counted through all views.
+    """
+
+    placed: PlacedStripes
+    patch: IntArray
+    patch_planes: tuple[Plane, ...]
+    view: IntArray
+    points_in_target: FloatArray
+    on_target: BoolArray
+    chain: IntArray
+
+
+def place_stripes(
+    camera: Camera, stripes: StripePoints, dome_from_target: SE3, surfaces: Surfaces
+) -> PlacedStripes:
+    """Find the surface and place of every stripe point (paper, Eq. 34).
+
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    stripes : StripePoints
+        Of the picture.
+    dome_from_target : SE3
+        Pose of the target in it.
+    surfaces : Surfaces
+        Of the target.
+
+    Returns
+    -------
+    PlacedStripes
+        Only points that lie on a surface and not near its edge to another.
+    """
+    rays = camera.rays(stripes.pixels)
+    target_from_dome = dome_from_target.inverse()
+    in_target = Rays(
+        target_from_dome.apply(rays.origins),
+        target_from_dome.rotate(rays.directions),
+        rays.valid,
+    )
+    points, surface = surfaces.hits(in_target)
+    index = np.flatnonzero(surface >= 0)
+    points_in_dome = dome_from_target.apply(points[index])
+    normals = np.stack([dome_from_target.rotate(p.normal) for p in surfaces.planes])
+    _, _, by_point = camera.project_with_jacobian(points_in_dome)
+    by_pixel = solve_on_surface(by_point, normals[surface[index]], _PIXEL_STEPS)
+    seen = np.all(np.isfinite(by_pixel), axis=(1, 2))
+    index = index[seen]
+    return PlacedStripes(
+        index, surface[index], points_in_dome[seen], by_pixel[seen], stripes.across[index]
+    )
+
+
+def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the moves (N, 3, K) of points on surfaces that bring about given changes.
+
+    Parameters
+    ----------
+    by_point : array, shape (N, 2, 3)
+        Derivative of the projection.
+    normals : array, shape (N, 3)
+        Of the surfaces, in `dome`.
+    right : array, shape (N, 3, K) or (3, K)
+        Changes of the pixel's x and y, and of the distance along the normal.
+
+    Notes
+    -----
+    The inverse of the projection within the surface: three equations for a point's three
+    coordinates, two of them the pixel's.
+    """
+    system = np.concatenate([by_point, normals[:, None, :]], axis=1)
+    finite = np.all(np.isfinite(system), axis=(1, 2))
+    system[~finite] = np.eye(3)
+    moved: FloatArray = np.linalg.solve(
+        system, np.broadcast_to(right, (len(system), *right.shape[-2:]))
+    )
+    moved[~finite] = np.nan
+    return moved
+
+
+BIN_PX = 12.0
+"""Neighbouring points share speckle, paint and blur; so many pixels along count as one."""
+# A gap of more pixels than this along a stripe ends a bin.
+_GAP_PX = 10.0
+# Autocorrelation is looked at over so many bins, each from so many pairs at least.
+_MAX_LAG, _LEAST_PAIRS = 12, 20
+
+
+@dataclass(frozen=True, slots=True)
+class StripeGroup:
+    """Bins of points of one laser in one view, B of them, along each surface in turn.
+
+    Attributes
+    ----------
+    view, laser : int
+        Which.
+    pixels : array, shape (B, 2)
+        Means of the points' centres, weighed by their noise, in `image`.
+    across : array, shape (B, 2)
+        As `StripePoints`.
+    surface : int array, shape (B,)
+        Index into `Surfaces`.
+    sigma_px : array, shape (B,)
+        Nominal noise across the stripe.
+    counts : int array, shape (B,)
+        Number of points in every bin.
+    gain : array, shape (B,)
+        How far the point moves away from the sheet as its pixel moves across the stripe, metres
+        per pixel; taken at the start and held, so that residuals stay plain squares.
+    """
+
+    view: int
+    laser: int
+    pixels: FloatArray
+    across: FloatArray
+    surface: IntArray
+    sigma_px: FloatArray
+    counts: IntArray
+    gain: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of bins."""
+        return len(self.counts)
+
+
+def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -> StripeGroup:
+    """Put the points of one stripe into bins along it.
+
+    Parameters
+    ----------
+    i_view, i_laser : int
+        Which view and laser.
+    points : StripePoints
+        Of that laser alone, N of them.
+    surface : int array, shape (N,)
+        Which surface each lies on.
+
+    Returns
+    -------
+    StripeGroup
+        With a gain of 1.
+
+    Notes
+    -----
+    Within a bin a stripe is straight to a hundredth of a pixel, so that means of pixels stand for
+    means of residuals.
+    """
+    order, starts = _ordered(points.pixels, surface)
+    weights = 1.0 / points.sigma_px[order] ** 2
+    total = np.add.reduceat(weights, starts)
+    counts = np.diff(np.append(starts, len(order)))
+
+    def mean(values: FloatArray) -> FloatArray:
+        summed = np.add.reduceat(values[order] * weights[:, None], starts, axis=0)
+        result: FloatArray = summed / total[:, None]
+        return result
+
+    # Stripes found along x and along y may have opposite signs.
+    along_first = np.sign(points.across @ points.across[0])
+    across = mean(points.across * np.where(along_first < 0.0, -1.0, 1.0)[:, None])
+    return StripeGroup(
+        view=i_view,
+        laser=i_laser,
+        pixels=mean(points.pixels),
+        across=across / np.linalg.norm(across, axis=1, keepdims=True),
+        surface=surface[order][starts],
+        # A full bin counts as one point, for its points share most of their error.
+        sigma_px=np.sqrt(counts.max() / total),
+        counts=counts.astype(np.int64),
+        gain=np.ones(len(starts)),
+    )
+
+
+def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the order of points along their stripe, surface by surface, and bins' first places."""
+    order, starts, n = [], [], 0
+    for i in np.unique(surface):
+        mine = np.flatnonzero(surface == i)
+        offsets = pixels[mine] - pixels[mine].mean(axis=0)
+        way = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][0]
+        along = np.argsort(way, kind="stable")
+        order.append(mine[along])
+        first = last = -np.inf
+        for k, here in enumerate(way[along].tolist()):
+            if here - first >= BIN_PX or here - last > _GAP_PX:
+                starts.append(n + k)
+                first = here
+            last = here
+        n += len(mine)
+    return np.concatenate(order), np.array(starts, np.int64)
+
+
+def points_on(
+    camera: Camera, pixels: FloatArray, surface: IntArray, planes: Sequence[Plane]
+) -> tuple[FloatArray, FloatArray]:
+    """Return where pixels meet their surfaces, and the surfaces' normals, (N, 3) each.
+
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    pixels : array, shape (N, 2)
+        Of the picture.
+    surface : int array, shape (N,)
+        Index into `planes`.
+    planes : sequence of Plane
+        The target's surfaces in `dome`; their normals need not be units.
+    """
+    rays = camera.rays(pixels)
+    normals = np.stack([plane.normal for plane in planes])[surface]
+    offsets = np.array([plane.offset for plane in planes])[surface]
+    ahead = np.einsum("ni,ni->n", rays.directions, normals)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (offsets - np.einsum("ni,ni->n", rays.origins, normals)) / ahead
+    return rays.points_at(distance), normals
+
+
+def with_gain(
+    group: StripeGroup, camera: Camera, planes: Sequence[Plane], sheet: Sheet
+) -> StripeGroup:
+    """Return the group with its gain by the present surfaces and sheet."""
+    points, normals = points_on(camera, group.pixels, group.surface, planes)
+    _, _, by_point = camera.project_with_jacobian(points)
+    right = np.concatenate([group.across, np.zeros((len(points), 1))], axis=1)[..., None]
+    by_across = solve_on_surface(by_point, normals, right)[..., 0]
+    gain = np.einsum("ni,ni->n", sheet.gradient(points), by_across)
+    return replace(group, gain=np.abs(gain))
+
+
+def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
+    """Return the group with the noise of its bins raised by an error that they share.
+
+    Parameters
+    ----------
+    group : StripeGroup
+    error_px : float
+        Standard deviation of what shifts and turns the whole stripe in its picture. All bins
+        together then tell a place and a direction no better than that.
+    """
+    shared = error_px * np.sqrt(0.5 * len(group))
+    return replace(group, sigma_px=np.hypot(group.sigma_px, shared))
+
+
+def correlation_factor(sequences: Sequence[FloatArray]) -> float:
+    """Return by how much the variance of a mean exceeds that of independent values.
+
+    Parameters
+    ----------
+    sequences : sequence of array, shape (B,)
+        Residuals in order along stripes; NaN where there is none.
+
+    Notes
+    -----
+    One plus twice the sum of autocorrelations, up to the first that is not positive (Geyer 1992,
+    doi:10.1214/ss/1177011137, initial positive sequence). At least 1.
+    """
+    products = np.zeros(_MAX_LAG + 1)
+    pairs = np.zeros(_MAX_LAG + 1)
+    for values in sequences:
+        known = np.isfinite(values)
+        filled = np.where(known, values, 0.0)
+        for lag in range(min(_MAX_LAG + 1, len(values))):
+            end = len(values) - lag
+            products[lag] += float(filled[:end] @ filled[lag:])
+            pairs[lag] += float(np.count_nonzero(known[:end] & known[lag:]))
+    if products[0] <= 0.0:
+        return 1.0
+    factor = 1.0
+    for lag in range(1, _MAX_LAG + 1):
+        if pairs[lag] < _LEAST_PAIRS or products[lag] <= 0.0:
+            break
+        factor += 2.0 * (products[lag] / pairs[lag]) / (products[0] / pairs[0])
+    return factor

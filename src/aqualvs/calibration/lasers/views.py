@@ -1,0 +1,303 @@
+"""The pictures of a laser calibration: where the vehicle was in each, and what its stripes lit.
+
+Where the vehicle is in a box of markers: the paper's least squares of distances in space.
+
+The paper minimises V (Eq. 32-33) over the pose and the distance along every ray; each distance has
+a closed form, so that V is the sum of squared distances of the markers' corners from their rays.
+Reprojection weighs corners as they are measured, in pixels, and is better; both are reported.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.lasers.stripes_on_planes import (
+    PlacedStripes,
+    PooledStripes,
+    StripePoints,
+    Surfaces,
+    place_stripes,
+)
+from aqualvs.calibration.solver.bundle import moved_target, point_by_pose
+from aqualvs.calibration.solver.initial_pose import target_pose
+from aqualvs.calibration.targets.targets import View
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Camera
+
+# A corner belongs to a plane of the box that it is this near to, in metres.
+_ON_PLANE = 1e-4
+_MAX_STEPS = 50
+_SMALL_TURN, _SMALL_SHIFT = 1e-10, 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialPose:
+    """A pose by the paper's cost function.
+
+    Attributes
+    ----------
+    dome_from_target : SE3
+        The inverse of the paper's (S^G, R_S^G).
+    cost : float
+        V of Eq. 32 at its minimum, in square metres.
+    rms : float
+        Root mean square distance of corners from their rays, in metres.
+    """
+
+    dome_from_target: SE3
+    cost: float
+    rms: float
+
+
+def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
+    """Minimise the paper's V (Eq. 32-33).
+
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    view : View
+        Corners that are believed; this cost has no defence against wrong ones.
+    start : SE3
+        `dome_from_target` near the solution.
+
+    Returns
+    -------
+    SpatialPose
+
+    Raises
+    ------
+    CalibrationError
+        If fewer than three corners have rays (the paper's least number).
+    """
+    rays = camera.rays(view.pixels)
+    n = int(np.count_nonzero(rays.valid))
+    if n < 3:
+        raise CalibrationError(f"{view.name}: {n} corners can be used but a pose needs 3")
+    origins, directions = rays.origins[rays.valid], rays.directions[rays.valid]
+    points = view.points[rays.valid]
+    # The closed form of lambda leaves of every equation what is at right angles to its ray.
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    middle, pose = points.mean(axis=0), start
+    for _ in range(_MAX_STEPS):
+        in_dome = pose.apply(points)
+        rows = np.einsum("nij,nj->ni", across, in_dome - origins).reshape(-1)
+        slopes = (across @ point_by_pose(in_dome, pose.apply(middle))).reshape(-1, 6)
+        step = -np.linalg.lstsq(slopes, rows, rcond=None)[0]
+        pose = moved_target(pose, middle, step)
+        if np.all(np.abs(step[:3]) < _SMALL_TURN) and np.all(np.abs(step[3:]) < _SMALL_SHIFT):
+            break
+    missed = np.einsum("nij,nj->ni", across, pose.apply(points) - origins)
+    cost = float(np.sum(missed**2))
+    return SpatialPose(pose, cost, float(np.sqrt(cost / n)))
+
+
+def planes_with_points(view: View, planes: Sequence[Plane]) -> tuple[int, ...]:
+    """Return which of a target's planes the view's points lie on, three or more each."""
+    near = [np.abs(plane.signed_distance(view.points)) < _ON_PLANE for plane in planes]
+    return tuple(i for i, on in enumerate(near) if np.count_nonzero(on) >= 3)
+
+
+def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
+    """Return by how much two poses differ: angle (radians), and shift of a point `middle` (m)."""
+    turn = a.rotation @ b.rotation.T
+    # Accurate near zero, unlike the arc cosine of the trace.
+    sine = 0.5 * np.linalg.norm(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    angle = float(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0)))
+    return angle, float(np.linalg.norm(a.apply(middle) - b.apply(middle)))
+
+
+_FEWEST_CORNERS = 4
+# Neighbouring points of a stripe say much the same.
+_ENOUGH_POINTS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class LaserView:
+    """One picture: points of the target, and of stripes on it.
+
+    Attributes
+    ----------
+    view : View
+        Corners of markers or of the board.
+    stripes : StripePoints
+        Of all lasers together.
+    """
+
+    view: View
+    stripes: StripePoints
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedView:
+    """A picture with the target's pose in it.
+
+    Attributes
+    ----------
+    view : View
+        Corners that were believed.
+    stripes : StripePoints
+        As found.
+    dome_from_target : SE3
+        By reprojection.
+    spatial : SpatialPose
+        By the paper's cost.
+    placed : PlacedStripes
+        Stripe points on the target's surfaces.
+    n_corners_rejected : int
+        Corners that were not believed.
+    rms_px : float
+        Root mean square distance of the corners from where the pose by them alone puts them.
+    """
+
+    view: View
+    stripes: StripePoints
+    dome_from_target: SE3
+    spatial: SpatialPose
+    placed: PlacedStripes
+    n_corners_rejected: int
+    rms_px: float
+
+
+def place_views(
+    camera: Camera, views: Sequence[LaserView], surfaces: Surfaces
+) -> tuple[list[PlacedView], list[str]]:
+    """Find the pose of every picture, and its stripes on the surfaces.
+
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the pictures.
+    views : sequence of LaserView
+        One for each picture.
+    surfaces : Surfaces
+        Of the target. Where it has several, markers must be seen on two or more.
+
+    Returns
+    -------
+    placed : list of PlacedView
+    left_out : list of str
+        Why others could not be used, in words, the picture's name first.
+
+    Raises
+    ------
+    CalibrationError
+        If no picture can be used.
+    """
+    found, left_out = [], []
+    for view in views:
+        try:
+            found.append(_placed_view(camera, view, surfaces))
+        except CalibrationError as fault:
+            left_out.append(str(fault))
+    if not found:
+        few = f" (and {len(left_out) - 1} others likewise)" if len(left_out) > 1 else ""
+        reason = left_out[0] if left_out else "no pictures were given"
+        raise CalibrationError(f"no picture can be used: {reason}{few}")
+    return found, left_out
+
+
+def _placed_view(camera: Camera, laser_view: LaserView, surfaces: Surfaces) -> PlacedView:
+    view = laser_view.view
+    if len(view) < _FEWEST_CORNERS:
+        raise CalibrationError(
+            f"{view.name}: {len(view)} corners of the target found; show more of it, with better "
+            "light, or check the family and sizes in its file"
+        )
+    pose = target_pose(camera, view)
+    believed = view.where(pose.inliers)
+    if len(surfaces.planes) > 1:
+        _check_surfaces(believed, surfaces)
+    elif pose.ambiguous:
+        raise CalibrationError(
+            f"{view.name}: the board could lean either way; take this picture from nearer, or "
+            "more from the side"
+        )
+    return replaced(
+        camera,
+        PlacedView(
+            believed,
+            laser_view.stripes.thinned(_ENOUGH_POINTS),
+            pose.dome_from_target,
+            spatial_pose(camera, believed, pose.dome_from_target),
+            _none(),
+            len(view) - len(believed),
+            pose.rms_px,
+        ),
+        pose.dome_from_target,
+        surfaces,
+    )
+
+
+def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: Surfaces) -> PlacedView:
+    """Return the picture with another pose, and its stripes where that puts them."""
+    placed = place_stripes(camera, view.stripes, pose, surfaces)
+    return replace(view, dome_from_target=pose, placed=placed)
+
+
+def _check_surfaces(view: View, surfaces: Surfaces) -> None:
+    seen = planes_with_points(view, surfaces.planes)
+    if len(seen) < 2:
+        where = f"plane '{surfaces.names[seen[0]]}' only" if seen else "none of the planes"
+        raise CalibrationError(
+            f"{view.name}: markers are seen on {where}; turn the vehicle so that markers on two "
+            "planes of the box are in the picture"
+        )
+
+
+def _none() -> PlacedStripes:
+    return PlacedStripes(
+        np.zeros(0, np.int64),
+        np.zeros(0, np.int64),
+        np.zeros((0, 3)),
+        np.zeros((0, 3, 2)),
+        np.zeros((0, 2)),
+    )
+
+
+def pooled(views: Sequence[PlacedView], surfaces: Surfaces) -> PooledStripes:
+    """Return the stripe points of all pictures as one."""
+    n_surfaces = len(surfaces.planes)
+    parts = [view.placed for view in views]
+    placed = PlacedStripes(
+        np.concatenate([p.index for p in parts]),
+        np.concatenate([p.surface for p in parts]),
+        np.concatenate([p.points_in_dome for p in parts]),
+        np.concatenate([p.by_pixel for p in parts]),
+        np.concatenate([p.across for p in parts]),
+    )
+    patch = [p.surface + n_surfaces * i for i, p in enumerate(parts)]
+    planes: list[Plane] = []
+    chain, first = [], 0
+    for view in views:
+        planes += [surfaces.placed(i, view.dome_from_target) for i in range(n_surfaces)]
+        chain.append(view.stripes.chain[view.placed.index] + first)
+        first += int(view.stripes.chain.max(initial=-1)) + 1
+    in_target = np.concatenate(
+        [v.dome_from_target.inverse().apply(v.placed.points_in_dome) for v in views]
+    )
+    corners = np.concatenate([v.view.points for v in views])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # A flat target has bounds along its face only.
+    inside = np.all((in_target >= low) & (in_target <= high) | (high <= low), axis=1)
+    return PooledStripes(
+        placed,
+        np.concatenate(patch),
+        tuple(planes),
+        np.repeat(np.arange(len(views)), [len(p) for p in parts]),
+        in_target,
+        inside,
+        np.concatenate(chain),
+    )
+
+
+def split_by_view(values: IntArray, views: Sequence[PlacedView]) -> list[IntArray]:
+    """Return what belongs to each picture of values (N,) of all points."""
+    ends = np.cumsum([len(view.placed) for view in views])[:-1]
+    return np.split(values, ends)

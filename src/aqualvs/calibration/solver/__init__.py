@@ -1,0 +1,1 @@
+"""Least squares with an honest covariance: residual blocks, bundle adjustment, priors."""

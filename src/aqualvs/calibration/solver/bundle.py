@@ -1,0 +1,325 @@
+"""Bundle adjustment through the dome: views of targets, one camera, one or several media.
+
+The one problem behind `calibrate camera`, `calibrate dome` and the poses of `calibrate lasers`:
+reprojection residuals of all corners, with analytic derivatives by the camera's numbers, the media
+outside and the targets' poses.
+
+Small changes of a target's pose, in which poses are solved and their covariance is told.
+
+Reprojection residuals of many views at once, with derivatives by camera, medium and poses.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from aqualvs.calibration.solver.least_squares import Block
+from aqualvs.calibration.solver.priors import PRIORS, media_prior, rig_difference, rig_prior
+from aqualvs.calibration.targets.targets import View
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, skew
+from aqualvs.optics.camera import Camera, parameter_names
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
+
+
+def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
+    """Return `dome_from_target` turned about a point of the target, then shifted.
+
+    Parameters
+    ----------
+    pose : SE3
+    middle : array, shape (3,)
+        In the target's frame; stays in its place under the turn.
+    step : array, shape (6,)
+        Rotation vector (radians) and shift (metres), both in `dome`.
+    """
+    return _moved(pose, middle, rotation_from_rotvec(step[:3]), step[3:])
+
+
+def moved_targets(
+    poses: Sequence[SE3], middles: Sequence[FloatArray], steps: FloatArray
+) -> list[SE3]:
+    """Return several poses, each moved by its own of the steps (N, 6), as `moved_target` does."""
+    turns = rotation_from_rotvec(steps[:, :3])
+    moves = zip(poses, middles, turns, steps[:, 3:], strict=True)
+    return [_moved(pose, middle, turn, shift) for pose, middle, turn, shift in moves]
+
+
+def _moved(pose: SE3, middle: FloatArray, turn: FloatArray, shift: FloatArray) -> SE3:
+    arm = pose.rotation @ middle
+    # The middle lies at arm + translation, and stays there under the turn.
+    return SE3(turn @ pose.rotation, arm - turn @ arm + pose.translation + shift)
+
+
+def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
+    """Return the derivative (N, 3, 6) of points by the step of `moved_target` at zero.
+
+    Parameters
+    ----------
+    points_in_dome : array, shape (N, 3)
+        Points of the target.
+    centre : array, shape (3,)
+        What the target turns about, in `dome`.
+    """
+    by_pose = np.zeros((len(points_in_dome), 3, 6))
+    by_pose[:, :, :3] = -skew(points_in_dome - centre)
+    by_pose[:, :, 3:] = np.eye(3)
+    return by_pose
+
+
+CORNERS = "corners"
+CORNER_SIGMA_PX = 0.1
+"""Nominal noise of a corner; solves estimate the real one."""
+
+
+@dataclass(frozen=True, slots=True)
+class PosedView:
+    """A view, where its target is taken to be, and where its derivatives belong.
+
+    Attributes
+    ----------
+    view : View
+    dome_from_target : SE3
+    shared_columns : int array, shape (S,)
+        Of the camera's numbers, in the order that `corner_blocks` is given.
+    pose_columns : int array, shape (6,) or (0,)
+        Of the pose; none where it is exact.
+    """
+
+    view: View
+    dome_from_target: SE3
+    shared_columns: IntArray
+    pose_columns: IntArray
+
+
+def corner_blocks(camera: Camera, shared: Sequence[str], views: Sequence[PosedView]) -> list[Block]:
+    """Return one block a view, for views of one medium.
+
+    Parameters
+    ----------
+    camera : Camera
+        As it looks into that medium.
+    shared : sequence of str
+        The camera's numbers that are solved for, as `parameter_names` has them.
+    views : sequence of PosedView
+    """
+    if not views:
+        return []
+    counts = [len(v.view) for v in views]
+    points = np.concatenate([_in_dome(v) for v in views])
+    centres = np.repeat([v.dome_from_target.apply(v.view.middle) for v in views], counts, axis=0)
+    pixels, _, by_point, by_number = camera.project_with_parameter_jacobian(points)
+    found = np.concatenate([v.view.pixels for v in views])
+    residuals = (pixels - found) / CORNER_SIGMA_PX
+    names = parameter_names(camera)
+    jacobian = np.empty((len(points), 2, len(shared) + 6))
+    jacobian[:, :, : len(shared)] = by_number[:, :, [names.index(name) for name in shared]]
+    jacobian[:, :, len(shared) : -3] = _cross(points - centres, by_point)
+    jacobian[:, :, -3:] = by_point
+    jacobian /= CORNER_SIGMA_PX
+    ends = np.cumsum(counts)
+    return [
+        _block(v, len(shared), residuals[end - n : end], jacobian[end - n : end])
+        for v, n, end in zip(views, counts, ends, strict=True)
+    ]
+
+
+def _block(posed: PosedView, n_shared: int, residuals: FloatArray, jacobian: FloatArray) -> Block:
+    columns = np.concatenate([posed.shared_columns, posed.pose_columns])
+    if not len(posed.pose_columns):
+        jacobian = jacobian[:, :, :n_shared]
+    return Block(CORNERS, columns, residuals, jacobian)
+
+
+def _in_dome(posed: PosedView) -> FloatArray:
+    pose = posed.dome_from_target
+    points: FloatArray = posed.view.points @ pose.rotation.T + pose.translation
+    return points
+
+
+def _cross(arms: FloatArray, by_point: FloatArray) -> FloatArray:
+    """Return the derivative (N, 2, 3) by a turn of points at arms (N, 3) from its centre."""
+    x, y, z = arms[:, 0, None], arms[:, 1, None], arms[:, 2, None]
+    gx, gy, gz = by_point[..., 0], by_point[..., 1], by_point[..., 2]
+    return np.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], axis=-1)
+
+
+__all__ = [
+    "CORNERS",
+    "CORNER_SIGMA_PX",
+    "PRIORS",
+    "Bundle",
+    "BundleState",
+    "PoseTerm",
+    "TargetView",
+    "moved_target",
+    "point_by_pose",
+    "rig_difference",
+]
+
+_N_WATER = "n_water"
+
+
+class PoseTerm(Protocol):
+    """What is known beforehand about the pose of one target, as residuals of it."""
+
+    def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
+        """Return residuals and their derivative by a step of the pose, see `pose_steps`."""
+
+
+@dataclass(frozen=True, slots=True)
+class TargetView:
+    """One view with all that is given about it.
+
+    Attributes
+    ----------
+    view : View
+        Points and pixels.
+    medium : int
+        Index into `BundleState.media`.
+    dome_from_target : SE3
+        Start of the pose, or the pose itself.
+    fixed : bool
+        Whether the pose is exact.
+    known : tuple of PoseTerm
+        What else is known about the pose.
+    """
+
+    view: View
+    medium: int
+    dome_from_target: SE3
+    fixed: bool = False
+    known: tuple[PoseTerm, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BundleState:
+    """What a bundle solves for.
+
+    Attributes
+    ----------
+    rig : Rig
+        Camera and housing; its own `n_water` plays no part.
+    media : array, shape (M,)
+        Refractive indices outside the dome.
+    poses : tuple of SE3
+        `dome_from_target` of every view.
+    """
+
+    rig: Rig
+    media: FloatArray
+    poses: tuple[SE3, ...]
+
+    def camera(self, medium: int) -> Camera:
+        """Return the camera as it looks into one of the media."""
+        return self.rig.in_water(float(self.media[medium])).camera()
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """The problem; see `least_squares.solve`.
+
+    Columns: the rig's free numbers, the free media, then six for each view whose pose is free (a
+    turn about the middle of its points, radians in `dome`, and a shift, metres).
+
+    Attributes
+    ----------
+    views : tuple of TargetView
+    free : tuple of str
+        Names of the rig's numbers that are solved for, as `parameter_names` has them, `n_water`
+        not among them.
+    start : BundleState
+        Where the solve starts, and what priors are centred on.
+    priors : RigUncertainty
+        How well the start is known; numbers it does not name have no prior.
+    media_sigma : array, shape (M,)
+        How well the start's media are known: 0 keeps one exact, infinite leaves it free.
+    """
+
+    views: tuple[TargetView, ...]
+    free: tuple[str, ...]
+    start: BundleState
+    priors: RigUncertainty
+    media_sigma: FloatArray
+
+    @property
+    def free_media(self) -> list[int]:
+        """Indices of the media that are solved for."""
+        return [i for i, sigma in enumerate(self.media_sigma) if sigma > 0.0]
+
+    @property
+    def n_shared(self) -> int:
+        """Columns that all views share."""
+        return len(self.free) + len(self.free_media)
+
+    @property
+    def n_parameters(self) -> int:
+        """Length of a step."""
+        return self.n_shared + 6 * sum(not v.fixed for v in self.views)
+
+    def medium_columns(self, medium: int) -> IntArray:
+        """Return the column of a medium; none where it is exact."""
+        free = self.free_media
+        return np.array([len(self.free) + free.index(medium)] if medium in free else [], np.int64)
+
+    def pose_columns(self, i_view: int) -> IntArray:
+        """Return the columns of a view's pose; none where it is exact."""
+        if self.views[i_view].fixed:
+            return np.zeros(0, np.int64)
+        first = self.n_shared + 6 * sum(not v.fixed for v in self.views[:i_view])
+        return np.arange(first, first + 6)
+
+    def blocks(self, state: BundleState) -> list[Block]:
+        """Return the residuals: one block of corners a view, in order; what is known; priors."""
+        return [*self._corner_blocks(state), *self._known(state), *self._priors(state)]
+
+    def moved(self, state: BundleState, step: FloatArray) -> BundleState:
+        """Return the state moved by a step (P,)."""
+        media = state.media.copy()
+        media[self.free_media] += step[len(self.free) : self.n_shared]
+        free = [i for i, target in enumerate(self.views) if not target.fixed]
+        poses = list(state.poses)
+        moved = moved_targets(
+            [poses[i] for i in free],
+            [self.views[i].view.middle for i in free],
+            step[self.n_shared :].reshape(-1, 6),
+        )
+        for i, pose in zip(free, moved, strict=True):
+            poses[i] = pose
+        rig = rig_moved_by(state.rig, self.free, step[: len(self.free)])
+        return BundleState(rig, media, tuple(poses))
+
+    def _corner_blocks(self, state: BundleState) -> list[Block]:
+        by_view: dict[int, Block] = {}
+        for medium in range(len(state.media)):
+            mine = [i for i, v in enumerate(self.views) if v.medium == medium]
+            column = self.medium_columns(medium)
+            shared = np.concatenate([np.arange(len(self.free)), column])
+            views = [
+                PosedView(self.views[i].view, state.poses[i], shared, self.pose_columns(i))
+                for i in mine
+            ]
+            names = (*self.free, *([_N_WATER] if len(column) else []))
+            blocks = corner_blocks(state.camera(medium), names, views)
+            by_view.update(zip(mine, blocks, strict=True))
+        return [by_view[i] for i in range(len(self.views))]
+
+    def _known(self, state: BundleState) -> list[Block]:
+        return [
+            block
+            for i, (target, pose) in enumerate(zip(self.views, state.poses, strict=True))
+            if not target.fixed
+            for term in target.known
+            for block in term.blocks(pose, pose.apply(target.view.middle), self.pose_columns(i))
+        ]
+
+    def _priors(self, state: BundleState) -> list[Block]:
+        media, free = self.free_media, self.free
+        return rig_prior(self.start.rig, state.rig, free, self.priors) + media_prior(
+            self.start.media[media],
+            state.media[media],
+            self.media_sigma[media],
+            np.arange(len(free), self.n_shared),
+        )

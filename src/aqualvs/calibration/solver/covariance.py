@@ -1,0 +1,422 @@
+"""Covariance of what all views share, estimated from how the views disagree.
+
+Errors of corners that are common to a view (the board bends, the camera moves during the exposure,
+a rolling shutter) leave residuals that vary smoothly over the picture. A covariance that counts
+every corner as independent is then too small. Each view's pull on the shared parameters is taken as
+one observation instead: the cluster-robust "sandwich" (Liang & Zeger 1986,
+doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views of unequal leverage (Bell &
+McCaffrey 2002, Survey Methodology 28, 169-181). A few views tell many parameters' covariance badly;
+it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
+doi:10.1016/S0047-259X(03)00096-4).
+
+Views from which nothing good can come, and the words that say what to do about it.
+
+What the data of a solve determined, and what rests on prior knowledge.
+
+Covariance of a solve that took some numbers as they are, though they are not known exactly.
+
+The "consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4): the errors of
+numbers that were held pass into those that were solved for, through the slopes of both.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.solver.bundle import Bundle, BundleState
+from aqualvs.calibration.solver.least_squares import Block, Solution, inverse, normal_equations
+from aqualvs.calibration.solver.priors import PRIORS
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.optics.rig import RigUncertainty
+
+# Boards less than this apart in direction (radians) and in distance (share) are all the same.
+_SAME_DIRECTION, _SAME_DISTANCE = np.deg2rad(3.0), 0.05
+# Ratios of found to given lengths that a mistaken unit explains, to within the last.
+_UNITS = {
+    1e3: "distances written in metres, or square_mm in micrometres",
+    1e-3: "distances written in micrometres, or square_mm in metres",
+    1e2: "distances off by a factor of 100",
+    1e-2: "distances off by a factor of 100",
+    25.4: "distances in inches",
+    1 / 25.4: "square_mm in inches",
+    10.0: "distances in centimetres",
+    0.1: "square_mm in centimetres",
+}
+_UNIT_TOLERANCE = 0.12
+
+
+def spread_of(normals: FloatArray, distances: FloatArray) -> tuple[float, float]:
+    """Return how much boards differ in direction (radians, largest) and distance (share).
+
+    Parameters
+    ----------
+    normals : array, shape (V, 3)
+        Unit normals of the boards, in any common frame.
+    distances : array, shape (V,)
+    """
+    cosines = np.clip(np.abs(normals @ normals.T), 0.0, 1.0)
+    return float(np.arccos(cosines.min())), float(np.ptp(distances) / np.median(distances))
+
+
+def all_alike(normals: FloatArray, distances: FloatArray) -> bool:
+    """Return whether all boards are parallel and at one distance."""
+    direction, distance = spread_of(normals, distances)
+    return direction < _SAME_DIRECTION and distance < _SAME_DISTANCE
+
+
+def length_ratio(given: FloatArray, found: FloatArray) -> float:
+    """Return how many times longer distances found in pictures are than those given.
+
+    From the differences between views where they differ enough (a median, so that a few wrong ones
+    do not count): an offset, such as of a lens that is not yet known, plays no part then.
+    """
+    i, j = np.triu_indices(len(given), 1)
+    apart = np.abs(given[i] - given[j]) > 0.1 * np.median(np.abs(given))
+    if np.count_nonzero(apart) >= len(given):
+        return float(np.median((found[i] - found[j])[apart] / (given[i] - given[j])[apart]))
+    return float(np.median(found / given))
+
+
+def scale_fault(ratio: float, tolerance: float) -> str | None:
+    """Return what a ratio of found to given distances means; None where all is well."""
+    if abs(ratio - 1.0) <= tolerance:
+        return None
+    for unit, meaning in _UNITS.items():
+        if abs(ratio / unit - 1.0) < _UNIT_TOLERANCE:
+            return (
+                f"the pictures put the boards {ratio:.4g} times as far away as the given distances "
+                f"do: {meaning}? Distances and square_mm are in millimetres"
+            )
+    if ratio < 0.0:
+        return (
+            "the given distances grow where the pictures show the board coming nearer; measure "
+            "them from the dome's centre forward, along its y axis"
+        )
+    return (
+        f"the pictures put the boards {ratio:.4g} times as far apart as the given distances do; "
+        f"measure the board's squares: square_mm would have to be {1.0 / ratio:.4g} times what "
+        "its file says, if the distances are right"
+    )
+
+
+def unbelievable_distance(distances: FloatArray, labels: Sequence[str]) -> str | None:
+    """Return what is wrong with boards at distances (metres) at which nobody holds them."""
+    median = float(np.median(distances))
+    label = labels[int(np.argsort(distances)[len(distances) // 2])]
+    if 0.03 < median < 30.0:
+        return None
+    return (
+        f"{label}: the board would stand {1e3 * median:.4g} mm away; is square_mm in its file in "
+        "millimetres?"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """A combination of numbers, each counted in sigmas of its prior.
+
+    Attributes
+    ----------
+    weights : dict
+        Share of every number, squares adding up to 1.
+    gain : float
+        How many times more the data say about it than the prior does.
+    """
+
+    weights: dict[str, float]
+    gain: float
+
+    @property
+    def main(self) -> dict[str, float]:
+        """The numbers that make up nearly all of it, largest first."""
+        order = sorted(self.weights, key=lambda name: -abs(self.weights[name]))
+        return {name: self.weights[name] for name in order if abs(self.weights[name]) > 0.3}
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """What the data determined of the numbers of which something was known beforehand.
+
+    Attributes
+    ----------
+    shrinkage : dict
+        For every such number its sigma after the solve over that before: 1 says that the data
+        added nothing.
+    directions : tuple of Direction
+        Independent combinations, best determined first.
+    """
+
+    shrinkage: dict[str, float]
+    directions: tuple[Direction, ...]
+
+    def untold(self, limit: float = 0.1) -> list[Direction]:
+        """Return the combinations about which the data say far less than the priors do."""
+        return [direction for direction in self.directions if direction.gain < limit]
+
+    def undetermined(self, names: Sequence[str], limit: float = 0.9) -> list[str]:
+        """Return which of the names the data hardly say anything about."""
+        return [name for name in names if self.shrinkage.get(name, 0.0) > limit]
+
+
+def observability(
+    bundle: Bundle,
+    solution: Solution[BundleState],
+    uncertainty: RigUncertainty,
+    names: Sequence[str],
+) -> Observability:
+    """Weigh what a solve learnt about some numbers against what was known of them.
+
+    All else is marginalised, with what was known of it: poses, the lens, the intrinsics.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    solution : Solution
+        Of it.
+    uncertainty : RigUncertainty
+        After the solve, with that of numbers that were held passed on.
+    names : sequence of str
+        Numbers to judge, whose priors do not hang on those of others; those without a prior are
+        passed over.
+    """
+    names = [name for name in names if name in bundle.free and name in bundle.priors.names]
+    if not names:
+        return Observability({}, ())
+    columns = np.array([bundle.free.index(name) for name in names])
+    prior = bundle.priors.of(names)
+    learnt = solution.information.copy()
+    learnt[np.ix_(columns, columns)] -= np.linalg.inv(prior)
+    root = np.linalg.cholesky(prior)
+    gains, vectors = np.linalg.eigh(root.T @ _marginal(learnt, columns) @ root)
+    # In the numbers themselves a direction is root @ vector; told in sigmas of each one's prior.
+    shares = root @ vectors / np.sqrt(np.diag(prior))[:, None]
+    shares /= np.linalg.norm(shares, axis=0)
+    directions = tuple(
+        Direction(dict(zip(names, shares[:, k].tolist(), strict=True)), max(float(gains[k]), 0.0))
+        for k in np.argsort(-gains)
+    )
+    before, after = bundle.priors.sigmas, uncertainty.sigmas
+    return Observability({name: after[name] / before[name] for name in names}, directions)
+
+
+def _marginal(information: FloatArray, columns: IntArray) -> FloatArray:
+    """Return the information on some parameters once all others are marginalised."""
+    others = np.setdiff1d(np.arange(len(information)), columns)
+    cross = information[np.ix_(columns, others)]
+    own = information[np.ix_(columns, columns)]
+    marginal: FloatArray = own - cross @ inverse(information[np.ix_(others, others)]) @ cross.T
+    return marginal
+
+
+def considered(
+    bundle: Bundle, solution: Solution[BundleState], held: RigUncertainty
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the joint covariance of what was solved for and of what was held.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        The problem.
+    solution : Solution
+        Of it.
+    held : RigUncertainty
+        Of numbers that the bundle does not solve for.
+
+    Returns
+    -------
+    names : tuple of str
+        `bundle.free`, then those of `held`.
+    covariance : array, shape (P + H, P + H)
+        In the bundle's columns, then those of `held`.
+    """
+    if not held.names:
+        return bundle.free, solution.covariance.copy()
+    cross = _cross_information(bundle, solution, held.names)
+    gain = -solution.covariance @ cross
+    passed_on = gain @ held.covariance
+    joint = np.block(
+        [
+            [solution.covariance + passed_on @ gain.T, passed_on],
+            [passed_on.T, held.covariance],
+        ]
+    )
+    return (*bundle.free, *held.names), joint
+
+
+def _cross_information(
+    bundle: Bundle, solution: Solution[BundleState], held: tuple[str, ...]
+) -> FloatArray:
+    """Return what the data say about solved and held numbers together, shape (P, H)."""
+    wider = replace(bundle, free=(*bundle.free, *held))
+    kept = [i for i, b in enumerate(solution.blocks) if b.group != PRIORS]
+    # Priors stand at the end, so both problems begin with the same blocks.
+    blocks = wider.blocks(solution.state)[: len(kept)]
+    information = normal_equations(
+        wider.n_parameters,
+        blocks,
+        [solution.inliers[i] for i in kept],
+        [solution.block_scales[i] for i in kept],
+    ).information
+    n, m = len(bundle.free), len(held)
+    solved = np.r_[0:n, n + m : wider.n_parameters]
+    cross: FloatArray = information[np.ix_(solved, np.arange(n, n + m))]
+    return cross
+
+
+# A view that determines a combination by itself to more than this share has nothing to be compared
+# with there.
+_ALONE = 0.999
+# Student's distribution has a variance from three views on; fewer are taken as so many.
+_FEWEST_VIEWS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class ViewCovariance:
+    """Covariance of the shared parameters, by corners and by views.
+
+    Attributes
+    ----------
+    by_corners : array, shape (S, S)
+        As if the errors of all corners were independent.
+    by_views : array, shape (S, S)
+        From the disagreement of the views; nowhere smaller than `by_corners`.
+    inflation : float
+        How many times larger the variance by views is, over all combinations; 1 if the corners'
+        errors are independent, and by chance below.
+    step : array, shape (S,)
+        What one Gauss-Newton step would add to the parameters; zero at the solution. The
+        disagreement of the views is that after this step.
+    """
+
+    by_corners: FloatArray
+    by_views: FloatArray
+    inflation: float
+    step: FloatArray
+
+
+def shared_covariance(bundle: Bundle, solution: Solution[BundleState]) -> ViewCovariance:
+    """Estimate the covariance of what the views of a bundle share, see `view_covariance`.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        Without priors, and with free poses of which nothing is known.
+    solution : Solution
+        Of it; columns beyond those of the bundle are shared, too, and come last.
+    """
+    n = len(bundle.views)
+    beyond = np.arange(bundle.n_parameters, len(solution.covariance))
+    shared = np.concatenate([np.arange(bundle.n_shared), beyond])
+    return view_covariance(
+        solution.blocks[:n], solution.inliers[:n], solution.block_scales[:n], shared
+    )
+
+
+def view_covariance(
+    blocks: Sequence[Block],
+    inliers: Sequence[BoolArray],
+    scales: Sequence[float],
+    shared: IntArray,
+) -> ViewCovariance:
+    """Estimate the covariance of shared parameters from views with a pose each.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        One for each view, at the solution or near it. Columns that are not shared
+        belong to its pose alone.
+    inliers : sequence of bool array, shape (N,)
+        Corners that were believed.
+    scales : sequence of float
+        Noise of each view as a multiple of the nominal one.
+    shared : int array, shape (S,)
+        Columns of the parameters that all views share.
+
+    Raises
+    ------
+    CalibrationError
+        If the views say nothing at all about one of the parameters.
+    """
+    own, pulls = [], []
+    for block, inside, scale in zip(blocks, inliers, scales, strict=True):
+        information, pull = _without_pose(block, inside, scale, shared)
+        own.append(information)
+        pulls.append(pull)
+    by_corners = inverse(np.sum(own, axis=0))
+    root = _root(by_corners)
+    white = [root.T @ information @ root for information in own]
+    step = -by_corners @ np.sum(pulls, axis=0)
+    scores = [root.T @ (pull + mine @ step) for mine, pull in zip(own, pulls, strict=True)]
+    spread, inflation = _spread(white, scores)
+    return ViewCovariance(by_corners, root @ spread @ root.T, inflation, step)
+
+
+def _without_pose(
+    block: Block, inside: BoolArray, scale: float, shared: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what one view says (S, S) of the shared parameters, and its pull (S,) on them."""
+    n = len(block.columns)
+    equations = normal_equations(n, [replace(block, columns=np.arange(n))], [inside], [scale])
+    place = {int(column): i for i, column in enumerate(shared)}
+    mine = np.array([i for i, c in enumerate(block.columns) if int(c) in place], np.int64)
+    pose = np.setdiff1d(np.arange(n), mine)
+    cross = equations.information[np.ix_(mine, pose)]
+    by_pose = cross @ inverse(equations.information[np.ix_(pose, pose)])
+    rows = np.array([place[int(c)] for c in block.columns[mine]], np.int64)
+    information, pull = np.zeros((len(shared), len(shared))), np.zeros(len(shared))
+    information[np.ix_(rows, rows)] = equations.information[np.ix_(mine, mine)] - by_pose @ cross.T
+    pull[rows] = equations.gradient[mine] - by_pose @ equations.gradient[pose]
+    return information, pull
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Return R with R R' = covariance, for units of any size."""
+    sigma = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    root: FloatArray = sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
+
+
+def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+    """Return the covariance (S, S) of the parameters in units of that by corners, and its mean.
+
+    Parameters
+    ----------
+    own : sequence of array, shape (S, S)
+        What each view says; they add up to the unit matrix.
+    scores : sequence of array, shape (S,)
+        Its pull; of covariance own (1 - own) if the errors of corners are independent.
+    """
+    n, size = len(own), len(own[0])
+    corrected, expected = np.zeros((n, size)), 0.0
+    for i, (information, score) in enumerate(zip(own, scores, strict=True)):
+        values, vectors = np.linalg.eigh(information)
+        values = np.clip(values, 0.0, 1.0)
+        alone = values > _ALONE
+        factor = np.where(alone, 0.0, 1.0 / np.sqrt(np.maximum(1.0 - values, 1.0 - _ALONE)))
+        corrected[i] = vectors @ (factor * (vectors.T @ score))
+        expected += float(values[~alone].sum())
+    if expected <= 0.0:
+        return np.eye(size), 1.0
+    sandwich = corrected.T @ corrected
+    inflation = float(np.trace(sandwich)) / expected
+    values, vectors = np.linalg.eigh(_shrunk(corrected, sandwich, inflation))
+    # Few views tell their own scatter badly: a ratio to it is Student's, of a variance so much
+    # larger. Corners' own noise is known from many, and is there in any case.
+    shares = np.einsum("sk,nst,tk->nk", vectors, np.array(own), vectors)
+    effective = np.maximum(np.sum(shares, axis=0) ** 2 / np.sum(shares**2, axis=0), _FEWEST_VIEWS)
+    students = effective / (effective - 2.0)
+    values = 1.0 + students * np.maximum(values - 1.0, 0.0)
+    return (vectors * values) @ vectors.T, inflation
+
+
+def _shrunk(corrected: FloatArray, sandwich: FloatArray, inflation: float) -> FloatArray:
+    """Shrink the sandwich towards a multiple of one, by how uncertain it is itself."""
+    n, size = corrected.shape
+    target = inflation * np.eye(size)
+    outer = corrected[:, :, None] * corrected[:, None, :]
+    uncertain = float(np.sum(np.square(outer - sandwich / n)))
+    apart = float(np.sum(np.square(sandwich - target)))
+    share = min(uncertain / apart, 1.0) if apart > 0.0 else 1.0
+    return share * target + (1.0 - share) * sandwich

@@ -1,0 +1,409 @@
+"""Where a target is, from one picture of it, with no starting values: flat targets or not.
+
+Through a dome there is no closed form. The rays that the pixels see in the outer medium are first
+taken to start at the one point nearest to them all, for which perspective-n-point has closed
+solutions: IPPE for flat targets with both of its answers (Collins & Bartoli 2014,
+doi:10.1007/s11263-014-0725-5), SQPnP for others (Terzakis & Lourakis 2020,
+doi:10.1007/978-3-030-58452-8_28). Each is then refined through the true optics, robustly.
+
+Where a solve of poses starts: each view's pose by itself, then all of them turned square.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from aqualvs.calibration.solver.bundle import moved_target, point_by_pose
+from aqualvs.calibration.solver.least_squares import Block, Solution, solve
+from aqualvs.calibration.targets.targets import View
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import Rays
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+
+MAX_RMS_PX = 5.0
+"""Corners that fit worse than this do not show the target they are said to."""
+_CORNERS = "corners"
+_MIN_POINTS = 4
+# Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.
+_LINE, _FLAT, _NEARLY_FLAT = 1e-3, 1e-6, 0.05
+# The start takes all rays to meet in one point, which behind a dome they miss by some pixels.
+_START_ERROR_PX = 8.0
+_FEW_INLIERS = 0.7
+# Rivals whose residuals are less than this many times longer may be the truth.
+_RIVAL = 1.5
+# Closed solutions this many times worse than the best are not worth refining.
+_HOPELESS = 5.0
+# So many observations at the nominal noise temper the noise that a view's own residuals tell: the
+# eight residuals of a single marker leave two degrees of freedom.
+_PRIOR_FREEDOM = 8.0
+# Rays further than this from their mean (cosine) are of no use to the start.
+_SIDEWAYS = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class TargetPose:
+    """A target's pose with its uncertainty.
+
+    Attributes
+    ----------
+    dome_from_target : SE3
+        The pose.
+    covariance : array, shape (6, 6)
+        Of the step of `pose_steps.moved_target`: a turn about the middle of the view's points
+        (radians) and a shift (metres), both in `dome`; camera and medium taken as exact.
+    rms_px : float
+        Root mean square distance of the inliers from their predicted pixels.
+    inliers : bool array, shape (N,)
+        The view's points that were believed.
+    ambiguous : bool
+        Whether a second pose, a flat target leaning the other way, explains the view nearly as
+        well.
+    """
+
+    dome_from_target: SE3
+    covariance: FloatArray
+    rms_px: float
+    inliers: BoolArray
+    ambiguous: bool
+
+
+def target_pose(
+    camera: Camera, view: View, *, sigma_px: float = 0.1, max_rms_px: float = MAX_RMS_PX
+) -> TargetPose:
+    """Find the pose of a target from scratch.
+
+    Parameters
+    ----------
+    camera : Camera
+        Bare or behind a dome, looking into the medium of the picture.
+    view : View
+        Four points or more that are not on one line; up to about a third may be wrong.
+    sigma_px : float
+        Nominal noise of a corner; weighs in where a view has few points.
+    max_rms_px : float
+        Inliers that fit worse are no view of this target. Infinite to take any pose.
+
+    Returns
+    -------
+    TargetPose
+
+    Raises
+    ------
+    CalibrationError
+        If the view has too few points, points on one line, or no pose explains it.
+    """
+    rays = camera.rays(view.pixels)
+    _check(view, rays)
+    best, rival = _best_two(camera, view, closed_form_poses(view, rays), sigma_px)
+    if best is None or _doubtful(best, sigma_px, max_rms_px):
+        start = _start_despite_outliers(camera, view, rays)
+        if start is not None:
+            again, second = _best_two(camera, view, iter([start]), sigma_px)
+            if again is not None and (best is None or _better(again, best)):
+                best, rival = again, second
+    if best is None or _rms_px(best, sigma_px) > max_rms_px or _believed(best) < _MIN_POINTS:
+        raise CalibrationError(_not_found(view, best, sigma_px))
+    return _result(best, rival, sigma_px)
+
+
+@dataclass(frozen=True, slots=True)
+class _PoseProblem:
+    """One view of a target with a known camera."""
+
+    camera: Camera
+    view: View
+    sigma_px: float
+
+    @property
+    def n_parameters(self) -> int:
+        return 6
+
+    def blocks(self, state: SE3) -> list[Block]:
+        points = state.apply(self.view.points)
+        pixels, _, by_point = self.camera.project_with_jacobian(points)
+        middle = state.apply(self.view.middle)
+        return [
+            Block(
+                _CORNERS,
+                np.arange(6),
+                (pixels - self.view.pixels) / self.sigma_px,
+                by_point @ point_by_pose(points, middle) / self.sigma_px,
+            )
+        ]
+
+    def moved(self, state: SE3, step: FloatArray) -> SE3:
+        return moved_target(state, self.view.middle, step)
+
+
+def _check(view: View, rays: Rays) -> None:
+    n = int(np.count_nonzero(rays.valid))
+    if n < _MIN_POINTS:
+        raise CalibrationError(
+            f"{view.name}: {n} points of the target can be used but a pose needs {_MIN_POINTS}; "
+            "show more of the target"
+        )
+    extents = _extents(view.points[rays.valid])[0]
+    if extents[1] < _LINE * extents[0]:
+        raise CalibrationError(
+            f"{view.name}: the {n} points found lie on one line; show more of the target"
+        )
+
+
+def _extents(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return extents (3,) along principal axes, those axes as a rotation's rows, the middle."""
+    middle: FloatArray = points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return np.pad(extents, (0, 3 - len(extents))), axes, middle
+
+
+def _best_two(
+    camera: Camera, view: View, starts: Iterator[SE3], sigma_px: float
+) -> tuple[Solution[SE3] | None, Solution[SE3] | None]:
+    problem = _PoseProblem(camera, view, sigma_px)
+    found: list[Solution[SE3]] = []
+    for start in starts:
+        try:
+            solution = solve(problem, start)
+        except (CalibrationError, np.linalg.LinAlgError):
+            continue
+        if not any(_same(solution.state, other.state) for other in found):
+            found.append(solution)
+    found.sort(key=lambda s: (-round(4.0 * _believed(s) / len(view)), s.scales[_CORNERS]))
+    return (found[0] if found else None), (found[1] if len(found) > 1 else None)
+
+
+def _same(a: SE3, b: SE3) -> bool:
+    return bool(np.linalg.norm(a.rotation - b.rotation) < 1e-4)
+
+
+def _believed(solution: Solution[SE3]) -> int:
+    return int(np.count_nonzero(solution.inliers[0]))
+
+
+def _rms_px(solution: Solution[SE3], sigma_px: float) -> float:
+    residuals = solution.blocks[0].residuals[solution.inliers[0]] * sigma_px
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else np.inf
+
+
+def _doubtful(solution: Solution[SE3], sigma_px: float, max_rms_px: float) -> bool:
+    share = _believed(solution) / len(solution.inliers[0])
+    return share < _FEW_INLIERS or _rms_px(solution, sigma_px) > min(max_rms_px, MAX_RMS_PX)
+
+
+def _better(a: Solution[SE3], b: Solution[SE3]) -> bool:
+    """Return whether `a` is more believable: the median residual of all points decides."""
+    a_all, b_all = (np.linalg.norm(s.blocks[0].residuals, axis=1) for s in (a, b))
+    return bool(np.median(np.nan_to_num(a_all, nan=np.inf)) < np.nanmedian(b_all))
+
+
+@dataclass(frozen=True, slots=True)
+class _Pinhole:
+    """The pinhole camera that comes nearest to the rays of a view."""
+
+    dome_from_pinhole: SE3
+    points: FloatArray
+    normalised: FloatArray
+
+    def pose(self, rotvec: FloatArray, translation: FloatArray) -> SE3:
+        return self.dome_from_pinhole @ SE3.from_rotvec(rotvec.ravel(), translation.ravel())
+
+
+def _pinhole(view: View, rays: Rays) -> _Pinhole:
+    origins, directions = rays.origins[rays.valid], rays.directions[rays.valid]
+    forward = directions.mean(axis=0)
+    forward /= np.linalg.norm(forward)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    # Rays of a narrow view nearly meet anywhere along them: a faint pull towards the mean origin
+    # picks one place.
+    pull = 1e-6 * len(directions) * np.eye(3)
+    right = np.einsum("nij,nj->i", across, origins) + pull @ origins.mean(axis=0)
+    centre = np.linalg.solve(across.sum(axis=0) + pull, right)
+    side = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    side /= np.linalg.norm(side)
+    pose = SE3(np.stack([side, np.cross(forward, side), forward], axis=1), centre)
+    in_pinhole = directions @ pose.rotation
+    ahead = in_pinhole[:, 2] > _SIDEWAYS
+    normalised = in_pinhole[ahead, :2] / in_pinhole[ahead, 2:]
+    return _Pinhole(pose, view.points[rays.valid][ahead], np.ascontiguousarray(normalised))
+
+
+def closed_form_poses(view: View, rays: Rays) -> Iterator[SE3]:
+    """Yield the poses that closed solutions find for a view whose pixels see these rays.
+
+    They take all rays to start at the one point nearest to them all.
+    """
+    pinhole = _pinhole(view, rays)
+    extents, axes, middle = _extents(pinhole.points)
+    if extents[2] < _NEARLY_FLAT * extents[0]:
+        flat = (pinhole.points - middle) @ axes.T
+        flat[:, 2] = 0.0
+        target_from_flat = SE3(axes.T, middle)
+        for pose in _closed_form(pinhole, flat, cv2.SOLVEPNP_IPPE):
+            yield pose @ target_from_flat.inverse()
+    if extents[2] > _FLAT * extents[0]:
+        yield from _closed_form(pinhole, pinhole.points, cv2.SOLVEPNP_SQPNP)
+
+
+def _closed_form(pinhole: _Pinhole, points: FloatArray, method: int) -> Iterator[SE3]:
+    if len(points) < _MIN_POINTS:
+        return
+    try:
+        _, rotvecs, translations, errors = cv2.solvePnPGeneric(
+            points, pinhole.normalised, np.eye(3), None, flags=method
+        )
+    except cv2.error:  # it asserts where points are degenerate
+        return
+    for rotvec, translation, error in zip(rotvecs, translations, np.ravel(errors), strict=True):
+        if error > _HOPELESS * np.min(errors):
+            continue
+        if np.all(np.isfinite(rotvec)) and np.all(np.isfinite(translation)):
+            yield pinhole.pose(rotvec, translation)
+
+
+def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | None:
+    pinhole = _pinhole(view, rays)
+    if len(pinhole.points) < _MIN_POINTS + 1:
+        return None
+    try:
+        found, rotvec, translation, _ = cv2.solvePnPRansac(
+            pinhole.points,
+            pinhole.normalised,
+            np.eye(3),
+            None,
+            iterationsCount=300,
+            reprojectionError=_START_ERROR_PX / max(camera.lens.fx, camera.lens.fy),
+            confidence=0.999,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:
+        return None
+    return pinhole.pose(rotvec, translation) if found else None
+
+
+def _result(best: Solution[SE3], rival: Solution[SE3] | None, sigma_px: float) -> TargetPose:
+    scale = best.scales[_CORNERS]
+    freedom = 2.0 * _believed(best) - 6.0
+    tempered = (freedom * scale**2 + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM)
+    rms = _rms_px(best, sigma_px)
+    ambiguous = rival is not None and _rms_px(rival, sigma_px) < _RIVAL * rms + 0.1 * sigma_px
+    return TargetPose(
+        dome_from_target=best.state,
+        covariance=best.covariance * (tempered / scale**2),
+        rms_px=rms,
+        inliers=best.inliers[0],
+        ambiguous=ambiguous,
+    )
+
+
+def _not_found(view: View, best: Solution[SE3] | None, sigma_px: float) -> str:
+    fit = "" if best is None else f" (the best leaves {_rms_px(best, sigma_px):.1f} px)"
+    return (
+        f"{view.name}: no pose of the target explains its {len(view)} points{fit}; check the "
+        "target's file against the print, and the rig and medium against the picture"
+    )
+
+
+# Points of a view that a starting pose is found from: more gain nothing.
+_ENOUGH_POINTS = 48
+# A closed solution whose median corner is this near needs no refinement of its own.
+_NEAR_PX = 2.0
+_START_MIN_POINTS = 6
+_QUARTER = 0.5 * np.pi
+
+
+@dataclass(frozen=True, slots=True)
+class StartPose:
+    """A first pose of a view.
+
+    Attributes
+    ----------
+    dome_from_target : SE3
+    median_px : float
+        How far off the median point is that it was found from.
+    """
+
+    dome_from_target: SE3
+    median_px: float
+
+
+def start_pose(camera: Camera, view: View) -> StartPose | str:
+    """Return a view's pose, however badly the starting camera explains it, or why there is none."""
+    few = thinned(view)
+    rays = camera.rays(few.pixels)
+    if np.count_nonzero(rays.valid) >= _START_MIN_POINTS:
+        quick = [_judged(camera, few, pose) for pose in closed_form_poses(few, rays)]
+        best = min(quick, key=lambda start: start.median_px, default=None)
+        if best is not None and best.median_px < _NEAR_PX:
+            return best
+    try:
+        found = target_pose(camera, few, max_rms_px=float("inf"))
+    except CalibrationError as error:
+        return str(error)
+    return _judged(camera, few, found.dome_from_target)
+
+
+def _judged(camera: Camera, view: View, pose: SE3) -> StartPose:
+    pixels, _ = camera.project(pose.apply(view.points))
+    off = np.linalg.norm(np.nan_to_num(pixels - view.pixels, nan=np.inf), axis=1)
+    return StartPose(pose, float(np.median(off)))
+
+
+def thinned(view: View, n_points: int = _ENOUGH_POINTS) -> View:
+    """Return a view with at most so many points, spread over the target."""
+    if len(view) <= n_points:
+        return view
+    keep = np.zeros(len(view), np.bool_)
+    # A fixed stride would keep few columns of a board whose rows it divides.
+    keep[np.random.default_rng(len(view)).permutation(len(view))[:n_points]] = True
+    return view.where(keep)
+
+
+def square_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
+    """Return the nearest `dome_from_board` rotation of boards square to the dome.
+
+    Boards stand upright, on a side or upside down: x and y along the dome's x and -z axes, or a
+    quarter turn about y further.
+
+    Parameters
+    ----------
+    rotations : sequence of array, shape (3, 3)
+        Of the boards; the majority decides.
+    """
+    choices = [
+        rotation_from_rotvec([0.0, k * _QUARTER, 0.0]) @ DOME_FROM_CAM_NOMINAL for k in range(4)
+    ]
+    nearness = [np.median([np.trace(r @ choice.T) for r in rotations]) for choice in choices]
+    return choices[int(np.argmax(nearness))]
+
+
+def turned_square(
+    rig: Rig, poses: Sequence[SE3], square: FloatArray, boards: Sequence[int], sigma: float
+) -> tuple[Rig, list[SE3]]:
+    """Turn camera and boards together about the dome's centre until most boards stand square.
+
+    Pictures cannot tell: through a sphere the turn changes nothing. The turn is that which makes
+    one of the boards exactly square and leaves the smallest robust tilt of the others.
+
+    Parameters
+    ----------
+    rig : Rig
+    poses : sequence of SE3
+        Of all boards.
+    square : array, shape (3, 3)
+        Rotation of a square board.
+    boards : sequence of int
+        Those of which it is known that most are square.
+    sigma : float
+        How square, in radians.
+    """
+    tilts = np.array([rotvec_from_rotation(poses[i].rotation @ square.T) for i in boards])
+    apart = np.sum((tilts[:, None] - tilts[None]) ** 2, axis=-1)
+    best = int(np.argmin(np.sum(np.log1p(apart / sigma**2), axis=1)))
+    turn = SE3(rotation_from_rotvec(-tilts[best]), np.zeros(3))
+    return replace(rig, dome_from_cam=turn @ rig.dome_from_cam), [turn @ pose for pose in poses]

@@ -1,0 +1,595 @@
+"""Robust non-linear least squares over blocks of residuals, with an honest covariance.
+
+Levenberg-Marquardt on the normal equations (Marquardt 1963, doi:10.1137/0111030), robust by
+iterated reweighting (Huber 1964, doi:10.1214/aoms/1177703732). The noise of measurements is
+estimated from their residuals, and the covariance rests on that, not on a promise.
+
+Loss functions of robust least squares, by the length of a residual in standard deviations.
+
+Blocks of residuals: what a least-squares problem is made of.
+
+How noisy measurements are, from their residuals: of every block, tempered by its group's.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from scipy.stats import chi2
+
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+
+# Good residuals hardly reach this, so that the estimate stays efficient; outliers count linearly.
+_HUBER = 3.0
+# At this, the estimate is 95 % efficient on normal errors (Holland & Welsch 1977,
+# doi:10.1080/03610927708827533), and the weights tell its covariance rightly.
+_CAUCHY = 2.385
+
+
+class Loss(StrEnum):
+    """How the length of a residual counts."""
+
+    SQUARE = "square"
+    """As its square: for priors."""
+    HUBER = "huber"
+    """As its square up to three standard deviations, linearly beyond: for measurements."""
+    CAUCHY = "cauchy"
+    """Logarithmically beyond two or so: where a good part of the data obeys another law."""
+
+    def cost(self, lengths: FloatArray) -> FloatArray:
+        """Return the loss of residuals (N,), half the square for short ones."""
+        square: FloatArray = 0.5 * lengths**2
+        if self is Loss.HUBER:
+            return np.where(lengths <= _HUBER, square, _HUBER * (lengths - 0.5 * _HUBER))
+        if self is Loss.CAUCHY:
+            logarithm: FloatArray = 0.5 * _CAUCHY**2 * np.log1p((lengths / _CAUCHY) ** 2)
+            return logarithm
+        return square
+
+    def weight(self, lengths: FloatArray) -> FloatArray:
+        """Return d cost / d length over length: what iterated reweighting multiplies with."""
+        if self is Loss.HUBER:
+            return np.where(lengths <= _HUBER, 1.0, _HUBER / np.maximum(lengths, _HUBER))
+        if self is Loss.CAUCHY:
+            weight: FloatArray = 1.0 / (1.0 + (lengths / _CAUCHY) ** 2)
+            return weight
+        return np.ones_like(lengths)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Residuals that depend on the same parameters.
+
+    Attributes
+    ----------
+    group : str
+        Measurements of one group are of one kind, with much the same noise.
+    columns : int array, shape (C,)
+        Parameters these residuals depend on.
+    residuals : array, shape (N, K)
+        Measured minus predicted, or its negative, over its nominal standard deviation. K values
+        belong to one observation, such as x and y of a corner. NaN rows are not seen.
+    jacobian : array, shape (N, K, C)
+        Derivative of `residuals`.
+    loss : Loss
+        How the length of an observation's residual counts.
+    scaled : bool
+        Whether the noise is estimated, as a multiple of the nominal one; priors are meant as they
+        are.
+    """
+
+    group: str
+    columns: IntArray
+    residuals: FloatArray
+    jacobian: FloatArray
+    loss: Loss = Loss.HUBER
+    scaled: bool = True
+    lengths: FloatArray = field(init=False, repr=False, compare=False)
+    """Lengths (N,) of the observations' residuals."""
+
+    def __post_init__(self) -> None:
+        squares = np.einsum("nk,nk->n", self.residuals, self.residuals)
+        object.__setattr__(self, "lengths", np.sqrt(squares))
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which observations (N,) have a residual."""
+        seen: BoolArray = np.isfinite(self.lengths)
+        return seen
+
+    def values(self, inliers: BoolArray) -> int:
+        """Return how many numbers the marked observations hold."""
+        n_values: int = self.residuals.shape[1]
+        return int(np.count_nonzero(inliers)) * n_values
+
+
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """Gauss-Newton's view of a cost at one state.
+
+    Attributes
+    ----------
+    information : array, shape (P, P)
+    gradient : array, shape (P,)
+    own : tuple of array, shape (C, C)
+        Every block's part of `information`, in its own columns.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    own: tuple[FloatArray, ...]
+
+
+def normal_equations(
+    n_parameters: int,
+    blocks: Sequence[Block],
+    inliers: Sequence[BoolArray],
+    scales: Sequence[float],
+) -> NormalEquations:
+    """Return the normal equations of blocks with their inliers and noise scales."""
+    information, gradient = np.zeros((n_parameters, n_parameters)), np.zeros(n_parameters)
+    own = []
+    for block, inside, scale in zip(blocks, inliers, scales, strict=True):
+        matrix, vector = _of_block(block, inside, scale)
+        information[block.columns[:, None], block.columns] += matrix
+        gradient[block.columns] += vector
+        own.append(matrix)
+    return NormalEquations(information, gradient, tuple(own))
+
+
+def _of_block(block: Block, inside: BoolArray, scale: float) -> tuple[FloatArray, FloatArray]:
+    n_values, n_columns = block.residuals.shape[1], len(block.columns)
+    weights = block.loss.weight(block.lengths / scale)
+    # A point that a step made invisible has no slope to offer.
+    believed = inside & np.isfinite(weights)
+    residuals, jacobian = block.residuals, block.jacobian
+    if not believed.all():
+        weights, residuals, jacobian = weights[believed], residuals[believed], jacobian[believed]
+    root = np.repeat(np.sqrt(weights) / scale, n_values)
+    slopes = jacobian.reshape(-1, n_columns) * root[:, None]
+    return slopes.T @ slopes, slopes.T @ (residuals.reshape(-1) * root)
+
+
+def cost(
+    blocks: Sequence[Block],
+    inliers: Sequence[BoolArray],
+    scales: Sequence[float],
+    lost_length: float,
+) -> float:
+    """Return the robust cost; inliers that are no longer seen count as `lost_length`."""
+    total = 0.0
+    for block, inside, scale in zip(blocks, inliers, scales, strict=True):
+        lengths = block.lengths[inside] / scale
+        lost = ~np.isfinite(lengths)
+        if lost.any():
+            lengths[lost] = lost_length
+        total += float(np.sum(block.loss.cost(lengths)))
+    return total
+
+
+# Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
+_REJECT = 5.0
+# How many times the median's scale may be too small by chance.
+_DOUBT = 1.5
+# Data without any noise still need a scale to divide by.
+_TINY = 1e-6
+# A block's noise is that of its group until its own residuals, by so many values, say otherwise.
+_GROUP_FREEDOM = 10.0
+# Fewer values than this left over by the fit say nothing about noise.
+_LEAST_FREEDOM = 0.5
+
+
+def start_scales(blocks: Sequence[Block]) -> list[float]:
+    """Return a first noise scale for every block: its group's median, which outliers hardly move.
+
+    Blocks that are not scaled have 1.
+    """
+    groups = {b.group for b in blocks if b.scaled}
+    scale = {g: _median_scale([b for b in blocks if b.scaled and b.group == g]) for g in groups}
+    return [scale[b.group] if b.scaled else 1.0 for b in blocks]
+
+
+def freedoms(
+    blocks: Sequence[Block],
+    inliers: Sequence[BoolArray],
+    equations: NormalEquations,
+    covariance: FloatArray,
+) -> list[float]:
+    """Return for every block how many of its values are left over by the fit."""
+    triples = zip(blocks, inliers, equations.own, strict=True)
+    return [
+        block.values(inside)
+        - float(np.sum(own * covariance[block.columns[:, None], block.columns]))
+        for block, inside, own in triples
+    ]
+
+
+def believed(
+    blocks: Sequence[Block], scales: Sequence[float], freedom: Sequence[float]
+) -> list[BoolArray]:
+    """Return the inliers of every block."""
+    return [
+        # NaN compares false.
+        block.lengths < _REJECT * min(scale, _largest_scale(block, free))
+        if block.scaled
+        else block.seen
+        for block, scale, free in zip(blocks, scales, freedom, strict=True)
+    ]
+
+
+def group_scales(
+    blocks: Sequence[Block],
+    inliers: Sequence[BoolArray],
+    scales: Sequence[float],
+    freedom: Sequence[float],
+) -> dict[str, float]:
+    """Return the typical scale of every group: the median over what its blocks say by themselves.
+
+    A block counts by its freedom, so that one block alone is its group; a few bad ones do not
+    count.
+    """
+    typical = {}
+    for group in {b.group for b in blocks if b.scaled}:
+        mine = [i for i, b in enumerate(blocks) if b.scaled and b.group == group]
+        useful = [i for i in mine if freedom[i] > _LEAST_FREEDOM]
+        if not useful:
+            typical[group] = scales[mine[0]]
+            continue
+        by_itself = [_squares(blocks[i], inliers[i], scales[i]) / freedom[i] for i in useful]
+        weights = np.array([freedom[i] for i in useful])
+        scale = float(np.sqrt(_weighted_median(np.array(by_itself), weights)))
+        largest = _weighted_median(
+            np.array([_largest_scale(blocks[i], freedom[i]) for i in useful]), weights
+        )
+        typical[group] = max(min(scale, largest), _TINY)
+    return typical
+
+
+def block_scales(
+    blocks: Sequence[Block],
+    inliers: Sequence[BoolArray],
+    scales: Sequence[float],
+    freedom: Sequence[float],
+    typical: dict[str, float],
+) -> list[float]:
+    """Return the scale of every block: from its own residuals, tempered by its group's."""
+    found = []
+    for block, inside, scale, free in zip(blocks, inliers, scales, freedom, strict=True):
+        if not block.scaled:
+            found.append(1.0)
+            continue
+        prior = typical[block.group]
+        squares = _squares(block, inside, scale) + _GROUP_FREEDOM * prior**2
+        tempered = float(np.sqrt(squares / (max(free, 0.0) + _GROUP_FREEDOM)))
+        found.append(min(tempered, max(_largest_scale(block, free), prior)))
+    return found
+
+
+def _largest_scale(block: Block, freedom: float) -> float:
+    """Return the scale that a block's median allows at most.
+
+    Where many observations are outliers, they hold up the scale that lets them in; this breaks it.
+    """
+    values = block.values(block.seen)
+    if freedom <= _LEAST_FREEDOM or not values:
+        return float("inf")
+    return _DOUBT * _median_scale([block]) * float(np.sqrt(values / freedom))
+
+
+def _squares(block: Block, inliers: BoolArray, scale: float) -> float:
+    lengths = block.lengths[inliers]
+    return float(np.sum(block.loss.weight(lengths / scale) * lengths**2))
+
+
+def _median_scale(blocks: Sequence[Block]) -> float:
+    lengths = np.concatenate([b.lengths for b in blocks])
+    lengths = lengths[np.isfinite(lengths)]
+    if not len(lengths):
+        return 1.0
+    return max(float(np.median(lengths)) / _median_length(blocks[0].residuals.shape[1]), _TINY)
+
+
+@functools.cache
+def _median_length(n_values: int) -> float:
+    """Return the median length of so many values with unit noise."""
+    return float(np.sqrt(chi2.ppf(0.5, n_values)))
+
+
+def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
+    order = np.argsort(values)
+    heaped = np.cumsum(weights[order])
+    return float(np.interp(0.5 * heaped[-1], heaped - 0.5 * weights[order], values[order]))
+
+
+__all__ = [
+    "Block",
+    "FreeParameterError",
+    "Problem",
+    "Solution",
+    "information_of",
+    "inverse",
+    "solve",
+]
+
+_MAX_ROUNDS = 20
+_MAX_ITERATIONS = 60
+_DAMPING_START, _DAMPING_LEAST, _DAMPING_LIMIT, _FREE = 1e-4, 1e-12, 1e10, 1e-3
+# Steps shorter than this, in sigmas, leave nothing to gain; so does a relative fall of the cost
+# below rounding. Noise can be told from nearby.
+_SMALL_STEP, _SMALL_FALL, _NEAR = 2e-2, 1e-10, 0.5
+# Relative change of a noise scale that the solution does not feel.
+_SAME_SCALE = 5e-3
+# An observation that a step makes invisible costs as much as one that is so many sigmas off.
+_LOST = 1e3
+# Combinations known worse than this, relative to the best known one, are known to rounding only.
+_RANK = 1e-13
+
+State = TypeVar("State")
+
+
+class FreeParameterError(CalibrationError):
+    """A parameter that neither measurements nor priors say anything about.
+
+    Attributes
+    ----------
+    parameter : int
+        Its place among those of the problem.
+    """
+
+    def __init__(self, parameter: int) -> None:
+        super().__init__(
+            f"parameter {parameter} of the solve is entirely free: no picture says anything about "
+            "it; take more pictures, from other distances and angles"
+        )
+        self.parameter = parameter
+
+
+class Problem(Protocol[State]):
+    """What is solved: residuals of a state, and how a state moves."""
+
+    @property
+    def n_parameters(self) -> int:
+        """Length of a step."""
+
+    def blocks(self, state: State) -> Sequence[Block]:
+        """Return the residuals of a state; always the same blocks with as many rows."""
+
+    def moved(self, state: State, step: FloatArray) -> State:
+        """Return the state moved by a step (P,).
+
+        A RigError, here or in `blocks`, says that such a state cannot exist.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Solution(Generic[State]):
+    """What a solve found.
+
+    Attributes
+    ----------
+    state : State
+        The solution.
+    blocks : tuple of Block
+        Residuals there.
+    inliers : tuple of bool array, shape (N,)
+        For every block, the observations that were believed.
+    block_scales : tuple of float
+        For every block, its noise as a multiple of the nominal one.
+    scales : dict
+        The typical noise of every group of which noise was estimated.
+    information : array, shape (P, P)
+        Of data and priors together, by the estimated noise.
+    covariance : array, shape (P, P)
+        Inverse of `information`.
+    cost : float
+        What was minimised, at the estimated noise.
+    converged : bool
+    n_iterations : int
+    """
+
+    state: State
+    blocks: tuple[Block, ...]
+    inliers: tuple[BoolArray, ...]
+    block_scales: tuple[float, ...]
+    scales: dict[str, float]
+    information: FloatArray
+    covariance: FloatArray
+    cost: float
+    converged: bool
+    n_iterations: int
+
+
+def solve(
+    problem: Problem[State],
+    start: State,
+    *,
+    reject: bool = True,
+    remedy: Callable[[int], str] | None = None,
+) -> Solution[State]:
+    """Minimise the residuals of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is solved.
+    start : State
+        Near enough to the solution for Newton's method.
+    reject : bool
+        Whether observations beyond five scales are left out.
+    remedy : callable, optional
+        Gives the message, with what the user should do, for a parameter that nothing is known of.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    CalibrationError
+        If nothing is known about one of the parameters, or nothing can be seen from the start.
+    """
+    try:
+        return _solved(_Run(problem, start, reject))
+    except FreeParameterError as fault:
+        if remedy is None:
+            raise
+        raise CalibrationError(remedy(fault.parameter)) from fault
+
+
+def _solved(run: "_Run[State]") -> Solution[State]:
+    run.descend(_NEAR)
+    for _ in range(_MAX_ROUNDS):
+        if not run.rescale():
+            break
+        run.descend(_NEAR)
+    run.descend(_SMALL_STEP)
+    return run.solution()
+
+
+def information_of(
+    solution: Solution[State], n_parameters: int, wanted: Callable[[Block], bool]
+) -> FloatArray:
+    """Return the part of a solution's information (P, P) that some of its blocks bring."""
+    chosen = [i for i, block in enumerate(solution.blocks) if wanted(block)]
+    return normal_equations(
+        n_parameters,
+        [solution.blocks[i] for i in chosen],
+        [solution.inliers[i] for i in chosen],
+        [solution.block_scales[i] for i in chosen],
+    ).information
+
+
+def inverse(information: FloatArray) -> FloatArray:
+    """Invert a positive semidefinite matrix whose units differ by many orders of magnitude.
+
+    Combinations known to rounding only get a variance that is huge, but finite.
+
+    Raises
+    ------
+    CalibrationError
+        If nothing at all is known about one of the parameters.
+    """
+    if not len(information):
+        return information
+    size = _sizes(information)
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    values = np.maximum(values, _RANK * values[-1])
+    inverted: FloatArray = (vectors / values) @ vectors.T / np.outer(size, size)
+    return inverted
+
+
+@dataclass(slots=True)
+class _Run(Generic[State]):
+    """A solve under way."""
+
+    problem: Problem[State]
+    state: State
+    reject: bool
+    blocks: tuple[Block, ...] = ()
+    inliers: list[BoolArray] = field(default_factory=list)
+    scales: list[float] = field(default_factory=list)
+    typical: dict[str, float] = field(default_factory=dict)
+    damping: float = _DAMPING_START
+    converged: bool = False
+    n_iterations: int = 0
+
+    def __post_init__(self) -> None:
+        self.blocks = tuple(self.problem.blocks(self.state))
+        self.inliers = [b.seen for b in self.blocks]
+        if not any(seen.any() for seen in self.inliers):
+            raise CalibrationError(
+                "no point can be seen from the starting values; check the rig's lens and dome"
+            )
+        self.scales = start_scales(self.blocks)
+
+    def descend(self, small_step: float) -> None:
+        """Go down towards the minimum at the present scales and inliers, until steps are small."""
+        self.converged = not self.problem.n_parameters
+        here = self._cost(self.blocks)
+        for _ in range(_MAX_ITERATIONS):
+            if self.converged:
+                return
+            equations = self._equations()
+            there, step = self._lower(equations, here)
+            in_sigmas = float(np.sqrt(step @ equations.information @ step))
+            little = here - there <= _SMALL_FALL * here and in_sigmas < 1.0
+            # A damped step is short wherever it is taken.
+            free = self.damping <= _FREE
+            self.converged = free and (in_sigmas < small_step or little)
+            here = there
+
+    def rescale(self) -> bool:
+        """Estimate noise and outliers anew; say whether the minimum moves by it."""
+        before = self.scales, self.inliers
+        equations = self._equations()
+        freedom = freedoms(self.blocks, self.inliers, equations, inverse(equations.information))
+        if self.reject:
+            self.inliers = believed(self.blocks, self.scales, freedom)
+        self.typical = group_scales(self.blocks, self.inliers, self.scales, freedom)
+        self.scales = block_scales(self.blocks, self.inliers, self.scales, freedom, self.typical)
+        same = all(np.array_equal(a, b) for a, b in zip(before[1], self.inliers, strict=True))
+        return not (same and np.allclose(self.scales, before[0], rtol=_SAME_SCALE, atol=0.0))
+
+    def solution(self) -> Solution[State]:
+        """Return what was found."""
+        information = self._equations().information
+        return Solution(
+            state=self.state,
+            blocks=self.blocks,
+            inliers=tuple(self.inliers),
+            block_scales=tuple(self.scales),
+            scales=self.typical,
+            information=information,
+            covariance=inverse(information),
+            cost=self._cost(self.blocks),
+            converged=self.converged,
+            n_iterations=self.n_iterations,
+        )
+
+    def _lower(self, equations: NormalEquations, here: float) -> tuple[float, FloatArray]:
+        """Take one step down, as long as it may be; return the cost there and the step."""
+        diagonal = np.diag(equations.information)
+        while self.damping < _DAMPING_LIMIT:
+            self.n_iterations += 1
+            damped = equations.information + np.diag(self.damping * diagonal)
+            step = _solve(damped, -equations.gradient)
+            trial = self._try(step)
+            if trial is not None and trial[2] <= here:
+                self.state, self.blocks, there = trial
+                self.damping = max(self.damping * 0.1, _DAMPING_LEAST)
+                return there, step
+            self.damping *= 10.0
+        # Nowhere down, to rounding: what slope is left means nothing.
+        self.damping = _DAMPING_START
+        return here, np.zeros(self.problem.n_parameters)
+
+    def _try(self, step: FloatArray) -> tuple[State, tuple[Block, ...], float] | None:
+        try:
+            state = self.problem.moved(self.state, step)
+            blocks = tuple(self.problem.blocks(state))
+        except RigError:
+            return None
+        return state, blocks, self._cost(blocks)
+
+    def _cost(self, blocks: Sequence[Block]) -> float:
+        return cost(blocks, self.inliers, self.scales, _LOST)
+
+    def _equations(self) -> NormalEquations:
+        return normal_equations(self.problem.n_parameters, self.blocks, self.inliers, self.scales)
+
+
+def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    size = _sizes(matrix)
+    solved: FloatArray = np.linalg.solve(matrix / np.outer(size, size), right / size) / size
+    return solved
+
+
+def _sizes(information: FloatArray) -> FloatArray:
+    size: FloatArray = np.sqrt(np.diag(information))
+    if not np.all(size > 0.0):
+        raise FreeParameterError(int(np.argmin(size)))
+    return size

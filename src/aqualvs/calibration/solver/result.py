@@ -1,0 +1,191 @@
+"""What `calibrate dome` and `calibrate camera` return."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import ttest_1samp
+
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
+from aqualvs.calibration.solver.least_squares import Block
+from aqualvs.calibration.targets.targets import View
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.rig import Rig, RigUncertainty
+
+# Views that a comparison takes, and the chance of a wrong verdict that the dome is needed.
+_FEWEST_COMPARED, _CHANCE = 3, 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class ViewFit:
+    """How one view fits.
+
+    Attributes
+    ----------
+    label : str
+        What messages call it.
+    view : View
+    dome_from_target : SE3
+        Pose of its target.
+    covariance : array, shape (6, 6)
+        Of the step of `pose_steps.moved_target`; zero where the pose was exact.
+    residuals : array, shape (N, 2)
+        Measured minus predicted pixels; NaN where the target's point cannot be seen.
+    inliers : bool array, shape (N,)
+        Points that were believed.
+    noise_px : float
+        Estimated standard deviation of a coordinate.
+    """
+
+    label: str
+    view: View
+    dome_from_target: SE3
+    covariance: FloatArray
+    residuals: FloatArray
+    inliers: BoolArray
+    noise_px: float
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of the inliers from their predicted pixels (as OpenCV)."""
+        return rms_px(self.residuals[self.inliers])
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedMedium:
+    """Index of a medium with its uncertainty; 0 where it was taken as exact."""
+
+    name: str
+    n: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class HeldBack:
+    """How well corners are predicted that nothing was solved from: both models, same corners.
+
+    Attributes
+    ----------
+    dome_px, bare_px : array, shape (V,)
+        For every view held back, the root mean square distance of its predicted corners with the
+        dome, and with a bare lens free to sit anywhere.
+    n_by_view : int array, shape (V,)
+        How many corners were predicted by both.
+    """
+
+    dome_px: FloatArray
+    bare_px: FloatArray
+    n_by_view: IntArray
+
+    @property
+    def n_views(self) -> int:
+        """Number of views held back."""
+        return len(self.n_by_view)
+
+    @property
+    def n_points(self) -> int:
+        """Number of their corners."""
+        return int(self.n_by_view.sum())
+
+    @property
+    def dome_rms_px(self) -> float:
+        """Root mean square distance of all corners with the dome."""
+        return float(np.sqrt(np.average(self.dome_px**2, weights=self.n_by_view)))
+
+    @property
+    def bare_rms_px(self) -> float:
+        """Root mean square distance of all corners with a bare lens."""
+        return float(np.sqrt(np.average(self.bare_px**2, weights=self.n_by_view)))
+
+    @property
+    def n_dome_better(self) -> int:
+        """Number of views that the dome predicts better."""
+        return int(np.count_nonzero(self.dome_px < self.bare_px))
+
+    @property
+    def p_value(self) -> float:
+        """Chance of such an advantage of the dome, if there were none.
+
+        Student's test of the views' log ratios: what both models have in common cancels in a view,
+        and corners of one view are not independent. NaN with fewer than three views.
+        """
+        if self.n_views < _FEWEST_COMPARED:
+            return float("nan")
+        ratios = np.log(self.bare_px / self.dome_px)
+        return float(ttest_1samp(ratios, 0.0, alternative="greater").pvalue)
+
+    @property
+    def dome_is_better(self) -> bool:
+        """Whether refraction shows: the bare lens is worse, view by view, by more than chance."""
+        return self.p_value < _CHANCE
+
+
+@dataclass(frozen=True, slots=True)
+class DomeCalibration:
+    """A solved rig, and how far to trust it.
+
+    Attributes
+    ----------
+    rig : Rig
+        With lens, rotation, dome and intrinsics as solved; everything else as it was.
+    uncertainty : RigUncertainty
+        Joint covariance of all that was solved for or held, scaled by the residuals.
+    media : tuple of SolvedMedium
+        One for each set.
+    views : tuple of ViewFit
+    left_out : dict
+        Labels of views, or of what was given of them, that were not used, and why.
+    noise_px : float
+        Typical standard deviation of a corner's coordinate.
+    rotation_is_solved : bool
+        Whether boards told the camera's rotation; if not it is that of the rig as given.
+    held_back : HeldBack or None
+        None where it was not asked for, or there are too few views.
+    findings : tuple of str
+        In plain words: what the data determined, and what they could not.
+    n_iterations : int
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty
+    media: tuple[SolvedMedium, ...]
+    views: tuple[ViewFit, ...]
+    left_out: dict[str, str]
+    noise_px: float
+    rotation_is_solved: bool
+    held_back: HeldBack | None
+    findings: tuple[str, ...]
+    n_iterations: int
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of all inliers from their predicted pixels (as OpenCV)."""
+        return rms_px(np.concatenate([v.residuals[v.inliers] for v in self.views]))
+
+    @property
+    def n_points(self) -> int:
+        """Number of corners that were believed."""
+        return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
+
+
+def rms_px(residuals: FloatArray) -> float:
+    """Return the root mean square length of residuals (N, 2)."""
+    if not len(residuals):
+        return float("nan")
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
+
+
+def view_fit(
+    label: str,
+    view: View,
+    pose: SE3,
+    covariance: FloatArray,
+    block: Block,
+    inliers: BoolArray,
+    scale: float,
+) -> ViewFit:
+    """Return how a view fits, from its block of corners in a bundle."""
+    if not len(covariance):
+        covariance = np.zeros((6, 6))
+    residuals = -CORNER_SIGMA_PX * block.residuals
+    return ViewFit(label, view, pose, covariance, residuals, inliers, CORNER_SIGMA_PX * scale)

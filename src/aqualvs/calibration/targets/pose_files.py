@@ -1,0 +1,289 @@
+"""`poses.csv`: what was measured of the boards' poses, one row a picture.
+
+Columns: `file`; `distance_mm`, where the board's plane meets the dome's y axis; and `T00` to `T23`,
+the first three rows of dome_from_board (translations in millimetres). Either may be left out.
+
+Which pictures the arguments of a command mean.
+"""
+
+import csv
+import difflib
+import glob
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.transforms import SE3
+from aqualvs.special_files import refuse_special
+from aqualvs.yamlfile import read_text
+
+PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+"""What a folder is searched for."""
+
+
+def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
+    """Return the pictures that files, folders and patterns mean, each once.
+
+    Parameters
+    ----------
+    arguments : sequence of str or Path
+        Pictures, folders of them, or patterns such as 'air/*.png'. What one argument means is
+        sorted naturally (`img2` before `img10`).
+
+    Raises
+    ------
+    CalibrationError
+        If an argument means no picture, or two of the pictures have the same file name: poses and
+        reports know pictures by their names.
+    """
+    paths = [path for argument in arguments for path in _meant(str(argument))]
+    if not paths:
+        raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
+    unique = list(dict.fromkeys(paths))
+    first: dict[str, Path] = {}
+    for path in unique:
+        other = first.setdefault(path.name, path)
+        if other is not path:
+            raise CalibrationError(
+                f"{path}: has the same file name as {other}; rename one, pictures are known by name"
+            )
+    return unique
+
+
+def _meant(argument: str) -> list[Path]:
+    path = Path(argument)
+    if path.is_dir():
+        found = [p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES]
+        if not found:
+            raise CalibrationError(
+                f"{path}: no pictures in this folder; looked for "
+                f"{', '.join(sorted(PICTURE_SUFFIXES))}"
+            )
+        return sorted(found, key=_natural)
+    if path.exists():
+        refuse_special(path, CalibrationError)
+        return [path]
+    if glob.has_magic(argument):
+        matches = [Path(match) for match in glob.glob(argument, recursive=True)]
+        found = [p for p in matches if p.is_file()]
+        if found:
+            return sorted(found, key=_natural)
+        raise CalibrationError(f"{argument}: no file matches this pattern; check folder and ending")
+    raise CalibrationError(f"{path}: no such picture or folder; check the path")
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key in which runs of digits count by value."""
+    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", str(path))]
+
+
+__all__ = ["BoardPose", "load_poses", "match_poses", "picture_paths"]
+
+_MM = 1e3
+_MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
+_COLUMNS = ("file", "distance_mm", *_MATRIX)
+# Digits that people keep leave a rotation this far from one.
+_ROTATION_TOLERANCE = 2e-3
+# Half a degree, or half a millimetre, between a row's distance and its matrix.
+_DISTANCE_TOLERANCE_MM = 1.0
+# Distances in other units: no board stands inside a dome, none is seen at 100 m.
+_DISTANCE_MM = (30.0, 1e5)
+_METRES_BELOW = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPose:
+    """What was measured of a board's pose.
+
+    Attributes
+    ----------
+    name : str
+        File name of the picture.
+    distance : float or None
+        Where the board's plane meets the y axis of `dome`, in metres.
+    dome_from_board : SE3 or None
+        The whole pose.
+    """
+
+    name: str
+    distance: float | None
+    dome_from_board: SE3 | None
+
+
+def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
+    """Load a `poses.csv`.
+
+    Raises
+    ------
+    CalibrationError
+        One line that names the file, the line, the value and the remedy.
+    """
+    source = Path(path)
+    text = read_text(source, "a poses.csv", CalibrationError)
+    reader = csv.reader(io.StringIO(text))
+    try:
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as fault:
+        raise CalibrationError(
+            f"{source}: line {reader.line_num} cannot be read ({fault}); mend that line"
+        ) from None
+    if len(rows) < 2:
+        raise CalibrationError(
+            f"{source}: holds no rows; write a line 'file,distance_mm' and one for each picture"
+        )
+    columns = _columns([cell.strip() for cell in rows[0][1]], source)
+    poses: dict[str, BoardPose] = {}
+    for line, row in rows[1:]:
+        pose = _pose(columns, row, f"{source}: line {line}")
+        if pose.name in poses:
+            raise CalibrationError(
+                f"{source}: line {line} names {pose.name} a second time; keep one row a picture"
+            )
+        poses[pose.name] = pose
+    return tuple(poses.values())
+
+
+def _columns(names: list[str], source: Path) -> list[str]:
+    if len(names) == 1 and ";" in names[0]:
+        raise CalibrationError(f"{source}: is separated by semicolons; save it with commas")
+    for name in names:
+        if name not in _COLUMNS:
+            close = difflib.get_close_matches(name, _COLUMNS, n=1, cutoff=0.5)
+            known = "known are file, distance_mm and T00 to T23"
+            hint = f"did you mean '{close[0]}'?" if close else known
+            raise CalibrationError(f"{source}: {name!r} is not a column of a poses.csv; {hint}")
+        if names.count(name) > 1:
+            raise CalibrationError(f"{source}: column {name} appears twice; keep one")
+    if "file" not in names:
+        raise CalibrationError(f"{source}: column file is missing; it names the picture of a row")
+    missing = [name for name in _MATRIX if name not in names]
+    if 0 < len(missing) < len(_MATRIX):
+        raise CalibrationError(
+            f"{source}: column {missing[0]} is missing; give all of T00 to T23, or none"
+        )
+    if missing and "distance_mm" not in names:
+        raise CalibrationError(
+            f"{source}: says nothing of poses; add a column distance_mm, or T00 to T23"
+        )
+    return names
+
+
+def _pose(columns: list[str], row: list[str], place: str) -> BoardPose:
+    if len(row) != len(columns):
+        raise CalibrationError(
+            f"{place} has {len(row)} values for {len(columns)} columns; mend the line"
+        )
+    cells = dict(zip(columns, (cell.strip() for cell in row), strict=True))
+    name = Path(cells["file"]).name
+    if not name:
+        raise CalibrationError(f"{place}: file is empty; write the picture's file name")
+    values = {key: _number(key, cell, place) for key, cell in cells.items() if key != "file"}
+    distance_mm = values.get("distance_mm")
+    if distance_mm is not None:
+        _check_distance(distance_mm, place)
+    matrix = [values.get(key) for key in _MATRIX]
+    pose = _matrix_pose(matrix, place)
+    if pose is not None and distance_mm is not None:
+        _check_agreement(pose, distance_mm, place)
+    return BoardPose(name, None if distance_mm is None else distance_mm / _MM, pose)
+
+
+def _number(key: str, cell: str, place: str) -> float | None:
+    """Return a cell's number; an empty cell is not known."""
+    if not cell:
+        return None
+    try:
+        value = float(cell)
+    except ValueError:
+        raise CalibrationError(f"{place}: {key} is {cell!r}; write a plain number") from None
+    if not np.isfinite(value):
+        raise CalibrationError(f"{place}: {key} is {cell!r}; write a finite number")
+    return value
+
+
+def _check_distance(distance_mm: float, place: str) -> None:
+    if not _DISTANCE_MM[0] <= distance_mm <= _DISTANCE_MM[1]:
+        small = 0.0 < distance_mm < _DISTANCE_MM[0]
+        unit = "metres" if distance_mm < _METRES_BELOW else "centimetres"
+        hint = f"it looks like {unit}, " if small else ""
+        raise CalibrationError(
+            f"{place}: distance_mm is {distance_mm:g}; {hint}give millimetres from the dome's "
+            "centre along its y axis"
+        )
+
+
+def _matrix_pose(matrix: list[float | None], place: str) -> SE3 | None:
+    known = [value for value in matrix if value is not None]
+    if not known:
+        return None
+    if len(known) < len(_MATRIX):
+        empty = _MATRIX[matrix.index(None)]
+        raise CalibrationError(f"{place}: {empty} is empty; give all of T00 to T23, or none")
+    whole = np.array(known).reshape(3, 4)
+    rotation = whole[:, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        what = "a mirror image" if off <= _ROTATION_TOLERANCE else f"off by {off:.2g}"
+        raise CalibrationError(
+            f"{place}: T00 to T22 are no rotation ({what}); give the columns of dome_from_board "
+            "with at least four decimals"
+        )
+    # The nearest rotation, since digits were cut.
+    left, _, right = np.linalg.svd(rotation)
+    return SE3(left @ right, whole[:, 3] / _MM)
+
+
+def _check_agreement(pose: SE3, distance_mm: float, place: str) -> None:
+    normal = pose.rotation[:, 2]
+    if abs(normal[1]) < 0.1:
+        raise CalibrationError(
+            f"{place}: the board's plane hardly meets the y axis; leave its distance_mm empty"
+        )
+    by_matrix_mm = _MM * float(normal @ pose.translation / normal[1])
+    if abs(by_matrix_mm - distance_mm) > _DISTANCE_TOLERANCE_MM:
+        units = abs(_MM * by_matrix_mm - distance_mm) <= 0.01 * distance_mm
+        hint = "T03, T13 and T23 look like metres, write millimetres" if units else "mend one"
+        raise CalibrationError(
+            f"{place}: distance_mm is {distance_mm:g}, but T00 to T23 put the board's plane at "
+            f"{by_matrix_mm:.4g} mm on the y axis; {hint}"
+        )
+
+
+def match_poses(
+    poses: Sequence[BoardPose], names: Sequence[str], source: Path
+) -> tuple[tuple[BoardPose, ...], tuple[str, ...]]:
+    """Return the pose of each picture, in the pictures' order, and what to remark.
+
+    Parameters
+    ----------
+    poses : sequence of BoardPose
+        Rows of the file.
+    names : sequence of str
+        File names of the pictures.
+    source : Path
+        The file, for messages.
+
+    Raises
+    ------
+    CalibrationError
+        If a picture has no row.
+    """
+    by_name = {pose.name: pose for pose in poses}
+    for name in names:
+        if name not in by_name:
+            close = difflib.get_close_matches(name, by_name, n=1, cutoff=0.6)
+            hint = f"; is {close[0]} meant?" if close else ""
+            raise CalibrationError(
+                f"{source}: has no row for {name}; add one, or leave the picture out{hint}"
+            )
+    spare = [name for name in by_name if name not in set(names)]
+    notes: tuple[str, ...] = ()
+    if spare:
+        shown = ", ".join(spare[:3]) + (", ..." if len(spare) > 3 else "")
+        notes = (f"{source}: {len(spare)} rows without a picture of the board ({shown})",)
+    return tuple(by_name[name] for name in names), notes

@@ -1,0 +1,516 @@
+"""Put printed targets on pages: paper, ruler, words.
+
+Lay out the markers of a calibration box (paper, 3.3): four planes, cut into sheets of paper.
+
+Frame `box`: origin at the middle of the open mouth, x right, y forward, z up.
+
+Where a target is black: rectangles of boards and markers, to print or to render.
+
+True-to-scale PDF of black rectangles and small text: all that printed targets need.
+
+Lengths are millimetres from a page's top-left corner, x right, y down. All rectangles of a page are
+one path, so that no viewer shows seams between neighbours; the file asks viewers not to scale it.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aqualvs.calibration.detection.tag_corners import marker_cells
+from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, aruco_dictionary
+from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+
+# From marker to marker, in sides of a marker: enough light ring, and room for stripes to cross.
+_PITCH = 1.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoxPlan:
+    """A box, open towards the vehicle and at its top.
+
+    Attributes
+    ----------
+    width, height, depth : float
+        Inside, along x, z and y, in metres.
+    marker : float
+        Side of a marker, in metres.
+    family : str
+        Name of the markers' dictionary.
+    first_id : int
+        Number of the first marker; the others follow.
+    """
+
+    width: float
+    height: float
+    depth: float
+    marker: float
+    family: str
+    first_id: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A piece of a plane that one sheet of paper covers.
+
+    Attributes
+    ----------
+    plane : str
+        On which plane it lies.
+    offset : (float, float)
+        Of its top-left corner from the plane's, right and down as seen from inside, in metres.
+    size : (float, float)
+        Width and height, in metres.
+    ids : tuple of int
+        Its markers.
+    corners : array, shape (M, 2)
+        Their top-left corners from the patch's own, in metres.
+    """
+
+    plane: str
+    offset: tuple[float, float]
+    size: tuple[float, float]
+    ids: tuple[int, ...]
+    corners: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Wall:
+    """A plane with axes right and down as seen from inside; `origin` is its top left."""
+
+    plane: Plane
+    origin: FloatArray
+    right: FloatArray
+    down: FloatArray
+    size: tuple[float, float]
+
+
+def box_patches(
+    plan: BoxPlan, rooms: Sequence[tuple[float, float]]
+) -> tuple[MarkerSet, tuple[Patch, ...]]:
+    """Return a box's markers, and the pieces in which they can be printed.
+
+    Parameters
+    ----------
+    plan : BoxPlan
+        The box.
+    rooms : sequence of (float, float)
+        Width and height that a sheet of paper can hold, in metres: upright and across. Infinite
+        for sheets as large as a plane.
+
+    Raises
+    ------
+    CalibrationError
+        If a plane or a sheet is too small for a marker, or the dictionary has too few.
+    """
+    pitch = _PITCH * plan.marker
+    _check(plan, pitch, rooms)
+    ids: list[int] = []
+    corners: list[FloatArray] = []
+    names: list[str] = []
+    patches: list[Patch] = []
+    walls = _walls(plan)
+    for name, wall in walls.items():
+        first = plan.first_id + len(ids)
+        placed = _grid(wall, pitch, plan.marker)
+        patches += _patches(name, placed, first, pitch, plan.marker, rooms)
+        numbers = first + np.arange(placed.shape[0] * placed.shape[1])
+        ids += numbers.tolist()
+        corners += [_in_box(wall, corner, plan.marker) for corner in placed.reshape(-1, 2)]
+        names += [name] * len(numbers)
+    held = len(aruco_dictionary(plan.family).bytesList)
+    if plan.first_id < 0 or ids[-1] >= held:
+        raise CalibrationError(
+            f"a box with markers {plan.first_id} to {ids[-1]}, but {plan.family} has ids 0 to "
+            f"{held - 1}; take larger markers or a smaller box"
+        )
+    markers = MarkerSet(
+        frame="box",
+        family=plan.family,
+        ids=np.array(ids, np.int64),
+        corners=np.array(corners),
+        plane_names=tuple(names),
+        planes={name: wall.plane for name, wall in walls.items()},
+    )
+    return markers, tuple(patches)
+
+
+def _check(plan: BoxPlan, pitch: float, rooms: Sequence[tuple[float, float]]) -> None:
+    smallest = min(plan.width, plan.height, plan.depth)
+    if not (plan.marker > 0.0 and smallest >= pitch):
+        raise CalibrationError(
+            f"a box with a side of {1e3 * smallest:g} mm for markers of {1e3 * plan.marker:g} mm, "
+            f"which take {1e3 * pitch:g} mm each; take smaller markers"
+        )
+    room = max(min(room) for room in rooms)
+    if room < pitch:
+        raise CalibrationError(
+            f"markers of {1e3 * plan.marker:g} mm take {1e3 * pitch:g} mm each, but a sheet has "
+            f"only {1e3 * room:g} mm; take larger paper or smaller markers"
+        )
+
+
+def _walls(plan: BoxPlan) -> dict[str, _Wall]:
+    x, y, z = np.eye(3)
+    left, deep, low = -0.5 * plan.width * x, plan.depth * y, -0.5 * plan.height * z
+    side = (plan.depth, plan.height)
+    return {
+        "forward": _Wall(Plane(y, plan.depth), left + deep - low, x, -z, (plan.width, plan.height)),
+        "left": _Wall(Plane(x, -0.5 * plan.width), left - low, y, -z, side),
+        "right": _Wall(Plane(x, 0.5 * plan.width), deep - left - low, -y, -z, side),
+        "down": _Wall(
+            Plane(z, -0.5 * plan.height), left + deep + low, x, -y, (plan.width, plan.depth)
+        ),
+    }
+
+
+def _grid(wall: _Wall, pitch: float, marker: float) -> FloatArray:
+    """Return the top-left corners (rows, columns, 2) of the markers, in the middle of the wall."""
+    counts = [int(side / pitch + 1e-9) for side in wall.size]
+    starts = [
+        0.5 * (side - n * pitch) + 0.5 * (pitch - marker)
+        for side, n in zip(wall.size, counts, strict=True)
+    ]
+    across, below = (start + pitch * np.arange(n) for start, n in zip(starts, counts, strict=True))
+    return np.stack(np.meshgrid(across, below), axis=-1)
+
+
+def _patches(
+    name: str,
+    placed: FloatArray,
+    first: int,
+    pitch: float,
+    marker: float,
+    rooms: Sequence[tuple[float, float]],
+) -> list[Patch]:
+    """Cut a wall's grid into blocks of whole cells that fit a sheet, the way that takes fewest."""
+    rows, columns = placed.shape[:2]
+    numbers = first + np.arange(rows * columns).reshape(rows, columns)
+    ways = [_block(room, pitch, rows, columns) for room in rooms if min(room) >= pitch]
+    n_down, n_across = min(ways, key=lambda way: -(-rows // way[0]) * -(-columns // way[1]))
+    inset = 0.5 * (pitch - marker)
+    patches = []
+    for i in range(0, rows, n_down):
+        for j in range(0, columns, n_across):
+            block = placed[i : i + n_down, j : j + n_across]
+            corner = block[0, 0] - inset
+            patches.append(
+                Patch(
+                    name,
+                    (float(corner[0]), float(corner[1])),
+                    (block.shape[1] * pitch, block.shape[0] * pitch),
+                    tuple(numbers[i : i + n_down, j : j + n_across].ravel().tolist()),
+                    block.reshape(-1, 2) - corner,
+                )
+            )
+    return patches
+
+
+def _block(room: tuple[float, float], pitch: float, rows: int, columns: int) -> tuple[int, int]:
+    """Return how many rows and columns of cells a sheet holds."""
+    return int(min(room[1] / pitch + 1e-9, rows)), int(min(room[0] / pitch + 1e-9, columns))
+
+
+def _in_box(wall: _Wall, corner: FloatArray, marker: float) -> FloatArray:
+    """Return a marker's corners (4, 3) in `box`."""
+    flat = corner + marker * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    points: FloatArray = wall.origin + flat[:, :1] * wall.right + flat[:, 1:] * wall.down
+    return points
+
+
+def board_rectangles(board: Board) -> FloatArray:
+    """Return x, y, width, height (N, 4) of a board's black areas, in `board`, metres."""
+    n_x, n_y = board.squares
+    column, row = np.meshgrid(np.arange(n_x), np.arange(n_y))
+    dark = (column + row) % 2 == (1 if board.first_is_light else 0)
+    corner = board.square * np.stack([column[dark], row[dark]], axis=-1).astype(np.float64)
+    squares = np.concatenate([corner, np.full_like(corner, board.square)], axis=-1)
+    if board.kind is BoardKind.CHESSBOARD:
+        return squares
+    markers = [
+        marker_rectangles(board.dictionary, number, points[0, :2], board.marker)
+        for number, points in enumerate(board.marker_points())
+    ]
+    return np.concatenate([squares, *markers])
+
+
+def marker_rectangles(family: str, number: int, corner: FloatArray, size: float) -> FloatArray:
+    """Return x, y, width, height (N, 4) of a marker's black areas.
+
+    Parameters
+    ----------
+    family : str
+        Name of the dictionary.
+    number : int
+        Which marker of it.
+    corner : array, shape (2,)
+        The marker's top-left corner, in the unit of `size`.
+    size : float
+        Side of the marker.
+    """
+    cells = marker_cells(family, number)[1:-1, 1:-1]
+    cell = size / len(cells)
+    rectangles = []
+    for row, values in enumerate(cells):
+        # Runs of dark cells; the light ends close a run at either side.
+        edges = np.flatnonzero(np.diff(np.concatenate([[1.0], values, [1.0]])))
+        for first, after in edges.reshape(-1, 2):
+            x, y = corner + cell * np.array([first, row])
+            rectangles.append([x, y, cell * (after - first), cell])
+    return np.array(rectangles)
+
+
+_POINTS_PER_MM = 72.0 / 25.4
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A line of Helvetica.
+
+    Attributes
+    ----------
+    x, y : float
+        Where it begins, on its base line, in millimetres.
+    size : float
+        Height of its letters' em, in millimetres.
+    words : str
+        Latin letters.
+    """
+
+    x: float
+    y: float
+    size: float
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """One page.
+
+    Attributes
+    ----------
+    width, height : float
+        In millimetres.
+    rectangles : array, shape (N, 4)
+        x, y, width, height of what is black, in millimetres.
+    texts : tuple of Text
+    """
+
+    width: float
+    height: float
+    rectangles: FloatArray
+    texts: tuple[Text, ...] = field(default=())
+
+
+def pdf_bytes(pages: Sequence[Page], title: str) -> bytes:
+    """Return a PDF file of these pages; the same pages give the same bytes."""
+    kids = " ".join(f"{4 + 2 * i} 0 R" for i in range(len(pages)))
+    objects = [
+        "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        f"<< /Type /Pages /Kids [{kids}] /Count {len(pages)} >>",
+        "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+    ]
+    for i, page in enumerate(pages):
+        width, height = page.width * _POINTS_PER_MM, page.height * _POINTS_PER_MM
+        objects.append(
+            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] "
+            f"/Resources << /Font << /F 3 0 R >> >> /Contents {5 + 2 * i} 0 R >>"
+        )
+        content = _content(page)
+        objects.append(f"<< /Length {len(_encoded(content))} >>\nstream\n{content}\nendstream")
+    objects.append(f"<< /Title ({_escaped(title)}) /Producer (aqualvs) >>")
+    return _file(objects)
+
+
+def _content(page: Page) -> str:
+    """Return a page's drawing: millimetres, y down."""
+    scale = f"{_POINTS_PER_MM:.8f}"
+    height = f"{page.height * _POINTS_PER_MM:.4f}"
+    lines = [f"{scale} 0 0 -{scale} 0 {height} cm", "0 g"]
+    lines += [" ".join(f"{value:.4f}" for value in row) + " re" for row in page.rectangles]
+    lines.append("f")
+    for text in page.texts:
+        place = f"1 0 0 -1 {text.x:.4f} {text.y:.4f} Tm"
+        lines.append(f"BT /F {text.size:.3f} Tf {place} ({_escaped(text.words)}) Tj ET")
+    return "\n".join(lines)
+
+
+def _escaped(words: str) -> str:
+    return words.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+
+
+def _encoded(text: str) -> bytes:
+    return text.encode("cp1252", errors="replace")
+
+
+def _file(objects: Sequence[str]) -> bytes:
+    """Return the file of these objects; the last one is its information."""
+    body = b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"
+    places = []
+    for i, text in enumerate(objects):
+        places.append(len(body))
+        body += f"{i + 1} 0 obj\n".encode() + _encoded(text) + b"\nendobj\n"
+    table = "".join(f"{place:010d} 00000 n \n" for place in places)
+    n = len(objects) + 1
+    end = (
+        f"xref\n0 {n}\n0000000000 65535 f \n{table}trailer\n"
+        f"<< /Size {n} /Root 1 0 R /Info {n - 1} 0 R >>\nstartxref\n{len(body)}\n%%EOF\n"
+    )
+    return body + end.encode()
+
+
+PAPERS_MM: dict[str, tuple[float, float]] = {
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+}
+"""Width and height of papers, upright."""
+
+FIT = "fit"
+"""Paper that is cut to what is printed on it."""
+
+_EDGE_MM = 8.0
+"""What printers leave white around a page."""
+_STRIP_MM = 14.0
+"""Below what is printed: ruler and words."""
+_RULER_MM = 100.0
+_TEXT_MM = 3.2
+_HAIR_MM = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Paper:
+    """Paper, in one of its two orientations.
+
+    Attributes
+    ----------
+    size_mm : (float, float) or None
+        Width and height; None for paper that fits.
+    name : str
+        How messages call it.
+    """
+
+    size_mm: tuple[float, float] | None
+    name: str
+
+    @property
+    def room_mm(self) -> tuple[float, float]:
+        """Width and height that can be printed on, less the ruler's strip."""
+        if self.size_mm is None:
+            return np.inf, np.inf
+        return self.size_mm[0] - 2.0 * _EDGE_MM, self.size_mm[1] - 2.0 * _EDGE_MM - _STRIP_MM
+
+    def page_mm(self, width: float, height: float) -> tuple[float, float]:
+        """Return the page's size for something of this size."""
+        if self.size_mm is not None:
+            return self.size_mm
+        wide = max(width, _RULER_MM + 60.0)
+        return wide + 2.0 * _EDGE_MM, height + 2.0 * _EDGE_MM + _STRIP_MM
+
+
+def papers(word: str) -> tuple[Paper, Paper]:
+    """Return a paper upright and across.
+
+    Parameters
+    ----------
+    word : str
+        "a4", "a3" and so on, "fit", or width x height in millimetres, such as "600x400".
+
+    Raises
+    ------
+    OptionError
+        If it is none of these.
+    """
+    key = word.strip().lower()
+    if key == FIT:
+        return Paper(None, FIT), Paper(None, FIT)
+    if key in PAPERS_MM:
+        width, height = PAPERS_MM[key]
+        return Paper((width, height), key.upper()), Paper((height, width), f"{key.upper()} across")
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", key)
+    if match is None:
+        raise OptionError(
+            f"--paper {word}: not known; use {', '.join(PAPERS_MM)}, {FIT}, or millimetres such as "
+            "600x400"
+        )
+    width, height = float(match[1]), float(match[2])
+    if min(width, height) < _RULER_MM + 2.0 * _EDGE_MM:
+        raise OptionError(
+            f"--paper {word}: too small for the ruler of 100 mm; take at least 116x116"
+        )
+    return Paper((width, height), word), Paper((height, width), f"{height:g}x{width:g}")
+
+
+def best_paper(word: str, width: float, height: float, what: str) -> Paper:
+    """Return the orientation that has room for something of this size, in millimetres.
+
+    Raises
+    ------
+    OptionError
+        If neither has.
+    """
+    for paper in papers(word):
+        room = paper.room_mm
+        if width <= room[0] + 1e-6 and height <= room[1] + 1e-6:
+            return paper
+    raise OptionError(
+        f"--paper {word}: {what} measures {width:g} x {height:g} mm and does not fit with its "
+        f"ruler; take larger paper, '--paper {FIT}' for a print shop, or smaller squares"
+    )
+
+
+def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words: str) -> Page:
+    """Return a page with something in its middle, a ruler to check the scale, and words.
+
+    Parameters
+    ----------
+    paper : Paper
+        With room for it.
+    rectangles : array, shape (N, 4)
+        x, y, width, height of what is black, from its own top left, millimetres.
+    size : (float, float)
+        Width and height of the whole, light border included, in millimetres.
+    words : str
+        What it is, in small print.
+    """
+    width, height = paper.page_mm(*size)
+    left, top = 0.5 * (width - size[0]), _EDGE_MM
+    if paper.size_mm is not None:
+        top = 0.5 * (height - _STRIP_MM - size[1])
+    placed = rectangles + np.array([left, top, 0.0, 0.0])
+    ruler_y = height - _EDGE_MM - 8.0
+    scale = "the line above measures exactly 100 mm: print at 100 %, without fitting to the page"
+    texts = (
+        Text(_EDGE_MM, height - _EDGE_MM - 4.2, _TEXT_MM, words),
+        Text(_EDGE_MM, height - _EDGE_MM, _TEXT_MM, scale),
+    )
+    return Page(width, height, np.concatenate([placed, ruler(_EDGE_MM, ruler_y)]), texts)
+
+
+def ruler(x: float, y: float) -> FloatArray:
+    """Return the rectangles (N, 4) of a ruler of 100 mm, with a tick every 10 mm."""
+    ticks = np.arange(0.0, _RULER_MM + 1.0, 10.0)
+    high = np.where(ticks % 50.0 == 0.0, 4.0, 2.5)
+    # The outer edges of the first and the last tick are 100 mm apart.
+    lefts = x + ticks - _HAIR_MM * ticks / _RULER_MM
+    marks = np.stack([lefts, y - high, np.full_like(ticks, _HAIR_MM), high], axis=-1)
+    return np.concatenate([marks, [[x, y - _HAIR_MM, _RULER_MM, _HAIR_MM]]])
+
+
+def outline(x: float, y: float, width: float, height: float) -> FloatArray:
+    """Return the rectangles (4, 4) of a hairline along which to cut; its middle is the cut."""
+    half = 0.5 * _HAIR_MM
+    return np.array(
+        [
+            [x - half, y - half, width + _HAIR_MM, _HAIR_MM],
+            [x - half, y + height - half, width + _HAIR_MM, _HAIR_MM],
+            [x - half, y + half, _HAIR_MM, height - _HAIR_MM],
+            [x + width - half, y + half, _HAIR_MM, height - _HAIR_MM],
+        ]
+    )

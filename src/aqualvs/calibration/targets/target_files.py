@@ -1,0 +1,615 @@
+"""Read and write what describes targets: `board.yaml`, `box.yaml` and `target.yaml`.
+
+Files speak millimetres, types metres. docs/targets.md explains every key.
+
+The text of target files: tolerant of notes, strict about everything else.
+
+What `board.yaml`, `box.yaml` and `target.yaml` may contain, key by key.
+
+What must hold for markers at known places: sizes, order, planes, units.
+"""
+
+import difflib
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from aqualvs.calibration.targets.targets import (
+    DICTIONARIES,
+    Board,
+    BoardKind,
+    MarkerSet,
+    aruco_dictionary,
+    dictionary_id,
+)
+from aqualvs.errors import CalibrationError, OutputError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text
+
+# Free text that people write without quotes, colons and all, which YAML would trip over.
+_FREE_TEXT = re.compile(
+    r"^(frame|corner_order|note):[ \t]+(?![\"'|>\[{&*!%@`])(?P<text>\S.*?)[ \t]*$", re.MULTILINE
+)
+
+
+def read_mapping(path: Path, what: str) -> dict[Any, Any]:
+    """Return the keys and values of a YAML file; `what` says what it should be.
+
+    Raises
+    ------
+    CalibrationError
+        One line, if the file cannot be read or does not hold keys and values.
+    """
+    text = _FREE_TEXT.sub(_quoted, read_text(path, what, CalibrationError))
+    content = parse_yaml(text, str(path), CalibrationError)
+    if not isinstance(content, dict):
+        raise CalibrationError(f"{path}: holds no keys; give the path of {what}")
+    return content
+
+
+def _quoted(match: re.Match[str]) -> str:
+    text = match["text"].replace("'", "''")
+    return f"{match[1]}: '{text}'"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        raise OutputError(
+            f"{path}: cannot be written ({fault.strerror}); choose another place"
+        ) from None
+
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=2, le=1000)]
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Corners = Annotated[list[Triple], Field(min_length=4, max_length=4)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class BoardFile(_Part):
+    """`board.yaml`."""
+
+    kind: Literal["chessboard", "charuco"] | None = None
+    squares_x: Count | None = None
+    squares_y: Count | None = None
+    inner_corners_x: Count | None = None
+    inner_corners_y: Count | None = None
+    square_mm: Positive
+    marker_mm: Positive | None = None
+    dictionary: str | None = None
+    border_mm: NotNegative = 0.0
+    legacy_pattern: bool = False
+    note: Any = None
+
+
+class PlanePart(_Part):
+    """One of `planes`: normal . X = d."""
+
+    normal: Triple
+    d: Number
+
+
+class MarkerPart(_Part):
+    """One of `markers`."""
+
+    id: Annotated[int, Field(ge=0)]
+    plane: str | None = None
+    size_mm: Positive
+    corners: Corners
+
+
+class MediumPart(_Part):
+    """`medium`: what the pictures were taken in."""
+
+    n_outside_nominal: Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
+
+
+class MarkersFile(_Part):
+    """`box.yaml` and `target.yaml`."""
+
+    frame: str | None = None
+    planes: dict[str, PlanePart] = {}
+    family: str
+    corner_order: str | None = None
+    markers: Annotated[list[MarkerPart], Field(min_length=1)]
+    medium: MediumPart | None = None
+    note: Any = None
+
+
+_File = TypeVar("_File", BoardFile, MarkersFile)
+
+_PARTS: dict[str, type[BaseModel]] = {
+    "planes": PlanePart,
+    "markers": MarkerPart,
+    "medium": MediumPart,
+}
+_EXAMPLES = {
+    "kind": "kind: charuco",
+    "squares_x": "squares_x: 11",
+    "squares_y": "squares_y: 8",
+    "inner_corners_x": "inner_corners_x: 6",
+    "inner_corners_y": "inner_corners_y: 9",
+    "square_mm": "square_mm: 24.0",
+    "marker_mm": "marker_mm: 18.0",
+    "dictionary": "dictionary: DICT_4X4_250",
+    "border_mm": "border_mm: 12.0",
+    "legacy_pattern": "legacy_pattern: false",
+    "planes": "planes: {left: {normal: [1.0, 0.0, 0.0], d: -200.0}}",
+    "normal": "normal: [1.0, 0.0, 0.0]",
+    "d": "d: -200.0",
+    "family": "family: DICT_APRILTAG_36h11",
+    "markers": "markers: [{id: 0, size_mm: 48.0, corners: [...]}]",
+    "id": "id: 0",
+    "plane": "plane: left",
+    "size_mm": "size_mm: 48.0",
+    "corners": "corners: [[x, y, z], [x, y, z], [x, y, z], [x, y, z]]",
+    "medium": "medium: {n_outside_nominal: 1.333}",
+    "n_outside_nominal": "n_outside_nominal: 1.333",
+}
+_TYPES = {
+    "float_type": "a plain number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a word",
+    "list_type": "a list",
+    "model_type": "keys and values",
+    "dict_type": "keys and values",
+}
+_LIMITS = {
+    "finite_number": "write a finite number",
+    "greater_than": "it must be greater than {gt:g}",
+    "greater_than_equal": "it must be at least {ge:g}",
+    "less_than_equal": "it must be at most {le:g}",
+    "too_short": "write {min_length} values",
+    "too_long": "write {max_length} values",
+}
+
+
+def parse_target(content: dict[Any, Any], model: type[_File], source: str) -> _File:
+    """Check the content of a target file, key by key.
+
+    Raises
+    ------
+    CalibrationError
+        One line on the first fault: file, place, value, remedy.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+        unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
+        # A misspelt key explains the one that is missing.
+        sentence = _sentence((unknown or faults)[0], model)
+        raise CalibrationError(f"{source}: {sentence}") from None
+
+
+def _sentence(fault: ErrorDetails, model: type[BaseModel]) -> str:
+    place, kind = _place(fault["loc"]), fault["type"]
+    if kind == "extra_forbidden":
+        return f"{place} is not a key of this file; {_closest(fault['loc'], model)}"
+    if kind == "missing":
+        return f"{place} is missing; add it, for example '{_example(fault['loc'])}'"
+    if kind == "literal_error":
+        return f"{place} is {_shown(fault['input'])}; write {fault['ctx']['expected']}"
+    limits = fault.get("ctx", {})
+    if kind in _LIMITS:
+        remedy = _LIMITS[kind].format(**limits)
+    elif kind in _TYPES:
+        remedy = f"write {_TYPES[kind]}, for example '{_example(fault['loc'])}'"
+    else:
+        remedy = fault["msg"]
+    return f"{place} is {_shown(fault['input'])}; {remedy}"
+
+
+def _example(loc: tuple[int | str, ...]) -> str:
+    words = [part for part in loc if part in _EXAMPLES]
+    return _EXAMPLES[str(words[-1])] if words else "note: text"
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    text = ""
+    for part in loc:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def _closest(loc: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    part = _PARTS.get(str(loc[0]), model) if len(loc) > 1 else model
+    known = list(part.model_fields)
+    close = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
+
+
+def _shown(value: object) -> str:
+    text = "empty" if value is None else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+# A ruler's error, as a share of the marker and in millimetres.
+_SIDE_TOLERANCE = (0.02, 0.2)
+_PLANE_TOLERANCE_MM = 0.5
+_SMALLEST_MM = 3.0
+# A box whose markers are all nearer to its origin than this, or a target this near to the dome's
+# centre, is given in other units: no vehicle fits in, no dome is so small.
+_SMALLEST_BOX_MM = 100.0
+_NEAREST_TARGET_MM = 30.0
+_UNITS = {1e-3: "metres", 1e-1: "centimetres"}
+
+
+def check_markers(file: MarkersFile, frame: str, source: Path) -> None:
+    """Check the markers of a file as a whole; lengths in it are millimetres.
+
+    Raises
+    ------
+    CalibrationError
+        One line on the first fault: file, marker, value, remedy.
+    """
+    try:
+        _check_ids(file)
+        planes = {name: _plane(name, part.normal, part.d) for name, part in file.planes.items()}
+        for part in file.markers:
+            _check_shape(part)
+            _check_plane(part, planes)
+        corners = np.array([part.corners for part in file.markers])
+        _check_extent(corners, frame)
+        _check_facing(file, corners, frame)
+    except CalibrationError as fault:
+        raise CalibrationError(f"{source}: {fault}") from None
+
+
+def _check_ids(file: MarkersFile) -> None:
+    held = len(aruco_dictionary(file.family).bytesList)
+    seen: set[int] = set()
+    for part in file.markers:
+        if part.id in seen:
+            raise CalibrationError(f"marker {part.id} is listed twice; every id is one marker")
+        if part.id >= held:
+            raise CalibrationError(
+                f"marker {part.id} is not in {file.family}, which has ids 0 to {held - 1}; check "
+                "the id or the family"
+            )
+        seen.add(part.id)
+
+
+def _plane(name: str, normal: list[float], d: float) -> Plane:
+    try:
+        return Plane.from_normal(normal, d)
+    except ValueError:
+        raise CalibrationError(
+            f"planes.{name}.normal is {normal}; a normal has a direction"
+        ) from None
+
+
+def _check_shape(part: MarkerPart) -> None:
+    corners = np.array(part.corners)
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    diagonals = np.linalg.norm(corners[2:] - corners[:2], axis=1)
+    if part.size_mm < _SMALLEST_MM:
+        unit = "metres" if part.size_mm < 0.3 else "centimetres"
+        raise CalibrationError(
+            f"marker {part.id}: size_mm is {part.size_mm:g}; it looks like {unit}, write "
+            "millimetres everywhere"
+        )
+    for factor, unit in _UNITS.items():
+        if np.allclose(sides, factor * part.size_mm, rtol=0.05):
+            raise CalibrationError(
+                f"marker {part.id}: its corners are {sides[0]:g} apart, but size_mm is "
+                f"{part.size_mm:g}; the corners look like {unit}, write millimetres"
+            )
+    tolerance = max(_SIDE_TOLERANCE[0] * part.size_mm, _SIDE_TOLERANCE[1])
+    if np.any(np.abs(sides - np.sqrt(2.0) * part.size_mm) < tolerance):
+        raise CalibrationError(
+            f"marker {part.id}: its corners are not in order around it; write top-left, "
+            "top-right, bottom-right, bottom-left"
+        )
+    worst = int(np.argmax(np.abs(sides - part.size_mm)))
+    if abs(sides[worst] - part.size_mm) > tolerance:
+        raise CalibrationError(
+            f"marker {part.id}: corners {worst} and {(worst + 1) % 4} are {sides[worst]:.2f} mm "
+            f"apart, but size_mm is {part.size_mm:g}; mend the corners or the size"
+        )
+    if np.any(np.abs(diagonals - np.sqrt(2.0) * part.size_mm) > 2.0 * tolerance):
+        raise CalibrationError(
+            f"marker {part.id}: its diagonals are {diagonals[0]:.2f} and {diagonals[1]:.2f} mm, "
+            "so it is no square; mend the corners"
+        )
+
+
+def _check_plane(part: MarkerPart, planes: dict[str, Plane]) -> None:
+    if part.plane is None:
+        return
+    if part.plane not in planes:
+        close = difflib.get_close_matches(part.plane, planes, n=1, cutoff=0.5)
+        known = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(planes)}"
+        raise CalibrationError(f"marker {part.id}: plane {part.plane!r} is not in planes; {known}")
+    off = planes[part.plane].signed_distance(np.array(part.corners))
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) > _PLANE_TOLERANCE_MM:
+        raise CalibrationError(
+            f"marker {part.id}: corner {worst} lies {abs(off[worst]):.1f} mm off plane "
+            f"{part.plane!r}; mend the corner, the plane's d, or the plane's name"
+        )
+
+
+def _check_extent(corners: FloatArray, frame: str) -> None:
+    distance = np.linalg.norm(corners, axis=-1)
+    if frame == "box" and distance.max() < _SMALLEST_BOX_MM:
+        raise CalibrationError(
+            f"no corner is farther than {distance.max():.3g} mm from the box's origin; it looks "
+            "like centimetres, write millimetres"
+        )
+    if frame == "dome" and distance.min() < _NEAREST_TARGET_MM:
+        raise CalibrationError(
+            f"a corner is only {distance.min():.3g} mm from the dome's centre, inside any dome; "
+            "check the units (millimetres) and that corners are given in the dome's frame"
+        )
+
+
+def _check_facing(file: MarkersFile, corners: FloatArray, frame: str) -> None:
+    """Markers face the viewer: the dome's centre, or the inside of a box of several planes."""
+    if frame == "box" and len({part.plane for part in file.markers}) < 2:
+        return
+    viewer = corners.reshape(-1, 3).mean(axis=0) if frame == "box" else np.zeros(3)
+    away = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    behind = np.einsum("ij,ij->i", away, corners.mean(axis=1) - viewer)
+    for part, side in zip(file.markers, behind, strict=True):
+        if side < 0.0:
+            raise CalibrationError(
+                f"marker {part.id}: seen from the camera its corners run anticlockwise; write "
+                "top-left, top-right, bottom-right, bottom-left as the camera sees them"
+            )
+
+
+_MM = 1e3
+_CORNER_ORDER = "top-left, top-right, bottom-right, bottom-left"
+_CORNER_ORDER_TEXT = f"as OpenCV reports: {_CORNER_ORDER} of the upright marker"
+_FRAME_TEXTS = {
+    "box": "origin at the middle of the open mouth, x right, y forward, z up, mm; "
+    "plane: normal . X = d",
+    "dome": "dome (origin at the dome's centre, x right, y forward, z up), mm",
+    "plate": "plate (x right, y down, origin at its top left), mm; NOT the dome: measure its place",
+}
+# A board's squares that no camera would be calibrated with.
+_SQUARE_MM = (3.0, 1000.0)
+
+
+def load_board(path: str | Path) -> Board:
+    """Load a `board.yaml`.
+
+    Raises
+    ------
+    CalibrationError
+        One line that names the file, the value and the remedy.
+    """
+    source = Path(path)
+    file = parse_target(read_mapping(source, "a board.yaml"), BoardFile, str(source))
+    kind = _board_kind(file, source)
+    if not _SQUARE_MM[0] <= file.square_mm <= _SQUARE_MM[1]:
+        raise CalibrationError(f"{source}: {_unlikely_square(file.square_mm)}")
+    try:
+        return Board(
+            kind=kind,
+            squares=_squares(file, source),
+            square=file.square_mm / _MM,
+            marker=(file.marker_mm or 0.0) / _MM,
+            dictionary=_known_dictionary(file.dictionary, "dictionary", source)
+            if file.dictionary
+            else "",
+            border=file.border_mm / _MM,
+            legacy_pattern=file.legacy_pattern,
+        )
+    except CalibrationError as fault:
+        text = str(fault)
+        raise CalibrationError(
+            text if text.startswith(str(source)) else f"{source}: {text}"
+        ) from None
+
+
+def _board_kind(file: BoardFile, source: Path) -> BoardKind:
+    marked = {"marker_mm": file.marker_mm, "dictionary": file.dictionary}
+    given = [key for key, value in marked.items() if value is not None]
+    kind = BoardKind(file.kind or ("charuco" if given else "chessboard"))
+    if kind is BoardKind.CHESSBOARD and given:
+        raise CalibrationError(
+            f"{source}: {given[0]} is given, but kind is chessboard; write 'kind: charuco', or "
+            f"leave out {given[0]}"
+        )
+    if kind is BoardKind.CHARUCO and len(given) < 2:
+        missing = next(key for key in marked if key not in given)
+        raise CalibrationError(f"{source}: {missing} is missing; a ChArUco board has markers")
+    return kind
+
+
+def _squares(file: BoardFile, source: Path) -> tuple[int, int]:
+    squares = (file.squares_x, file.squares_y)
+    inner = (file.inner_corners_x, file.inner_corners_y)
+    if any(squares) and any(inner):
+        raise CalibrationError(
+            f"{source}: gives squares and inner corners; keep squares_x and squares_y"
+        )
+    x, y = inner if any(inner) else squares
+    if x is None or y is None:
+        raise CalibrationError(
+            f"{source}: the number of squares is missing; write squares_x and squares_y, or "
+            "inner_corners_x and inner_corners_y, one less each"
+        )
+    return (x + 1, y + 1) if any(inner) else (x, y)
+
+
+def _unlikely_square(square_mm: float) -> str:
+    unit = "metres" if square_mm < 0.5 else "centimetres" if square_mm < _SQUARE_MM[0] else ""
+    looks = f"it looks like {unit}" if unit else "no camera sees one whole"
+    return f"square_mm is {square_mm:g}; {looks}, give the side of a square in millimetres"
+
+
+def _known_dictionary(name: str, key: str, source: Path) -> str:
+    if dictionary_id(name) is None:
+        close = difflib.get_close_matches(name.upper(), DICTIONARIES, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(DICTIONARIES)}"
+        raise CalibrationError(f"{source}: {key} is {name!r}, which is unknown; {hint}")
+    return name
+
+
+def load_box(path: str | Path) -> tuple[MarkerSet, float | None]:
+    """Load a `box.yaml`: markers on planes, in the box's own frame.
+
+    Returns
+    -------
+    markers : MarkerSet
+        In `box`; every marker lies on one of the planes.
+    n_nominal : float or None
+        Index that the file says the pictures were taken in.
+
+    Raises
+    ------
+    CalibrationError
+        One line that names the file, the value and the remedy.
+    """
+    source = Path(path)
+    file = parse_target(read_mapping(source, "a box.yaml"), MarkersFile, str(source))
+    if not file.planes:
+        raise CalibrationError(
+            f"{source}: planes is missing; a box has planes, each with 'normal' and 'd'"
+        )
+    for i, part in enumerate(file.markers):
+        if part.plane is None:
+            raise CalibrationError(
+                f"{source}: markers[{i}].plane is missing (id {part.id}); write one of "
+                f"{', '.join(file.planes)}"
+            )
+    markers = _markers(file, "box", source)
+    return markers, None if file.medium is None else file.medium.n_outside_nominal
+
+
+def load_target(path: str | Path) -> MarkerSet:
+    """Load a `target.yaml`: markers fixed to the vehicle, in `dome`.
+
+    Raises
+    ------
+    CalibrationError
+        One line that names the file, the value and the remedy.
+    """
+    source = Path(path)
+    file = parse_target(read_mapping(source, "a target.yaml"), MarkersFile, str(source))
+    if (file.frame or "").startswith("plate"):
+        raise CalibrationError(
+            f"{source}: frame is plate, so its corners are not in the dome's frame; measure the "
+            "plate's place on the vehicle and print it again with --position-mm and --rotation-deg"
+        )
+    return _markers(file, "dome", source)
+
+
+def _markers(file: MarkersFile, frame: str, source: Path) -> MarkerSet:
+    family = _known_dictionary(file.family, "family", source)
+    if file.corner_order is not None and _CORNER_ORDER not in file.corner_order:
+        raise CalibrationError(
+            f"{source}: corner_order is {file.corner_order!r}; this aqualvs reads only "
+            f"'{_CORNER_ORDER}', so reorder the corners"
+        )
+    check_markers(file, frame, source)
+    return MarkerSet(
+        frame=frame,
+        family=family,
+        ids=np.array([part.id for part in file.markers], np.int64),
+        corners=np.array([part.corners for part in file.markers], np.float64) / _MM,
+        plane_names=tuple(part.plane for part in file.markers),
+        planes={
+            name: Plane.from_normal(part.normal, part.d / _MM) for name, part in file.planes.items()
+        },
+    )
+
+
+def save_board(board: Board, path: str | Path, *, note: str = "") -> None:
+    """Write a `board.yaml` that `load_board` turns into the same board.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    content: dict[str, Any] = {
+        "kind": str(board.kind),
+        "squares_x": board.squares[0],
+        "squares_y": board.squares[1],
+        "square_mm": _to_mm(board.square),
+    }
+    if board.kind is BoardKind.CHARUCO:
+        content |= {"marker_mm": _to_mm(board.marker), "dictionary": board.dictionary}
+    content["border_mm"] = _to_mm(board.border)
+    if board.legacy_pattern:
+        content["legacy_pattern"] = True
+    if note:
+        content["note"] = note
+    write_text(Path(path), _yaml(content))
+
+
+def save_markers(markers: MarkerSet, path: str | Path, *, note: str = "") -> None:
+    """Write a `box.yaml` or `target.yaml` in the form that `load_box` and `load_target` read.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    content: dict[str, Any] = {"frame": _FRAME_TEXTS.get(markers.frame, markers.frame)}
+    if note:
+        content["note"] = note
+    if markers.planes:
+        content["planes"] = {
+            name: {"normal": _plain(plane.normal), "d": _to_mm(plane.offset)}
+            for name, plane in markers.planes.items()
+        }
+    content |= {"family": markers.family, "corner_order": _CORNER_ORDER_TEXT}
+    lines = [_marker_text(markers, i) for i in range(len(markers))]
+    write_text(Path(path), _yaml(content) + "markers:\n" + "".join(lines))
+
+
+def _marker_text(markers: MarkerSet, i: int) -> str:
+    """Return one marker, its corners on one line: YAML's own style would take thirty."""
+    corners = [_plain(corner * _MM) for corner in markers.corners[i]]
+    size = _to_mm(float(np.linalg.norm(markers.corners[i, 1] - markers.corners[i, 0])))
+    plane = markers.plane_names[i]
+    on_plane = "" if plane is None else f"    plane: {plane}\n"
+    return f"  - id: {int(markers.ids[i])}\n{on_plane}    size_mm: {size}\n    corners: {corners}\n"
+
+
+def _yaml(content: dict[str, Any]) -> str:
+    text: str = yaml.dump(
+        content,
+        Dumper=TidyDumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=1000,
+        default_flow_style=False,
+    )
+    return text
+
+
+def _to_mm(length: float) -> float:
+    # Nine decimals keep a picometre and drop the noise of the conversion.
+    return round(float(length) * _MM, 9)
+
+
+def _plain(values: Any) -> list[float]:
+    return [round(float(value), 9) + 0.0 for value in values]

@@ -1,0 +1,561 @@
+"""The index of the medium, frame by frame, from a target that is fixed on the vehicle.
+
+Section 2.2 of the paper solves for the index alone. Here a target that is not quite where it is
+said to be, and a camera that is known only so well, count as what they are: see `index_filter`.
+
+Has the index jumped? A two-sided cumulative sum over the frames' normalised surprises.
+
+Page (1954), Continuous inspection schemes, Biometrika 41, 100, doi:10.1093/biomet/41.1-2.100.
+
+The index of a medium from a set of pictures, as `calibrate water` reports it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.water_index.filter import (
+    MIN_POINTS,
+    WIDE,
+    Frame,
+    IndexModel,
+    Innovation,
+    Update,
+    believe,
+    compare,
+)
+from aqualvs.calibration.water_index.state import (
+    FIRST_CAMERA,
+    IndexOptions,
+    IndexPrior,
+    IndexReading,
+    IndexState,
+    IndexStep,
+    Knowledge,
+    N,
+    contradicts,
+)
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig, RigUncertainty
+
+# A change of one standard deviation of a frame is what is looked for.
+_ALLOWANCE = 0.5
+# False alarms of independent normal surprises are exp(2 * 0.5 * 21) frames apart: years at 25 fps.
+_LIMIT = 20.0
+# No single frame counts more, so that one wrong picture never rings; four in a row do.
+_LARGEST = 7.0
+# Compression repeats its errors over a group of pictures: what frames say is correlated that long.
+_BLOCK = 12
+_MEMORY = 100
+
+
+@dataclass(slots=True)
+class StepTest:
+    """Sums up surprises until they cannot be chance.
+
+    Attributes
+    ----------
+    inflation : float
+        By how much the spread of the surprises exceeds 1 over blocks of frames, 1 at least: what
+        the noise of corners has to be multiplied by, because neighbouring corners and frames err
+        together.
+    """
+
+    inflation: float = 1.0
+    _sums: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _lengths: list[int] = field(default_factory=lambda: [0, 0])
+    _block: list[float] = field(default_factory=list)
+    _n_blocks: int = 0
+
+    def add(self, surprise: float) -> int:
+        """Take the surprise of a frame in standard deviations.
+
+        Returns
+        -------
+        int
+            How many frames ago, this one included, the change that rings the alarm began; 0 while
+            there is none.
+        """
+        for side, sign in enumerate((1.0, -1.0)):
+            bounded = min(max(sign * surprise, -_LARGEST), _LARGEST)
+            total = max(self._sums[side] + bounded - _ALLOWANCE, 0.0)
+            self._sums[side] = total
+            self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
+            if total > _LIMIT:
+                began = self._lengths[side]
+                self.forget()
+                return began
+        self._spread(surprise)
+        return 0
+
+    @property
+    def quiet(self) -> bool:
+        """Whether nothing has been summed up."""
+        return not any(self._lengths)
+
+    def forget(self) -> None:
+        """Begin anew, as after a jump; the inflation stays."""
+        self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
+
+    def _spread(self, surprise: float) -> None:
+        self._block.append(surprise)
+        if len(self._block) < _BLOCK:
+            return
+        self._n_blocks += 1
+        square = min(float(np.sum(self._block)) ** 2 / _BLOCK, 9.0)
+        share = 1.0 / min(self._n_blocks + 8, _MEMORY)
+        # Surprises are over the inflated noise already: what they still exceed 1 by comes on top.
+        squared = self.inflation**2 * (1.0 + share * (square - 1.0))
+        self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
+        self._block = []
+
+
+# Noise of a corner before residuals tell, the least a first frame can tell of it, and the least.
+_NOMINAL_NOISE, _FIRST_NOISE, _LEAST_NOISE = 0.1, 0.03, 0.005
+_NOISE_MEMORY = 100
+_FIRST_ROUNDS = 4
+# A frame that surprises so much waits for the next ones instead of being believed.
+_WAIT = 4.0
+# Frames that can be taken back when a step is found.
+_KEPT = 50
+_MISFIT = 2.0
+# Last frames of a run that tell how far the index has jumped, and the most a frame can cost.
+_TELLING, _GROSS = 5, 16.0
+
+
+@dataclass(slots=True)
+class IndexEstimator:
+    """Recursive estimate of the index of the medium; time comes from the data.
+
+    One estimator serves one target, one rig and one dive. Started in air (`IndexPrior.air`), it
+    learns the target's place better than a ruler tells, and keeps that in the water.
+
+    Attributes
+    ----------
+    rig : Rig
+        Behind a dome.
+    uncertainty : RigUncertainty
+        How well it is known.
+    options : IndexOptions
+        What is assumed of target and medium.
+    prior : IndexPrior or None
+        What is known of the medium that the first frame sees; `set_prior` gives a later one.
+    steps : list of IndexStep
+        All alarms so far.
+
+    Raises
+    ------
+    CalibrationError
+        If the rig has no dome.
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty = field(default_factory=RigUncertainty.none)
+    options: IndexOptions = field(default_factory=IndexOptions)
+    prior: IndexPrior | None = None
+    steps: list[IndexStep] = field(default_factory=list)
+    _model: IndexModel = field(init=False, repr=False)
+    _state: IndexState | None = None
+    _noise: float = _NOMINAL_NOISE
+    _n_frames: int = 0
+    _n_lost: int = 0
+    _contradicted: bool = False
+    _moved: bool = False
+    _last_time: float = -math.inf
+    _since_prior: float = 0.0
+    _sigma_frame: float = math.inf
+    _test: StepTest = field(default_factory=StepTest, repr=False)
+    _recent: deque[tuple[IndexState, Innovation]] = field(
+        default_factory=lambda: deque(maxlen=_KEPT), repr=False
+    )
+
+    def __post_init__(self) -> None:
+        self._model = self._model_about(np.zeros(3))
+
+    def add(self, time: float, view: View) -> IndexReading:
+        """Take a frame and return what is known after it.
+
+        Parameters
+        ----------
+        time : float
+            In seconds; frames that are older than the last one are refused.
+        view : View
+            Points of the target in `dome` (metres) and where they were seen. Corners that are
+            missing, NaN or wrong do no harm while most are right.
+        """
+        known = () if self._state is None else self._state.ids
+        frame = Frame.of(time, view, known)
+        refused = self._refusal(frame)
+        if refused:
+            return self._reading(time, view.name, refused)
+        try:
+            if self._state is None:
+                return self._first(view.name, frame)
+            return self._next(view.name, self._state, frame)
+        except RigError as error:
+            return self._reading(time, view.name, f"no camera sees the target so ({error})")
+
+    def set_prior(self, prior: IndexPrior | None) -> None:
+        """Give what is known of the medium as the last frame saw it, say from a thermometer."""
+        self.prior, self._contradicted, self._since_prior = prior, False, 0.0
+        if self._state is not None:
+            self._state = self._state.anchored()
+
+    @property
+    def state(self) -> IndexState | None:
+        """Joint estimate with the prior, None before the first frame that counts."""
+        state = self._own
+        if state is None or self.prior is None or self._contradicted:
+            return state
+        return state.given_anchor(self.prior.n, self.prior.sigma)
+
+    @property
+    def _own(self) -> IndexState | None:
+        """Estimate without the prior, at the time of the last frame, used or not."""
+        if self._state is None:
+            return None
+        return self._state.later(max(self._last_time, self._state.time), self.options.drift)
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Numbers of the camera in `state`, after the target's place."""
+        return self._model.camera_names
+
+    def residuals(self, view: View) -> FloatArray:
+        """Return measured less predicted pixels (M, 2) of a view by what is known now.
+
+        Raises
+        ------
+        CalibrationError
+            Before the first frame that counts.
+        """
+        if self.state is None:
+            raise CalibrationError("no picture shows enough of the target yet; add one that does")
+        frame = Frame.of(self.state.time, view, self.state.ids)
+        left: FloatArray = self._model.line(self.state, frame).residuals.reshape(-1, 2)
+        return left
+
+    def _model_about(self, middle: FloatArray) -> IndexModel:
+        options = self.options
+        return IndexModel(
+            self.rig, self.uncertainty, options.pose_sigmas, options.sigma_corner_px, middle
+        )
+
+    def _refusal(self, frame: Frame) -> str:
+        if not math.isfinite(frame.time):
+            return "it has no time"
+        if self._state is not None and frame.time < self._last_time:
+            return (
+                f"its time {frame.time:.3f} s lies before that of an earlier frame, "
+                f"{self._last_time:.3f} s"
+            )
+        if len(frame.ids) < MIN_POINTS:
+            return f"{len(frame.ids)} corners of the target are seen; {MIN_POINTS} are needed"
+        return ""
+
+    def _first(self, name: str, frame: Frame) -> IndexReading:
+        self._model = self._model_about(frame.points.mean(axis=0))
+        start = self.rig.n_water if self.prior is None else self.prior.n
+        state, noise = self._model.first(frame, start), _NOMINAL_NOISE
+        for _ in range(_FIRST_ROUNDS):
+            seen = compare(self._model, state, frame, noise)
+            if not seen.fits:
+                return self._reading(frame.time, name, _not_there(seen))
+            update = believe(self._model, state, seen.frame, noise)
+            noise = max(update.noise, _FIRST_NOISE)
+        self._last_time, self._noise = frame.time, noise
+        return self._believe(name, seen, update, state.n)
+
+    def _next(self, name: str, last: IndexState, frame: Frame) -> IndexReading:
+        state = self._until(last, frame)
+        self._since_prior += self.options.drift**2 * (frame.time - self._last_time)
+        self._last_time = frame.time
+        noise = self._noise * self._test.inflation
+        seen = compare(self._model, state, frame, noise)
+        # Corners that fit one by one may still be those of a plate that has moved a little.
+        self._n_lost = 0 if seen.fits and seen.misfit < _MISFIT else self._n_lost + 1
+        if not seen.fits:
+            return self._reading(frame.time, name, _not_there(seen))
+        self._recent.append((last, seen))
+        surprise = seen.shift / seen.sigma
+        began = self._test.add(surprise)
+        if began:
+            return self._jump(name, min(began, len(self._recent)))
+        if abs(surprise) > _WAIT:
+            n = state.n + seen.shift
+            waits = f"alone it gives an index of {n:.4f}; the next frames will tell"
+            return self._reading(frame.time, name, waits, n_frame=n)
+        update = believe(self._model, state, seen.frame, noise)
+        return self._believe(name, seen, update, state.n)
+
+    def _believe(self, name: str, seen: Innovation, update: Update, n: float) -> IndexReading:
+        self._state = update.state
+        self._n_frames += 1
+        share = max(1.0 / self._n_frames, 1.0 / _NOISE_MEMORY)
+        square = self._noise**2 + share * (update.noise**2 - self._noise**2)
+        self._noise = max(math.sqrt(square), _FIRST_NOISE if self._n_frames < 2 else _LEAST_NOISE)
+        self._sigma_frame = seen.sigma_frame
+        return self._reading(seen.frame.time, name, n_frame=n + seen.shift, update=update)
+
+    def _jump(self, name: str, began: int) -> IndexReading:
+        """Take the last frames back and believe them again, the index free to have jumped."""
+        since = list(self._recent)[-began:]
+        since = since[_onset(np.array([s.shift / s.sigma for _, s in since])) :]
+        self._recent.clear()
+        try:
+            state, update = self._believe_again(since)
+        except RigError:
+            state, update = self._believe_again(since[-1:])
+        self._state, self._since_prior = state, WIDE**2
+        size, sigma = state.step
+        slope = self._model.slope_uncertainty(state, since[-1][1].frame)
+        sigma, step = math.hypot(sigma, slope * size), None
+        if abs(size) > max(self.options.smallest_step, 3.0 * sigma):
+            misfit = float(np.median([seen.misfit for _, seen in since]))
+            step = IndexStep(since[0][1].frame.time, size, sigma, misfit < _MISFIT)
+            self.steps.append(step)
+            self._moved = self._moved or not step.by_medium
+        return self._reading(self._last_time, name, n_frame=state.n, update=update, step=step)
+
+    def _believe_again(
+        self, since: Sequence[tuple[IndexState, Innovation]]
+    ) -> tuple[IndexState, Update]:
+        before, seen = since[0]
+        noise = self._noise * self._test.inflation
+        state = self._model.jumped(self._until(before, seen.frame), seen.frame)
+        update = believe(self._model, state, seen.frame, noise)
+        for _, later in since[1:]:
+            state = self._until(update.state, later.frame)
+            seen = compare(self._model, state, later.frame, noise)
+            if seen.fits and abs(seen.shift) < _WAIT * seen.sigma:
+                update = believe(self._model, state, seen.frame, noise)
+        return update.state.later(self._last_time, self.options.drift), update
+
+    def _until(self, state: IndexState, frame: Frame) -> IndexState:
+        later = state.later(frame.time, self.options.drift)
+        return later.with_corners(frame.ids, self.options.sigma_corner_px)
+
+    def _reading(
+        self,
+        time: float,
+        name: str,
+        refused: str = "",
+        *,
+        n_frame: float = math.nan,
+        update: Update | None = None,
+        step: IndexStep | None = None,
+    ) -> IndexReading:
+        own, prior = self._own, self.prior
+        if own is not None and prior is not None:
+            self._contradicted = contradicts(own, prior, self._contradicted)
+        sigma_frame = self._sigma_frame * self._test.inflation
+        joint, known = self.state, self._knowledge(sigma_frame)
+        unknown = (math.nan, math.inf) if prior is None else (prior.n, prior.sigma)
+        n, sigma = unknown if joint is None else (joint.n, joint.sigma)
+        return IndexReading(
+            name=name,
+            time=time,
+            refused=refused,
+            n=n,
+            sigma=sigma,
+            sigma_random=math.inf if own is None else math.sqrt(own.random_variance),
+            n_pictures=math.nan if own is None else own.n,
+            sigma_pictures=math.inf if own is None else own.sigma,
+            n_frame=n_frame,
+            sigma_frame=math.inf if update is None else sigma_frame,
+            n_points=0 if update is None else update.used,
+            rms_px=math.nan if update is None else update.rms,
+            observable=known.observable,
+            prior_used=prior is not None and not self._contradicted,
+            step=step,
+            remarks=known.remarks(),
+        )
+
+    def _knowledge(self, sigma_frame: float) -> Knowledge:
+        return Knowledge(
+            own=self._own,
+            joint=self.state,
+            prior=self.prior,
+            contradicted=self._contradicted,
+            since_prior=self._since_prior,
+            sigma_frame=sigma_frame,
+            decentring=float(np.linalg.norm(self.rig.dome_from_cam.translation)),
+            n_lost=self._n_lost,
+            moved=self._moved,
+            n_camera=len(self._model.camera_names),
+            options=self.options,
+        )
+
+
+def _onset(surprises: FloatArray) -> int:
+    """Return the first of a run's frames (K,) that lies beyond the jump which ends the run.
+
+    Least squares of a change of mean from zero; what no mean explains counts no more than gross.
+    """
+    after = float(np.median(surprises[-_TELLING:]))
+    without = np.minimum(surprises**2, _GROSS)
+    with_jump = np.minimum((surprises - after) ** 2, _GROSS)
+    costs = np.concatenate([[0.0], np.cumsum(without - with_jump)[:-1]])
+    return int(np.argmin(costs))
+
+
+def _not_there(seen: Innovation) -> str:
+    return (
+        f"only {len(seen.frame.ids)} of {seen.n_points} corners are where the target should be; "
+        "it is hidden, has moved, or is not the one that target.yaml describes"
+    )
+
+
+N_WATER = "n_water"
+_DEFAULT_OPTIONS = IndexOptions()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WaterCalibration:
+    """A rig in its medium.
+
+    Attributes
+    ----------
+    rig : Rig
+        With the index found, that of the last picture.
+    uncertainty : RigUncertainty
+        Of the rig's numbers, `n_water` and what it owes to the others among them.
+    sigma, sigma_random : float
+        Standard deviation of the index, and the part that more pictures reduce.
+    observable : bool
+        False where the index does not rest on the pictures; `remarks` says why.
+    steps : tuple of IndexStep
+        Alarms.
+    readings : tuple of IndexReading
+        What was known after each picture.
+    rms_px : float
+        Root mean square residual of the corners that counted.
+    remarks : tuple of str
+        What a user should know, one sentence each.
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty
+    sigma: float
+    sigma_random: float
+    observable: bool
+    steps: tuple[IndexStep, ...]
+    readings: tuple[IndexReading, ...] = field(repr=False)
+    rms_px: float
+    remarks: tuple[str, ...]
+
+    @property
+    def n(self) -> float:
+        """Index of the medium, relative to vacuum."""
+        return self.rig.n_water
+
+
+def calibrate_water(
+    rig: Rig,
+    views: Sequence[View],
+    times: Sequence[float] | None = None,
+    *,
+    uncertainty: RigUncertainty | None = None,
+    prior: IndexPrior | None = None,
+    options: IndexOptions = _DEFAULT_OPTIONS,
+) -> WaterCalibration:
+    """Find the index of the medium from pictures of a target fixed on the vehicle.
+
+    Parameters
+    ----------
+    rig : Rig
+        Behind a dome; its own index is where the search begins when there is no prior.
+    views : sequence of View
+        Points of the target in `dome`, metres.
+    times : sequence of float, optional
+        Of the pictures, in seconds, ascending. Without them all are of one moment.
+    uncertainty : RigUncertainty, optional
+        How well the rig is known; without it the rig is taken as exact.
+    prior : IndexPrior, optional
+        What is known of the medium in the first picture.
+    options : IndexOptions
+        What is assumed of the target and the medium.
+
+    Returns
+    -------
+    WaterCalibration
+
+    Raises
+    ------
+    CalibrationError
+        If the rig has no dome or no picture can be used.
+    """
+    known = RigUncertainty.none() if uncertainty is None else uncertainty
+    estimator = IndexEstimator(rig, uncertainty=known, options=options, prior=prior)
+    moments = np.zeros(len(views)) if times is None else np.asarray(times, np.float64)
+    readings = tuple(
+        estimator.add(float(time), view) for time, view in zip(moments, views, strict=True)
+    )
+    state = estimator.state
+    if state is None:
+        raise CalibrationError(_why_none(readings))
+    last = readings[-1]
+    return WaterCalibration(
+        rig=rig.in_water(max(state.n, 1.0)),
+        uncertainty=_with_index(known, state, estimator.camera_names),
+        sigma=last.sigma,
+        sigma_random=last.sigma_random,
+        observable=last.observable,
+        steps=tuple(estimator.steps),
+        readings=readings,
+        rms_px=_rms(readings),
+        remarks=last.remarks,
+    )
+
+
+def _why_none(readings: Sequence[IndexReading]) -> str:
+    if not readings:
+        return "no pictures of the target; give some on which the whole target is seen"
+    first = readings[0]
+    return (
+        f"none of {len(readings)} pictures can be used: {first.name}: {first.refused}; check that "
+        "target.yaml gives the target's corners in the frame of the dome, in millimetres"
+    )
+
+
+def _rms(readings: Sequence[IndexReading]) -> float:
+    counted = [r for r in readings if r and r.n_points]
+    weights = np.array([r.n_points for r in counted], np.float64)
+    squares = np.array([r.rms_px for r in counted]) ** 2
+    return float(np.sqrt(np.sum(weights * squares) / np.sum(weights)))
+
+
+def _with_index(
+    known: RigUncertainty, state: IndexState, camera_names: tuple[str, ...]
+) -> RigUncertainty:
+    """Return the covariance of the rig's numbers as they were, and of the index found with them.
+
+    The estimate of the camera's errors is left aside, as the rig keeps its numbers: errors of
+    these and of the index have the covariance that the state has between its two. Lasers are
+    correlated with the index by way of the camera alone.
+    """
+    old = known.only([name for name in known.names if name != N_WATER])
+    camera = slice(FIRST_CAMERA, FIRST_CAMERA + len(camera_names))
+    with_camera = state.covariance[camera, N]
+    reach = np.zeros(len(old.names))
+    if camera_names:
+        columns = [old.names.index(name) for name in camera_names]
+        reach = old.covariance[:, columns] @ _solve(old.of(camera_names), with_camera)
+    covariance = np.zeros((len(old.names) + 1,) * 2)
+    covariance[:-1, :-1] = old.covariance
+    covariance[-1, :-1] = covariance[:-1, -1] = reach
+    covariance[-1, -1] = state.sigma**2
+    return RigUncertainty((*old.names, N_WATER), covariance)
+
+
+def _solve(covariance: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve with a covariance that may be singular and whose units differ."""
+    size = np.sqrt(np.diag(covariance))
+    scaled = np.linalg.pinv(covariance / np.outer(size, size), hermitian=True)
+    solved: FloatArray = scaled @ (right / size) / size
+    return solved

@@ -1,0 +1,513 @@
+"""One frame's say about the index of the medium: a robust, iterated Kalman update.
+
+The index may change from frame to frame. What else decides where the target is seen does not: its
+place on the vehicle, the camera's numbers, and how far a corner is always off (its printing, its
+detection). Known only as well as they are, these are estimated along with the index: frames
+average out the noise of the corners and never the constants.
+
+What an index estimate takes of a picture.
+
+How a target on the vehicle is seen through a medium: prediction and derivatives by a state.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from aqualvs.calibration.solver.bundle import moved_target, point_by_pose
+from aqualvs.calibration.solver.least_squares import Loss
+from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.water_index.state import (
+    FAR,
+    FIRST_CAMERA,
+    POSE,
+    IndexState,
+    N,
+    first_state,
+)
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import parameter_names
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
+
+MIN_POINTS = 4
+"""Corners that a frame needs: with fewer, a bad one cannot be told from a good one."""
+
+MOST_POINTS = 64
+"""Corners beyond these would cost time and add little."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Corners of one picture that the estimate can use.
+
+    Attributes
+    ----------
+    time : float
+        In seconds.
+    ids : tuple of int
+        Corners.
+    points : array, shape (M, 3)
+        Where `target.yaml` has them, in `dome`, metres.
+    pixels : array, shape (M, 2)
+        Where they were found.
+    """
+
+    time: float
+    ids: tuple[int, ...]
+    points: FloatArray
+    pixels: FloatArray
+
+    @classmethod
+    def of(cls, time: float, view: View, known: tuple[int, ...] = ()) -> "Frame":
+        """Return the finite corners of a view, at most `MOST_POINTS` with those that are known."""
+        finite = np.all(np.isfinite(view.pixels), axis=1) & np.all(np.isfinite(view.points), axis=1)
+        _, first = np.unique(view.ids, return_index=True)
+        once = np.zeros(len(view), np.bool_)
+        once[first] = True
+        old = once & finite & np.isin(view.ids, known)
+        new = np.flatnonzero(once & finite & ~old)
+        room = min(len(new), max(MOST_POINTS - len(known), 0))
+        keep = np.flatnonzero(old).tolist()
+        if room:
+            keep += new[np.linspace(0, len(new) - 1, room).astype(int)].tolist()
+        ids = tuple(int(view.ids[i]) for i in keep)
+        return cls(time, ids, view.points[keep], view.pixels[keep])
+
+    def where(self, keep: BoolArray) -> "Frame":
+        """Return the corners that `keep` (M,) marks."""
+        ids = tuple(i for i, kept in zip(self.ids, keep, strict=True) if kept)
+        return replace(self, ids=ids, points=self.points[keep], pixels=self.pixels[keep])
+
+
+WIDE = 0.2
+"""Standard deviation of an index that is not known at all, or has just jumped."""
+BLIND = 1e-6
+"""Below this motion of the picture, pixels per unit of index, nothing is seen at all."""
+LINEAR = 1e-4
+"""Steps of the index up to this are linear to far below the noise of a corner."""
+
+_LOWEST, _HIGHEST = 1.0, 1.7
+_NEWTON = 30
+# Changes of a camera's number up to this many standard deviations are added linearly.
+_NEARLY = 0.02
+
+
+class Line(NamedTuple):
+    """Prediction of a frame near a state.
+
+    Attributes
+    ----------
+    residuals : array, shape (2M,)
+        Measured less predicted pixels.
+    slopes : array, shape (2M, D)
+        Derivative of the prediction by the state's mean.
+    """
+
+    residuals: FloatArray
+    slopes: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class IndexModel:
+    """How a target on the vehicle is seen through media of different index.
+
+    Attributes
+    ----------
+    rig : Rig
+        Behind a dome; its own `n_water` plays no part.
+    uncertainty : RigUncertainty
+        How well the camera's numbers are known.
+    pose_sigmas : array, shape (6,)
+        How well the target's place is known: turn about its middle (radians), shift (metres).
+    sigma_corner : float
+        What a corner is always off, standard deviation in pixels.
+    middle : array, shape (3,)
+        What the target turns about, in `dome`.
+    camera_names : tuple of str
+        Numbers of the camera that are uncertain, in the state's order.
+
+    Raises
+    ------
+    CalibrationError
+        If the rig has no dome.
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty
+    pose_sigmas: FloatArray
+    sigma_corner: float
+    middle: FloatArray
+    camera_names: tuple[str, ...] = field(init=False)
+    _moved: "_MovedRig" = field(init=False, repr=False, compare=False)
+    _cache: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.rig.dome is None:
+            raise CalibrationError(
+                f"rig {self.rig.name} has no dome: a bare lens looks the same in every medium, so "
+                "its index cannot be found; add the dome to the rig"
+            )
+        sigmas = self.uncertainty.sigmas
+        names = parameter_names(self.rig.camera())
+        uncertain = tuple(n for n in names if n != "n_water" and sigmas.get(n, 0.0) > 0.0)
+        object.__setattr__(self, "camera_names", uncertain)
+        scale = np.array([sigmas[name] for name in uncertain])
+        object.__setattr__(self, "_moved", _MovedRig(self.rig, uncertain, scale))
+
+    def first(self, frame: Frame, n: float) -> IndexState:
+        """Return the state before a first frame, its index looked for from `n` on."""
+        camera = self.uncertainty.of(self.camera_names)
+        blank = first_state(frame.time, n, WIDE, self.pose_sigmas, camera)
+        return first_state(
+            frame.time, self.nearest(blank, frame), WIDE, self.pose_sigmas, camera
+        ).with_corners(frame.ids, self.sigma_corner)
+
+    def jumped(self, state: IndexState, frame: Frame) -> IndexState:
+        """Return the state after a jump of the index to where a frame has it."""
+        n = self.nearest(state, frame)
+        line = self.line(at_index(state, n, slopes_too=True), frame)
+        return self.settled(state, line, frame).stepped(n, WIDE)
+
+    def settled(self, state: IndexState, line: Line, frame: Frame) -> IndexState:
+        """Return a state whose corners' errors hold for the picture that `line` predicts."""
+        predicted = frame.pixels - line.residuals.reshape(-1, 2)
+        visible = np.isfinite(predicted[:, 0])
+        ids = frame.where(visible).ids
+        return state.with_corners_at(ids, predicted[visible], self.sigma_corner) if ids else state
+
+    def line(self, state: IndexState, frame: Frame) -> Line:
+        """Return the prediction of a frame near a state; residuals are NaN where none is seen.
+
+        Slopes are those at the constants' first guesses and at `state.n_of_slopes`: taken anew
+        for every frame they would differ by the noise of the estimate, and seem to tell apart what
+        no frame can (first-estimates Jacobian, Huang et al. 2010, doi:10.1177/0278364909353640).
+        """
+        slopes = np.zeros((len(frame.ids), 2, len(state.mean)))
+        first_corner = FIRST_CAMERA + len(self.camera_names)
+        known = self._slopes(state.n_of_slopes, frame)
+        slopes[..., :first_corner] = known
+        off = np.zeros((len(frame.ids), 2))
+        for row, i in enumerate(frame.ids):
+            if i in state.ids:
+                at = first_corner + 2 * state.ids.index(i)
+                off[row] = state.mean[at : at + 2]
+                slopes[row, 0, at] = slopes[row, 1, at + 1] = 1.0
+        n = min(max(state.n, _LOWEST), _HIGHEST)
+        rig, rest = self._moved.near(state.mean[FIRST_CAMERA:first_corner])
+        target = moved_target(SE3.identity(), self.middle, state.mean[POSE])
+        pixels, _ = rig.in_water(n).camera().project(target.apply(frame.points))
+        off += known[..., N] * (state.n - n) + known[..., FIRST_CAMERA:] @ rest
+        residuals = frame.pixels - pixels - off
+        return Line(residuals.reshape(-1), slopes.reshape(-1, len(state.mean)))
+
+    def slope_uncertainty(self, state: IndexState, frame: Frame) -> float:
+        """Return the relative standard deviation of a change of index for what a state leaves open.
+
+        The constants decide how far the picture moves with the index: a product of unknowns that a
+        joint Gaussian does not hold.
+        """
+        mean, size = state.mean, FIRST_CAMERA + len(self.camera_names)
+        reference = self._slope_at(mean[:size], state.n, frame)
+        by_constant = np.zeros(size)
+        for i in range(POSE.start, size):
+            sigma = np.sqrt(state.covariance[i, i])
+            if sigma > 0.0:
+                moved = mean[:size].copy()
+                moved[i] += sigma
+                change = self._slope_at(moved, state.n, frame) - reference
+                by_constant[i] = float(np.sum(change * reference)) / sigma
+        variance = by_constant @ state.covariance[:size, :size] @ by_constant
+        power = max(float(np.sum(reference**2)), BLIND**2)
+        return float(np.sqrt(max(float(variance), 0.0))) / power
+
+    def _slope_at(self, mean: FloatArray, n: float, frame: Frame) -> FloatArray:
+        """Return the derivative (M, 2) of pixels by the index, all constants as in `mean`."""
+        rig = rig_moved_by(self.rig, self.camera_names, mean[FIRST_CAMERA:])
+        camera = rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
+        target = moved_target(SE3.identity(), self.middle, mean[POSE])
+        slopes = camera.project_with_parameter_jacobian(target.apply(frame.points))[3]
+        by_n: FloatArray = slopes[..., parameter_names(camera).index("n_water")]
+        return by_n
+
+    def _slopes(self, n: float, frame: Frame) -> FloatArray:
+        """Return derivatives (M, 2, 9 + C) of pixels by all but the corners' errors."""
+        if self._cache.get("n") != n or self._cache.get("ids") != frame.ids:
+            camera = self.rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
+            _, _, by_point, by_number = camera.project_with_parameter_jacobian(frame.points)
+            names = parameter_names(camera)
+            slopes = np.zeros((len(frame.ids), 2, FIRST_CAMERA + len(self.camera_names)))
+            slopes[..., N] = by_number[..., names.index("n_water")]
+            slopes[..., POSE] = by_point @ point_by_pose(frame.points, self.middle)
+            columns = [names.index(name) for name in self.camera_names]
+            slopes[..., FIRST_CAMERA:] = by_number[..., columns]
+            self._cache.update(n=n, ids=frame.ids, slopes=slopes)
+        known: FloatArray = self._cache["slopes"]
+        return known
+
+    def nearest(self, state: IndexState, frame: Frame) -> float:
+        """Return the index that puts most corners where they are, all constants as they are.
+
+        Newton's method on the weighted median of what the corners say one by one: half of them
+        may be wrong.
+        """
+        n = min(max(state.n, _LOWEST), _HIGHEST)
+        for _ in range(_NEWTON):
+            step = median_shift(self.line(at_index(state, n, slopes_too=True), frame))
+            new = min(max(n + step, _LOWEST), _HIGHEST)
+            if abs(new - n) < LINEAR:
+                return n + step
+            n = new
+        return n
+
+
+@dataclass(slots=True)
+class _MovedRig:
+    """A rig moved by small changes of its numbers; making one takes longer than a projection."""
+
+    rig: Rig
+    names: tuple[str, ...]
+    sigmas: FloatArray
+    _step: FloatArray = field(init=False)
+    _last: Rig = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._step, self._last = np.zeros(len(self.names)), self.rig
+
+    def near(self, step: FloatArray) -> tuple[Rig, FloatArray]:
+        """Return the rig moved by nearly `step`, and what is left of that to be added linearly."""
+        if np.any(np.abs(step - self._step) > _NEARLY * self.sigmas):
+            self._last = rig_moved_by(self.rig, self.names, step)
+            self._step = step.copy()
+        return self._last, step - self._step
+
+
+def at_index(state: IndexState, n: float, *, slopes_too: bool = False) -> IndexState:
+    """Return the state with another index, all else the same."""
+    mean = state.mean.copy()
+    mean[N] = n
+    return replace(state, mean=mean, n_of_slopes=n if slopes_too else state.n_of_slopes)
+
+
+def median_shift(line: Line) -> float:
+    """Return the weighted median of the changes of index that corners, each alone, ask for."""
+    slopes, residuals = line.slopes[:, N].reshape(-1, 2), line.residuals.reshape(-1, 2)
+    weights = np.sum(slopes**2, axis=1)
+    seen = np.isfinite(residuals[:, 0]) & (weights > BLIND**2)
+    if not np.any(seen):
+        return 0.0
+    shifts = np.sum(slopes[seen] * residuals[seen], axis=1) / weights[seen]
+    order = np.argsort(shifts)
+    # Slopes, not their squares: corners that move most would outvote all others.
+    along = np.cumsum(np.sqrt(weights[seen])[order])
+    return float(shifts[order[np.searchsorted(along, 0.5 * along[-1])]])
+
+
+_REJECT = 5.0
+_REJECTED = 1e-6
+_PASSES = 5
+# Square of a normal deviate that half of all lie below.
+_HALF = 0.4549
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """How a frame differs from what a state predicts.
+
+    Attributes
+    ----------
+    frame : Frame
+        Its corners that fit.
+    n_points : int
+        Corners before the misfits were left out.
+    shift, sigma : float
+        Change of the index that explains the frame best, and the standard deviation it should
+        have if there was none. Infinite sigma where the index cannot be seen.
+    sigma_frame : float
+        Part of `sigma` that is the frame's own noise.
+    misfit : float
+        Squared residuals that no change of index explains, in terms of their covariance and over
+        their number: about 1.
+    """
+
+    frame: Frame
+    n_points: int
+    shift: float
+    sigma: float
+    sigma_frame: float
+    misfit: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether most of the target is where the state has it."""
+        return 2 * len(self.frame.ids) > self.n_points and len(self.frame.ids) >= MIN_POINTS
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """A state after a frame.
+
+    Attributes
+    ----------
+    state : IndexState
+    used : int
+        Corners that counted.
+    rms : float
+        Root mean square residual of a coordinate of those, in pixels.
+    noise : float
+        Noise of a coordinate that the residuals speak for, in pixels.
+    """
+
+    state: IndexState
+    used: int
+    rms: float
+    noise: float
+
+
+def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) -> Innovation:
+    """Return how a frame differs from what a state predicts.
+
+    Parameters
+    ----------
+    model : IndexModel
+    state : IndexState
+        At the frame's time, with entries for its corners.
+    frame : Frame
+        At least one corner.
+    noise : float
+        Standard deviation of a coordinate, in pixels.
+    """
+    line, moved = model.line(state, frame), 0.0
+    if abs(median_shift(line)) > LINEAR:
+        n = model.nearest(state, frame)
+        far = abs(n - state.n_of_slopes) > FAR
+        line, moved = model.line(at_index(state, n, slopes_too=far), frame), n - state.n
+        state = model.settled(state, line, frame)
+    keep = np.isfinite(line.residuals[::2])
+    keep[keep] &= _left_over(state, _rows(line, keep), noise) < _REJECT
+    line = _rows(line, keep)
+    shift, variance, misfit = _best_shift(state, line, noise)
+    squares = float(np.sum(line.slopes[:, N] ** 2))
+    own = noise / np.sqrt(squares) if squares > BLIND**2 else np.inf
+    return Innovation(
+        frame.where(keep), len(keep), moved + shift, float(np.sqrt(variance)), own, misfit
+    )
+
+
+def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) -> Update:
+    """Return the state after a frame whose corners fit it.
+
+    Parameters
+    ----------
+    model : IndexModel
+    state : IndexState
+        At the frame's time, with entries for its corners.
+    frame : Frame
+        At least one corner, all of them visible.
+    noise : float
+        Standard deviation of a coordinate, in pixels.
+    """
+    state = state.with_slopes_near()
+    state = model.settled(state, model.line(state, frame), frame)
+    at, weights = state, np.ones(len(frame.ids))
+    for _ in range(_PASSES):
+        used = weights
+        step = _kalman_step(state, at, model.line(at, frame), np.repeat(noise**2 / used, 2))
+        lengths = _lengths(step.left / np.sqrt(step.expected))
+        close = abs(step.mean[N] - at.n) < LINEAR
+        at = replace(state, mean=step.mean)
+        weights = np.where(lengths < _REJECT, Loss.HUBER.weight(lengths), _REJECTED)
+        if close and np.allclose(weights, used, atol=0.05):
+            break
+    good = np.repeat(used > _REJECTED, 2)
+    rms = float(np.sqrt(np.mean(step.left[good] ** 2))) if np.any(good) else np.nan
+    estimate = noise * np.sqrt(np.median(step.left**2 / step.expected) / _HALF)
+    information = 1.0 / state.random_variance + step.information
+    after = replace(at, covariance=step.covariance(), random_variance=1.0 / information)
+    return Update(after, int(np.count_nonzero(good)) // 2, rms, float(estimate))
+
+
+class _KalmanStep(NamedTuple):
+    """A state's new mean, what is left of the residuals, and what that should be.
+
+    `left` and `expected` (2M,) are in pixels and their squares; `information` is what the frame
+    says of the index if all else was known.
+    """
+
+    mean: FloatArray
+    left: FloatArray
+    expected: FloatArray
+    information: float
+    old_covariance: FloatArray
+    reach: FloatArray
+    factor: tuple[FloatArray, bool]
+
+    def covariance(self) -> FloatArray:
+        """Return the new covariance."""
+        new = self.old_covariance - self.reach @ cho_solve(self.factor, self.reach.T)
+        symmetric: FloatArray = 0.5 * (new + new.T)
+        return symmetric
+
+
+def _kalman_step(
+    state: IndexState, at: IndexState, line: Line, variances: FloatArray
+) -> _KalmanStep:
+    """Solve for the mean with a prediction that is linear about `at`."""
+    differences = line.residuals + line.slopes @ (at.mean - state.mean)
+    reach = state.covariance @ line.slopes.T
+    spread = line.slopes @ reach
+    spread.flat[:: len(spread) + 1] += variances
+    factor = cho_factor(spread)
+    mean = state.mean + reach @ cho_solve(factor, differences)
+    left = differences - line.slopes @ (mean - state.mean)
+    expected = variances**2 * np.diag(cho_solve(factor, np.eye(len(spread))))
+    information = float(np.sum(line.slopes[:, N] ** 2 / variances))
+    return _KalmanStep(mean, left, expected, information, state.covariance, reach, factor)
+
+
+def _rows(line: Line, keep: BoolArray) -> Line:
+    both = np.repeat(keep, 2)
+    return Line(line.residuals[both], line.slopes[both])
+
+
+def _lengths(residuals: FloatArray) -> FloatArray:
+    lengths: FloatArray = np.linalg.norm(residuals.reshape(-1, 2), axis=1)
+    return lengths
+
+
+def _spread(state: IndexState, line: Line, noise: float) -> FloatArray:
+    spread: FloatArray = line.slopes @ state.covariance @ line.slopes.T
+    spread.flat[:: len(spread) + 1] += noise**2
+    return spread
+
+
+def _left_over(state: IndexState, line: Line, noise: float) -> FloatArray:
+    """Lengths (M,) of residuals that no change of index explains, in standard deviations."""
+    left = line.residuals - line.slopes[:, N] * median_shift(line)
+    spread = _spread(state, line, noise)
+    return _lengths(left / np.sqrt(np.diag(spread) - _by_index(spread, line)[0]))
+
+
+def _by_index(spread: FloatArray, line: Line) -> tuple[FloatArray, float, FloatArray]:
+    """Variances (2M,) that a free index explains, that index's variance, weights (2M,) for it."""
+    slopes = line.slopes[:, N]
+    if float(np.sum(slopes**2)) < BLIND**2:
+        return np.zeros_like(slopes), np.inf, np.zeros_like(slopes)
+    pull = cho_solve(cho_factor(spread), slopes)
+    variance = 1.0 / float(slopes @ pull)
+    return variance * slopes**2, variance, variance * pull
+
+
+def _best_shift(state: IndexState, line: Line, noise: float) -> tuple[float, float, float]:
+    """Change of index by generalised least squares, its variance, and what it leaves over."""
+    if not len(line.residuals):
+        return 0.0, np.inf, np.inf
+    spread = _spread(state, line, noise)
+    _, variance, weights = _by_index(spread, line)
+    shift = float(weights @ line.residuals)
+    left = line.residuals - line.slopes[:, N] * shift
+    misfit = float(left @ cho_solve(cho_factor(spread), left)) / max(len(left) - 1, 1)
+    return shift, variance, misfit

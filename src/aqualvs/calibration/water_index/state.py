@@ -1,0 +1,596 @@
+"""What an index estimate knows: the index and the constants of rig and target, jointly Gaussian.
+
+What is known of a medium's refractive index before a camera has looked at it.
+
+What an index estimate reports: options, readings, alarms, and what they mean in words.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.water import (
+    GREEN_NM,
+    N_AIR,
+    seawater_index_slopes,
+    seawater_index_vacuum,
+)
+
+# Standard deviation of the fit of Quan & Fry (1995) to its data.
+_SIGMA_FORMULA = 1.5e-5
+# Air's index less one goes with its density: 3 K or 10 hPa change it by 1 %, 3e-6.
+_SIGMA_AIR = 1e-5
+_STEP_NM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class IndexPrior:
+    """An index and how well it is known.
+
+    Attributes
+    ----------
+    n : float
+        Relative to vacuum.
+    sigma : float
+        Standard deviation, positive.
+    source : str
+        Where it comes from, for reports.
+
+    Raises
+    ------
+    OptionError
+        If the index cannot be or sigma is not positive.
+    """
+
+    n: float
+    sigma: float
+    source: str = "given"
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.n <= 2.0:
+            raise OptionError(
+                f"index prior is {self.n:g}; give the medium's index relative to vacuum, 1 to 2"
+            )
+        if not (math.isfinite(self.sigma) and self.sigma > 0.0):
+            raise OptionError(
+                f"index prior has sigma {self.sigma:g}; give a positive standard deviation"
+            )
+
+    @classmethod
+    def air(cls, n_air: float = N_AIR) -> "IndexPrior":
+        """Return what is known of air: a vehicle on deck that looks at its target learns from it.
+
+        The target's place and the lens are then known as well as this index makes them, and keep
+        that when the vehicle goes into the water.
+        """
+        return cls(n_air, _SIGMA_AIR, "air")
+
+    @classmethod
+    def seawater(
+        cls,
+        temperature_c: float,
+        salinity_permille: float,
+        *,
+        sigma_temperature_c: float = 0.5,
+        sigma_salinity_permille: float = 0.5,
+        wavelength_nm: float = GREEN_NM,
+        sigma_wavelength_nm: float = 5.0,
+        n_air: float = N_AIR,
+    ) -> "IndexPrior":
+        """Return what temperature and salinity say, by Quan & Fry (1995).
+
+        Parameters
+        ----------
+        temperature_c, salinity_permille : float
+            0 to 30 degrees Celsius and 0 to 40 per mille.
+        sigma_temperature_c, sigma_salinity_permille : float
+            Standard deviations of the two.
+        wavelength_nm, sigma_wavelength_nm : float
+            Of the light that the target is seen in. 5 nm change the index by 2e-4: look at the
+            target in the colour of the lasers (the green channel).
+        n_air : float
+            Index of air relative to vacuum, which the formula is multiplied by.
+
+        Raises
+        ------
+        OptionError
+            If a value lies outside the formula's range.
+        """
+        n = float(seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm))
+        slopes = seawater_index_slopes(temperature_c, salinity_permille, wavelength_nm)
+        side = math.copysign(_STEP_NM, GREEN_NM - wavelength_nm)
+        beside = seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm + side)
+        parts = (
+            float(slopes.by_temperature) * sigma_temperature_c,
+            float(slopes.by_salinity) * sigma_salinity_permille,
+            (float(beside) - n) / _STEP_NM * sigma_wavelength_nm,
+            _SIGMA_FORMULA,
+        )
+        source = f"{temperature_c:g} °C, {salinity_permille:g} per mille"
+        return cls(n / N_AIR * n_air, math.hypot(*parts), source)
+
+
+N, ANCHOR, BEFORE = 0, 1, 2
+"""Index now; when the prior was given; before the last step."""
+N_INDICES = 3
+POSE = slice(3, 9)
+FIRST_CAMERA = 9
+FAR = 0.02
+"""Changes of the index from which on slopes are taken anew."""
+
+# Motion of the picture over which corners' errors stay the same, and up to which nobody asks.
+_SAME_PX, _STILL_PX = 0.4, 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class IndexState:
+    """A joint Gaussian; never changed in place.
+
+    Attributes
+    ----------
+    time : float
+        Of the last frame, in seconds.
+    mean : array, shape (D,)
+        Three indices (`N`, `ANCHOR`, `BEFORE`); errors of the target's place: a turn about its
+        middle (radians) and a shift (metres) in `dome`; errors of the camera's numbers; and for
+        each corner, what its pixel is always off (x and y).
+    covariance : array, shape (D, D)
+    ids : tuple of int
+        Corners that have such entries, in their order.
+    random_variance : float
+        Of the index now if all constants were known: the part that more frames reduce.
+    n_of_slopes : float
+        Index for which derivatives are taken, see `IndexModel.line`.
+    seen_at : array, shape (K, 2)
+        Pixels of the corners at which their own errors hold; NaN where nothing holds yet.
+    """
+
+    time: float
+    mean: FloatArray
+    covariance: FloatArray
+    ids: tuple[int, ...]
+    random_variance: float
+    n_of_slopes: float
+    seen_at: FloatArray
+
+    @property
+    def n(self) -> float:
+        """Index now."""
+        return float(self.mean[N])
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of `n`."""
+        return float(np.sqrt(self.covariance[N, N]))
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Index now less that before the last step, and its standard deviation.
+
+        Constants that shift both alike cancel.
+        """
+        c = self.covariance
+        variance = c[N, N] + c[BEFORE, BEFORE] - 2.0 * c[N, BEFORE]
+        return float(self.mean[N] - self.mean[BEFORE]), float(np.sqrt(max(variance, 0.0)))
+
+    def later(self, time: float, drift: float) -> "IndexState":
+        """Return the state at another time, the index a random walk of `drift` per root second."""
+        grown = drift**2 * max(time - self.time, 0.0)
+        covariance = self.covariance.copy()
+        covariance[N, N] += grown
+        return replace(
+            self,
+            time=time,
+            covariance=covariance,
+            random_variance=self.random_variance + grown,
+        )
+
+    def anchored(self) -> "IndexState":
+        """Return the state with the index now kept as that which a prior speaks of."""
+        return self._copied(ANCHOR)
+
+    def stepped(self, n: float, sigma: float) -> "IndexState":
+        """Return the state after the index has jumped to about `n`; the constants stay known."""
+        kept = self._copied(BEFORE)
+        mean, covariance = kept.mean.copy(), kept.covariance
+        mean[N] = n
+        covariance[N, N] += sigma**2
+        return replace(
+            kept, mean=mean, covariance=covariance, random_variance=self.random_variance + sigma**2
+        )
+
+    def with_slopes_near(self) -> "IndexState":
+        """Return the state with derivatives taken anew if the index has gone far since."""
+        if abs(self.n - self.n_of_slopes) <= FAR:
+            return self
+        return replace(self, n_of_slopes=self.n)
+
+    def with_corners(self, ids: tuple[int, ...], sigma_px: float) -> "IndexState":
+        """Return the state with entries for corners that it does not know yet."""
+        new = tuple(i for i in ids if i not in self.ids)
+        if not new:
+            return self
+        size, more = len(self.mean), 2 * len(new)
+        covariance = np.zeros((size + more, size + more))
+        covariance[:size, :size] = self.covariance
+        covariance[size:, size:] = sigma_px**2 * np.eye(more)
+        return replace(
+            self,
+            mean=np.concatenate([self.mean, np.zeros(more)]),
+            covariance=covariance,
+            ids=self.ids + new,
+            seen_at=np.concatenate([self.seen_at, np.full((len(new), 2), np.nan)]),
+        )
+
+    def with_corners_at(
+        self, ids: tuple[int, ...], pixels: FloatArray, sigma_px: float
+    ) -> "IndexState":
+        """Return the state with corners' errors that hold where the corners are seen.
+
+        What a detector is off depends on where in its pixel a corner lies: where the picture has
+        moved by a good part of a pixel, fresh errors replace the old ones.
+
+        Parameters
+        ----------
+        ids : tuple of int
+            Corners of a picture, all known.
+        pixels : array, shape (M, 2)
+            Where they are predicted.
+        sigma_px : float
+            Standard deviation of the errors.
+        """
+        rows = [self.ids.index(i) for i in ids]
+        moved = pixels - self.seen_at[rows]
+        known = np.isfinite(moved[:, 0])
+        way = float(np.linalg.norm(np.median(moved[known], axis=0))) if np.any(known) else 0.0
+        state, seen_at = self, self.seen_at.copy()
+        if way > _STILL_PX:
+            kept = math.exp(-((way / _SAME_PX) ** 2))
+            state = self._with_corners_renewed(kept, sigma_px)
+            seen_at[:] = np.nan
+        fresh = ~np.isfinite(seen_at[rows, 0])
+        seen_at[np.array(rows)[fresh]] = pixels[fresh]
+        return replace(state, seen_at=seen_at)
+
+    def _with_corners_renewed(self, kept: float, sigma_px: float) -> "IndexState":
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        first = len(mean) - 2 * len(self.ids)
+        mean[first:] *= kept
+        covariance[first:] *= kept
+        covariance[:, first:] *= kept
+        rows = np.arange(first, len(mean))
+        covariance[rows, rows] += (1.0 - kept**2) * sigma_px**2
+        return replace(self, mean=mean, covariance=covariance)
+
+    def given_anchor(self, n: float, sigma: float) -> "IndexState":
+        """Return the state if the anchor is known to be `n` within `sigma` (a Kalman update)."""
+        reach = self.covariance[:, ANCHOR]
+        variance = reach[ANCHOR] + sigma**2
+        return replace(
+            self,
+            mean=self.mean + reach * ((n - self.mean[ANCHOR]) / variance),
+            covariance=self.covariance - np.outer(reach, reach) / variance,
+        )
+
+    def _copied(self, entry: int) -> "IndexState":
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[entry] = mean[N]
+        covariance[entry] = covariance[N]
+        covariance[:, entry] = covariance[:, N]
+        covariance[entry, entry] = self.covariance[N, N]
+        return replace(self, mean=mean, covariance=covariance)
+
+
+def first_state(
+    time: float, n: float, sigma: float, pose_sigmas: FloatArray, camera: FloatArray
+) -> IndexState:
+    """Return the state before any frame.
+
+    Parameters
+    ----------
+    time : float
+        In seconds.
+    n, sigma : float
+        Where the index is looked for, and how far around.
+    pose_sigmas : array, shape (6,)
+        Of the target's place: turn (radians) and shift (metres).
+    camera : array, shape (C, C)
+        Covariance of the camera's numbers.
+    """
+    size = FIRST_CAMERA + len(camera)
+    mean, covariance = np.zeros(size), np.zeros((size, size))
+    mean[:N_INDICES] = n
+    covariance[:N_INDICES, :N_INDICES] = sigma**2
+    covariance[POSE, POSE] = np.diag(np.asarray(pose_sigmas) ** 2)
+    covariance[FIRST_CAMERA:, FIRST_CAMERA:] = camera
+    return IndexState(time, mean, covariance, (), sigma**2, n, np.zeros((0, 2)))
+
+
+# Beyond so many standard deviations the target is not where it should be.
+_MOVED = 4.0
+_LOST_FRAMES = 10
+# Corners that are off by so many times what was expected of them.
+_CROOKED = 2.0
+# Fresh water and sea water are 0.008 apart: an index known half as well still says which.
+_LARGEST_SIGMA = 4e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexOptions:
+    """What is assumed of the target and the medium.
+
+    Attributes
+    ----------
+    sigma_place : float
+        How well the target's place on the vehicle is known, along each axis of `dome`, in metres.
+    sigma_turn : float
+        The same of its turn about each axis, in radians.
+    sigma_corner_px : float
+        What a corner is always off, by its printing and its detection.
+    drift : float
+        Random walk of the index per root second.
+    smallest_step : float
+        Steps below this ring no alarm.
+    largest_sigma : float
+        Without a prior, an index known less well than this is called unobservable.
+
+    Raises
+    ------
+    OptionError
+        If a value is negative or not finite.
+    """
+
+    sigma_place: float = 0.2e-3
+    sigma_turn: float = math.radians(0.1)
+    sigma_corner_px: float = 0.05
+    drift: float = 1e-5
+    smallest_step: float = 3e-4
+    largest_sigma: float = 2e-3
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise OptionError(f"{name} is {value:g}; give a number that is not negative")
+
+    @classmethod
+    def of_target(cls, place_sigma_mm: float, turn_sigma_deg: float) -> Self:
+        """Return the options for a target whose place on the vehicle is known so well.
+
+        An index counts as observable where it still tells fresh water from sea water.
+        """
+        return cls(
+            sigma_place=place_sigma_mm / 1e3,
+            sigma_turn=math.radians(turn_sigma_deg),
+            largest_sigma=_LARGEST_SIGMA,
+        )
+
+    @property
+    def pose_sigmas(self) -> FloatArray:
+        """Turn and shift of the target, shape (6,)."""
+        return np.array([self.sigma_turn] * 3 + [self.sigma_place] * 3)
+
+
+@dataclass(frozen=True, slots=True)
+class IndexStep:
+    """A sudden change of the index.
+
+    Attributes
+    ----------
+    time : float
+        Of the first frame after it, in seconds.
+    size, sigma : float
+        Change of the index and its standard deviation.
+    by_medium : bool
+        False where the corners moved as no index moves them: then the target or the lens has
+        moved, and `size` means nothing.
+    """
+
+    time: float
+    size: float
+    sigma: float
+    by_medium: bool
+
+    def text(self) -> str:
+        """Return the alarm as one line."""
+        if not self.by_medium:
+            return (
+                f"at {self.time:.1f} s the target or the lens has moved; fix and measure it again"
+            )
+        return (
+            f"at {self.time:.1f} s the index stepped by {self.size:+.4f} ± {self.sigma:.4f}: "
+            "other water, a leak or a pollutant"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexReading:
+    """What is known of the index after a frame.
+
+    Attributes
+    ----------
+    name : str
+        Of the picture.
+    time : float
+        In seconds.
+    refused : str
+        Why the frame was left out; empty where it counts.
+    n, sigma : float
+        Index of the medium now and its standard deviation, prior included; NaN and infinite
+        before the first frame that counts, where there is no prior.
+    sigma_random : float
+        Part of `sigma` that more frames reduce. Changes are seen to about this.
+    n_pictures, sigma_pictures : float
+        `n` and `sigma` without the prior.
+    n_frame, sigma_frame : float
+        From this frame alone, with all constants as they are known by now, and its noise.
+    n_points : int
+        Corners that counted.
+    rms_px : float
+        Root mean square residual of their coordinates.
+    observable : bool
+        Whether the index rests on the pictures: False where they say less than the prior, or,
+        without one, less than `IndexOptions.largest_sigma`.
+    prior_used : bool
+        False without a prior, and where it contradicts the pictures.
+    step : IndexStep or None
+        The alarm, in the frame that rings it.
+    remarks : tuple of str
+        What a user should know, one sentence each.
+    """
+
+    name: str
+    time: float
+    refused: str = ""
+    n: float
+    sigma: float
+    sigma_random: float
+    n_pictures: float
+    sigma_pictures: float
+    n_frame: float = math.nan
+    sigma_frame: float = math.inf
+    n_points: int = 0
+    rms_px: float = math.nan
+    observable: bool
+    prior_used: bool
+    step: IndexStep | None = None
+    remarks: tuple[str, ...]
+
+    def __bool__(self) -> bool:
+        """Whether the frame counted."""
+        return not self.refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Knowledge:
+    """All that decides whether an index is observable and what is to be said of it.
+
+    Attributes
+    ----------
+    own, joint : IndexState or None
+        Without and with the prior; None before the first frame that counts.
+    prior : IndexPrior or None
+        As given.
+    contradicted : bool
+        Whether it disagrees with the pictures.
+    since_prior : float
+        Variance that the index has gathered since the prior was given, by drift and steps.
+    sigma_frame : float
+        Noise of the index from one frame.
+    decentring : float
+        Distance of the lens from the dome's centre, metres.
+    n_lost : int
+        Frames since the target was last where it should be.
+    moved : bool
+        Whether a step was none of the medium's.
+    n_camera : int
+        Uncertain numbers of the camera in the states.
+    options : IndexOptions
+        As given.
+    """
+
+    own: IndexState | None
+    joint: IndexState | None
+    prior: IndexPrior | None
+    contradicted: bool
+    since_prior: float
+    sigma_frame: float
+    decentring: float
+    n_lost: int
+    moved: bool
+    n_camera: int
+    options: IndexOptions
+
+    @property
+    def observable(self) -> bool:
+        """Whether the index rests on the pictures."""
+        if self.own is None or self.joint is None or self.moved or self.n_lost >= _LOST_FRAMES:
+            return False
+        if self.prior is None or self.contradicted:
+            return self.own.sigma < self.options.largest_sigma
+        alone = math.sqrt(self.prior.sigma**2 + self.since_prior)
+        # After a step the prior speaks of another medium; what it taught about the target stays.
+        stepped = alone > self.options.largest_sigma
+        sigma = self.joint.sigma if stepped else self.own.sigma
+        return sigma < min(alone, self.options.largest_sigma)
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return what a user should know, one sentence each."""
+        found = [self._about_sight(), self._about_prior(), self._about_place()]
+        if self.n_lost >= _LOST_FRAMES:
+            found.append(
+                f"the target has not been where it should be for {self.n_lost} frames: it is "
+                "hidden or has moved, and the index is that from before"
+            )
+        return tuple(remark for remark in found if remark)
+
+    def _about_sight(self) -> str:
+        if self.observable or self.own is None or self.moved or self.n_lost >= _LOST_FRAMES:
+            return ""
+        if self.sigma_frame > self.options.largest_sigma:
+            return (
+                f"unobservable: the lens is {self.decentring * 1e3:.1f} mm from the dome's centre, "
+                "so the picture of the target hardly moves with the index; give temperature and "
+                "salinity"
+            )
+        if self.prior is not None and not self.contradicted:
+            return (
+                f"unobservable: the pictures alone know the index to {self.own.sigma:.1e}, the "
+                f"prior ({self.prior.source}) to {self.prior.sigma:.1e}; changes are still seen"
+            )
+        return (
+            f"unobservable: what is not known of the target's place and of the camera leaves the "
+            f"index open by {self.own.sigma:.1e}; measure them better, begin with pictures in "
+            "air, or give temperature and salinity; changes are still seen"
+        )
+
+    def _about_prior(self) -> str:
+        if self.prior is None or self.own is None or not self.contradicted:
+            return ""
+        n = float(self.own.mean[ANCHOR])
+        sigma = math.sqrt(self.own.covariance[ANCHOR, ANCHOR])
+        return (
+            f"the pictures give {n:.4f} +- {sigma:.4f}, the prior ({self.prior.source}) "
+            f"{self.prior.n:.4f} +- {self.prior.sigma:.4f}: a leak, a pollutant, another medium "
+            "than the prior's, or a target that is not where target.yaml has it; the prior is "
+            "left out"
+        )
+
+    def _about_place(self) -> str:
+        if self.moved:
+            return (
+                "the target or the lens has moved: the index cannot be trusted until the target "
+                "is measured anew"
+            )
+        if self.joint is None:
+            return ""
+        moved = np.abs(self.joint.mean[POSE])
+        sigmas = self.options.pose_sigmas
+        if np.any(moved > _MOVED * sigmas):
+            turn, shift = np.rad2deg(np.linalg.norm(moved[:3])), 1e3 * np.linalg.norm(moved[3:])
+            return (
+                f"the target seems {shift:.2f} mm and {turn:.2f}° from where target.yaml has it, "
+                "more than its place is said to be uncertain"
+            )
+        corners = self.joint.mean[POSE.stop + self.n_camera :]
+        off = float(np.sqrt(np.mean(corners**2))) if len(corners) else 0.0
+        if off > _CROOKED * self.options.sigma_corner_px:
+            return (
+                f"corners are always off by {off:.2f} px, more than was assumed; check the "
+                "target's print and the camera's calibration"
+            )
+        return ""
+
+
+def contradicts(own: IndexState, prior: IndexPrior, before: bool) -> bool:
+    """Return whether pictures and prior disagree; `before` is what this said last.
+
+    They do beyond four standard deviations, and cease to below three.
+    """
+    apart = abs(float(own.mean[ANCHOR]) - prior.n)
+    sigma = math.hypot(math.sqrt(own.covariance[ANCHOR, ANCHOR]), prior.sigma)
+    return apart > (3.0 if before else 4.0) * sigma

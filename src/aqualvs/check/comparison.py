@@ -1,0 +1,605 @@
+"""`aqualvs check new.yaml --against old.yaml`: what has moved between two rigs, and what of it.
+
+What lies between two rigs, such as before and after maintenance: numbers and their sigmas.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.stats import chi2, norm
+
+from aqualvs.check.finding import escaped
+from aqualvs.errors import RigError
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.optics.camera import DOME_PARAMETERS, POSE_PARAMETERS
+from aqualvs.optics.expected_error import WallView
+from aqualvs.optics.rig import (
+    LASER_PARAMETERS,
+    Laser,
+    Rig,
+    RigUncertainty,
+    laser_parameter_names,
+    tangent_basis,
+)
+from aqualvs.optics.rigfile import dated_copies, load_rig
+from aqualvs.optics.sheet import sheet_in
+from aqualvs.optics.solved import file_parameter_name, rig_uncertainty, solved_steps
+
+SIGNIFICANT = 5.0
+"""Sigmas from which on a change is no chance."""
+
+# No combination of numbers is believed to be known better than this share of their variances.
+_NOT_BETTER = 1e-4
+# Rotations (rad) come back from files with this much rounding, and then some.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class RigDifference:
+    """Changes of the numbers that two rigs share.
+
+    Attributes
+    ----------
+    names : tuple of str
+        As `RigUncertainty.names` has them; lasers are those of the old rig.
+    change : array, shape (P,)
+        New minus old, SI units and radians.
+    covariance : array, shape (P, P)
+        Of `change`; zero where neither rig says how well it is known.
+    """
+
+    names: tuple[str, ...]
+    change: FloatArray
+    covariance: FloatArray
+
+    def of(self, name: str) -> float:
+        """Return the change of one number; 0 for those that the rigs do not share."""
+        return float(self.change[self.names.index(name)]) if name in self.names else 0.0
+
+    def sigma(self, name: str) -> float:
+        """Return the standard deviation of one change; 0 where it is not known."""
+        if name not in self.names:
+            return 0.0
+        i = self.names.index(name)
+        return float(np.sqrt(max(self.covariance[i, i], 0.0)))
+
+    def sigmas(self, names: Sequence[str]) -> float | None:
+        """Return how many sigmas some numbers have moved together, in the direction that shows it.
+
+        None where it is not known, though something has moved.
+        """
+        rows = [self.names.index(name) for name in names if name in self.names]
+        change, covariance = self.change[rows], self.covariance[np.ix_(rows, rows)]
+        if not change.any():
+            return 0.0
+        size = np.sqrt(np.diag(covariance))
+        known = size > 0.0
+        if change[~known].any():
+            return None
+        scaled, size = change[known] / size[known], size[known]
+        correlation = covariance[np.ix_(known, known)] / np.outer(size, size)
+        values, vectors = np.linalg.eigh(correlation)
+        return float(np.linalg.norm(scaled @ vectors / np.sqrt(np.maximum(values, _NOT_BETTER))))
+
+    def has_moved(self, names: Sequence[str]) -> bool | None:
+        """Return whether some numbers have moved by more than chance, None where unknown.
+
+        The chance is that of `SIGNIFICANT` sigmas of one number, however many there are.
+        """
+        distance = self.sigmas(names)
+        if distance is None:
+            return None
+        limit = chi2.isf(2.0 * norm.sf(SIGNIFICANT), max(len(names), 1))
+        return distance > float(np.sqrt(limit))
+
+
+def rig_difference(
+    new: Rig, old: Rig, new_uncertainty: RigUncertainty, old_uncertainty: RigUncertainty
+) -> RigDifference:
+    """Compare two rigs number by number.
+
+    Parameters
+    ----------
+    new, old : Rig
+        Intrinsics are compared where both have the same lens model and number of coefficients,
+        lasers where both have one of that name.
+    new_uncertainty, old_uncertainty : RigUncertainty
+        Of either. Numbers that are equal to the last bit come from the same calibration, so that
+        their errors are common to both and take part in no difference; all others are independent.
+    """
+    changes = _camera_changes(new, old)
+    turns: dict[str, FloatArray] = {}
+    for laser in old.lasers:
+        twin = next((other for other in new.lasers if other.name == laser.name), None)
+        if twin is not None:
+            change, turns[laser.name] = _laser_change(twin, laser)
+            changes |= dict(zip(laser_parameter_names(laser), change.tolist(), strict=False))
+    names = tuple(changes)
+    change = np.array([*changes.values()])
+    same = change == 0.0
+    covariance = _given(old_uncertainty.of(names), same)
+    turn = _turned(names, turns)
+    covariance += _given(turn @ new_uncertainty.of(names) @ turn.T, same)
+    return RigDifference(names, change, covariance)
+
+
+def _camera_changes(new: Rig, old: Rig) -> dict[str, float]:
+    shift = new.dome_from_cam.translation - old.dome_from_cam.translation
+    turn = new.dome_from_cam.rotation @ old.dome_from_cam.rotation.T
+    rotvec = rotvec_from_rotation(turn)
+    rotvec[np.abs(rotvec) < _ROUNDING] = 0.0
+    values = [*shift, *rotvec]
+    changes = dict(zip(POSE_PARAMETERS, map(float, values), strict=True))
+    if new.dome is not None and old.dome is not None:
+        pairs = (
+            new.dome.inner_radius - old.dome.inner_radius,
+            new.dome.thickness - old.dome.thickness,
+            new.n_air - old.n_air,
+            new.dome.n_acrylic - old.dome.n_acrylic,
+            new.n_water - old.n_water,
+        )
+        changes |= dict(zip(DOME_PARAMETERS, pairs, strict=True))
+    if same_lens_model(new, old):
+        numbers = zip(_intrinsics(new), _intrinsics(old), strict=True)
+        differences = (ours - theirs for ours, theirs in numbers)
+        changes |= dict(zip(old.lens.parameter_names, differences, strict=True))
+    return changes
+
+
+def same_lens_model(new: Rig, old: Rig) -> bool:
+    """Return whether the intrinsics of two rigs mean the same."""
+    return (
+        new.lens.model == old.lens.model
+        and new.size_px == old.size_px
+        and new.lens.parameter_names == old.lens.parameter_names
+    )
+
+
+def _intrinsics(rig: Rig) -> tuple[float, ...]:
+    lens = rig.lens
+    return (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+
+
+def _laser_change(new: Laser, old: Laser) -> tuple[FloatArray, FloatArray]:
+    """Return the step that leads from the old plane to the new one, and what turns new steps.
+
+    The step is (tilt_1, tilt_2, offset) as `moved_plane` takes it. The matrix (3, 3) expresses a
+    small step from the new plane, in its own `tangent_basis`, as one from the old plane.
+    """
+    plane, sign = new.plane, 1.0
+    if plane.normal @ old.plane.normal < 0.0:
+        plane, sign = Plane(-plane.normal, -plane.offset), -1.0
+    basis = tangent_basis(old.plane.normal)
+    # `moved_plane` adds tangents to the normal: a step is the tangent of the angle.
+    tilt = basis @ plane.normal / max(float(plane.normal @ old.plane.normal), 1e-6)
+    tilt[np.abs(tilt) < _ROUNDING] = 0.0
+    turn = np.zeros((3, 3))
+    turn[:2, :2] = sign * basis @ tangent_basis(new.plane.normal).T
+    turn[2, 2] = sign
+    return np.array([*tilt, plane.offset - old.plane.offset]), turn
+
+
+def _turned(names: tuple[str, ...], turns: dict[str, FloatArray]) -> FloatArray:
+    matrix = np.eye(len(names))
+    for laser, turn in turns.items():
+        rows = [names.index(f"{laser}:{name}") for name in LASER_PARAMETERS]
+        matrix[np.ix_(rows, rows)] = turn
+    return matrix
+
+
+def _given(covariance: FloatArray, same: BoolArray) -> FloatArray:
+    """Return the covariance where the numbers marked by `same` are known to have no error."""
+    if not same.any():
+        return covariance
+    size = np.sqrt(np.diag(covariance))
+    size[size == 0.0] = 1.0
+    scaled = covariance / np.outer(size, size)
+    across = scaled[np.ix_(~same, same)]
+    common = np.linalg.pinv(scaled[np.ix_(same, same)], hermitian=True)
+    left: FloatArray = np.zeros_like(covariance)
+    left[np.ix_(~same, ~same)] = scaled[np.ix_(~same, ~same)] - across @ common @ across.T
+    left *= np.outer(size, size)
+    return left
+
+
+# The steps of one calibration are done in a day's work, two calibrations days or months apart.
+_PAUSE = timedelta(hours=12)
+_WALL_M = 0.6
+# Changes that matter to a dive: about 0.1 % of range or 0.1 degrees.
+_LENS_M, _TURN, _FOCAL_SHARE, _CENTRE_PX = 5e-4, math.radians(0.1), 0.002, 2.0
+_SHELL_M, _ACRYLIC, _INDEX = 2e-4, 5e-3, 1e-3
+_TILT, _SHIFT_M = math.radians(0.05), 3e-4
+# A laser whose plane is as near as this to one of another name is likely the same.
+_ALIKE_TILT, _ALIKE_SHIFT_M = math.radians(1.0), 5e-3
+
+_SCALES = {"mm": 1e3, "deg": math.degrees(1.0)}
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a rig and how it has changed.
+
+    Attributes
+    ----------
+    name : str
+        As the verdict calls it.
+    did, stayed : str
+        What it did or did not, in words: "moved by 0.4 mm", "stayed".
+    sigmas : float or None
+        How many sigmas that is; None where no sigma is known.
+    moved : bool
+        Whether that is more than chance, or, without sigmas, more than what matters.
+    matters : bool
+        Whether it is enough to be seen in a dive.
+    """
+
+    name: str
+    did: str
+    stayed: str
+    sigmas: float | None
+    moved: bool
+    matters: bool
+
+    @property
+    def is_same(self) -> bool:
+        """Whether it has not changed at all."""
+        return self.sigmas == 0.0
+
+    @property
+    def sentence(self) -> str:
+        """Say it."""
+        if self.sigmas is None:
+            told = "no sigma is known"
+        else:
+            told = f"{self.sigmas:{'.2g' if self.sigmas < 10.0 else '.0f'}} sigma"
+        if not self.moved and self.sigmas is not None:
+            return f"{self.name} {self.stayed} ({told})"
+        hardly = "" if self.matters else ", too little to matter"
+        return f"{self.name} {self.did} ({told}){hardly}"
+
+
+def last_calibration(path: Path) -> Path:
+    """Return the dated copy of a rig file as it was before its latest calibration.
+
+    Steps that follow one another within half a day are one calibration, of which every step leaves
+    a copy.
+
+    Raises
+    ------
+    RigError
+        If the rig notes no calibration, or no copy of an earlier one is kept beside it.
+    """
+    dates = {
+        name: step.date for name, step in solved_steps(load_rig(path, need_lasers=False)).items()
+    }
+    if not dates:
+        raise RigError(f"{path}: notes no date of a calibration; name an older rig file instead")
+    latest = set()
+    begun = max(dates.values())
+    for name, date in sorted(dates.items(), key=lambda one: one[1], reverse=True):
+        if begun - date <= _PAUSE:
+            latest.add((name, date))
+            begun = date
+    for copy in dated_copies(path):
+        try:
+            found = solved_steps(load_rig(copy, need_lasers=False))
+        except RigError:
+            continue
+        steps = {(name, step.date) for name, step in found.items()}
+        if steps and not steps & latest:
+            return copy
+    raise RigError(
+        f"{path}: no dated copy of an earlier calibration is kept beside it; name an older rig file"
+    )
+
+
+def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
+    """Compare two rig files, print what has changed, and return the exit code 0.
+
+    Raises
+    ------
+    RigError
+        If one of the files is not a rig file.
+    """
+    new_rig, new_uncertainty = _loaded(new)
+    old_rig, old_uncertainty = _loaded(old)
+    difference = rig_difference(new_rig, old_rig, new_uncertainty, old_uncertainty)
+    console = console or Console()
+    console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
+    console.print(_table(new_rig, old_rig, difference))
+    known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
+    for sentence in (*_limits(known), *_mismatches(new_rig, old_rig)):
+        console.print(sentence, markup=False, highlight=False)
+    parts = compared_parts(new_rig, old_rig, difference)
+    console.print(verdict(parts), style="bold", markup=False, highlight=False)
+    if not all(part.is_same for part in parts):
+        for sentence in consequence(new_rig, old_rig):
+            console.print(sentence, markup=False, highlight=False)
+    return 0
+
+
+def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Part]:
+    """Return the parts that both rigs have, and how each has changed."""
+    parts = [_lens_part(difference), _turn_part(difference)]
+    if same_lens_model(new, old):
+        parts.append(_intrinsics_part(new, old, difference))
+    if new.dome is not None and old.dome is not None:
+        parts += [_shell_part(difference), _water_part(difference)]
+    return parts + [_laser_part(new, a, b, difference) for a, b in _shared_lasers(new, old)]
+
+
+def verdict(parts: list[Part]) -> str:
+    """Return what moved and what stayed, in one sentence."""
+    moved = [part.sentence for part in parts if part.moved]
+    stayed = [part.sentence for part in parts if not part.moved and not part.is_same]
+    same = [part.name for part in parts if part.is_same]
+    told = moved + stayed
+    if same:
+        told.append(f"{'not changed at all' if told else 'nothing has changed'}: {', '.join(same)}")
+    if not moved and stayed:
+        told.insert(0, "nothing has moved that matters")
+    return _capital("; ".join(told) + ".")
+
+
+def consequence(new: Rig, old: Rig) -> Iterator[str]:
+    """Say what the old rig would read where the new one is right."""
+    if new.size_px != old.size_px:
+        return
+    pairs = _shared_lasers(new, old)
+    wall = WallView.ahead(replace(new, lasers=tuple(a for a, _ in pairs)), _WALL_M)
+    read = wall.read_by(replace(old, lasers=tuple(b for _, b in pairs)))
+    place = f"If the new rig is right, a wall {_WALL_M * 1e3:.0f} mm ahead"
+    if not np.isfinite(read).all():
+        yield f"{place} cannot be measured with the lasers that both rigs have."
+        return
+    range_m, pitch, yaw = read.tolist()
+    share = range_m / _WALL_M - 1.0
+    yield (
+        f"{place} and square to the vehicle would read {range_m * 1e3:.1f} mm ({share:+.2%}), "
+        f"pitch {_degrees(pitch)} and yaw {_degrees(yaw)} degrees with the old one."
+    )
+
+
+def _loaded(path: Path) -> tuple[Rig, RigUncertainty]:
+    rig = load_rig(path, need_lasers=False)
+    try:
+        return rig, rig_uncertainty(rig)
+    except RigError as error:
+        raise RigError(f"{path}: {error}") from None
+
+
+def _lens_part(difference: RigDifference) -> Part:
+    names = POSE_PARAMETERS[:3]
+    way = float(np.linalg.norm([difference.of(name) for name in names]))
+    return _part(difference, "the lens", names, f"moved by {way * 1e3:.2g} mm", way > _LENS_M)
+
+
+def _turn_part(difference: RigDifference) -> Part:
+    names = POSE_PARAMETERS[3:]
+    angle = float(np.linalg.norm([difference.of(name) for name in names]))
+    did = f"turned by {math.degrees(angle):.2g} deg"
+    return _part(difference, "the camera", names, did, angle > _TURN, "did not turn")
+
+
+def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> Part:
+    share = max(abs(new.lens.fx / old.lens.fx - 1.0), abs(new.lens.fy / old.lens.fy - 1.0))
+    centre = math.hypot(difference.of("cx"), difference.of("cy"))
+    did = f"changed by {share:.2%} in focal length and {centre:.2g} px in the image centre"
+    matters = share > _FOCAL_SHARE or centre > _CENTRE_PX
+    names = old.lens.parameter_names
+    return _part(difference, "the intrinsics", names, did, matters)
+
+
+def _shell_part(difference: RigDifference) -> Part:
+    names = ("inner_radius", "thickness", "n_acrylic")
+    radius, thickness, index = (difference.of(name) for name in names)
+    did = f"changed by {radius * 1e3:+.2g} mm in radius, {thickness * 1e3:+.2g} mm in thickness"
+    did += f" and {index:+.2g} in index"
+    matters = max(abs(radius), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
+    return _part(difference, "the dome", names, did, matters)
+
+
+def _water_part(difference: RigDifference) -> Part:
+    change = difference.of("n_water")
+    did = f"changed its index by {change:+.4f}"
+    return _part(difference, "the water", ("n_water",), did, abs(change) > _INDEX)
+
+
+def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> Part:
+    names = _names(old)
+    angle, shift, _ = _laser_move(new_rig, new, old, difference)
+    did = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at 0.6 m"
+    matters = angle > _TILT or abs(shift) > _SHIFT_M
+    return _part(difference, f"laser '{old.name}'", names, did, matters)
+
+
+def _part(
+    difference: RigDifference,
+    name: str,
+    names: tuple[str, ...],
+    did: str,
+    matters: bool,
+    stayed: str = "stayed",
+) -> Part:
+    moved = difference.has_moved(names)
+    return Part(
+        name=name,
+        did=did,
+        stayed=stayed,
+        sigmas=difference.sigmas(names),
+        moved=matters if moved is None else moved,
+        matters=matters,
+    )
+
+
+def _laser_move(
+    rig: Rig, new: Laser, old: Laser, difference: RigDifference
+) -> tuple[float, float, float]:
+    """Angle between two planes, mean distance of the new stripe from the old sheet, its sigma.
+
+    The stripe is that on a wall `_WALL_M` ahead; NaN where the camera does not see it.
+    """
+    names = _names(old)
+    angle = math.atan(math.hypot(*(difference.of(name) for name in names[:2])))
+    points = WallView.ahead(replace(rig, lasers=(new,)), _WALL_M).stripes[0].points_in_dome
+    if not len(points):
+        return angle, math.nan, math.nan
+    sheet = sheet_in(old, rig.n_air, rig.n_water)
+    shift = float(sheet.signed_distance(points).mean())
+    slope = np.append(points.mean(axis=0) @ tangent_basis(old.plane.normal).T, -1.0)
+    rows = [difference.names.index(name) for name in names]
+    variance = float(slope @ difference.covariance[np.ix_(rows, rows)] @ slope)
+    return angle, shift, math.sqrt(max(variance, 0.0))
+
+
+def _names(laser: Laser) -> tuple[str, ...]:
+    return tuple(f"{laser.name}:{name}" for name in LASER_PARAMETERS)
+
+
+def _shared_lasers(new: Rig, old: Rig) -> list[tuple[Laser, Laser]]:
+    """Pairs (new, old) of lasers of one name, in the order of the old rig."""
+    by_name = {laser.name: laser for laser in new.lasers}
+    return [(by_name[laser.name], laser) for laser in old.lasers if laser.name in by_name]
+
+
+def _limits(known: dict[Path, bool]) -> Iterator[str]:
+    """Say what the sigmas do not count."""
+    without = [str(path) for path, is_known in known.items() if not is_known]
+    if len(without) == len(known):
+        yield (
+            "Neither rig says how well it is known, so whatever is too little to matter counts as "
+            "chance."
+        )
+    elif without:
+        yield f"{without[0]} does not say how well it is known; sigmas are those of the other rig."
+
+
+def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
+    """Say what cannot be compared."""
+    if new.size_px != old.size_px:
+        have, had = ("x".join(map(str, rig.size_px)) for rig in (new, old))
+        yield (
+            f"The pictures are {have} px and were {had} px: another camera or video mode, so "
+            "intrinsics and readings cannot be compared."
+        )
+    elif not same_lens_model(new, old):
+        yield "The lens models differ, so the intrinsics cannot be compared number by number."
+    if (new.dome is None) != (old.dome is None):
+        yield f"Only the {'old' if new.dome is None else 'new'} rig has a dome."
+    yield from _laser_mismatches(new, old)
+
+
+def _laser_mismatches(new: Rig, old: Rig) -> Iterator[str]:
+    shared = {laser.name for _, laser in _shared_lasers(new, old)}
+    gone = [laser for laser in old.lasers if laser.name not in shared]
+    for laser in new.lasers:
+        if laser.name in shared:
+            continue
+        twin = next((other for other in gone if _alike(laser, other)), None)
+        if twin is None:
+            yield f"Laser '{laser.name}' is new."
+        else:
+            gone.remove(twin)
+            yield (
+                f"Laser '{laser.name}' lies where '{twin.name}' lay; if it is the same, give it "
+                "the same name in both files to compare them."
+            )
+    for laser in gone:
+        yield f"Laser '{laser.name}' is gone."
+
+
+def _alike(one: Laser, other: Laser) -> bool:
+    cosine = float(one.plane.normal @ other.plane.normal)
+    shift = one.plane.offset - math.copysign(1.0, cosine) * other.plane.offset
+    return abs(cosine) > math.cos(_ALIKE_TILT) and abs(shift) < _ALIKE_SHIFT_M
+
+
+def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:
+    table = Table(box=None)
+    table.add_column("number")
+    for name in ("old", "new", "change", "sigma", "in sigmas"):
+        table.add_column(name, justify="right")
+    for name in difference.names:
+        if ":" not in name:
+            table.add_row(*_row(name, _value(new, name), _value(old, name), difference))
+    for ours, theirs in _shared_lasers(new, old):
+        for row in _laser_rows(new, ours, theirs, difference):
+            table.add_row(*row)
+    return table
+
+
+def _row(name: str, new: float, old: float, difference: RigDifference) -> list[str]:
+    label = file_parameter_name(name)
+    scale = _SCALES.get(label.rpartition("_")[2], 1.0)
+    change, sigma = scale * difference.of(name), scale * difference.sigma(name)
+    return [
+        label,
+        "" if math.isnan(old) else f"{scale * old:.6g}",
+        "" if math.isnan(new) else f"{scale * new:.6g}",
+        *_change_cells(change, sigma),
+    ]
+
+
+def _change_cells(change: float, sigma: float) -> list[str]:
+    if change == 0.0:
+        return ["same", "", ""]
+    if sigma == 0.0 or math.isnan(sigma):
+        return [f"{change:+.3g}", "", ""]
+    return [f"{change:+.3g}", f"{sigma:.2g}", f"{abs(change) / sigma:.1f}"]
+
+
+def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> Iterator[list[str]]:
+    angle, shift, sigma = _laser_move(rig, new, old, difference)
+    label = escaped(old.name)
+    turn = [f"{label} turned by deg", "", ""]
+    yield turn + _change_cells(math.degrees(angle), math.degrees(_tilt_sigma(old, difference)))
+    if math.isfinite(shift):
+        moved = [f"{label} off at {_WALL_M:g} m by mm", "", ""]
+        # Rounding of points that have not moved.
+        shift = 0.0 if abs(shift) < 1e-12 else shift
+        yield moved + _change_cells(shift * 1e3, sigma * 1e3)
+
+
+def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
+    """Sigma of a laser's turn in the direction in which it has turned."""
+    rows = [difference.names.index(name) for name in _names(laser)[:2]]
+    tilt = difference.change[rows]
+    length = float(np.linalg.norm(tilt))
+    if length == 0.0:
+        return 0.0
+    return math.sqrt(float(tilt @ difference.covariance[np.ix_(rows, rows)] @ tilt)) / length
+
+
+def _value(rig: Rig, name: str) -> float:
+    """Value of one of a camera's numbers, NaN for rotations, which are told by their change."""
+    values: dict[str, float | FloatArray] = {
+        **dict(zip(POSE_PARAMETERS[:3], rig.dome_from_cam.translation.tolist(), strict=True)),
+        **dict.fromkeys(POSE_PARAMETERS[3:], math.nan),
+        "n_air": rig.n_air,
+        "n_water": rig.n_water,
+    }
+    if rig.dome is not None:
+        dome = rig.dome
+        values |= {"inner_radius": dome.inner_radius, "thickness": dome.thickness}
+        values["n_acrylic"] = dome.n_acrylic
+    lens = rig.lens
+    intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    values |= dict(zip(lens.parameter_names, intrinsics, strict=True))
+    return float(values[name])
+
+
+def _degrees(angle: float) -> str:
+    # Adding zero turns -0.0 into 0.0.
+    return f"{round(math.degrees(angle), 2) + 0.0:+.2f}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,380 @@
+"""`aqualvs doctor`: whether machine, stream and autopilot are ready, in words.
+
+`aqualvs doctor --mavlink`: what the autopilot tells, and what its settings mean for us.
+"""
+
+import contextlib
+import importlib.metadata
+import importlib.resources
+import itertools
+import os
+import platform
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+
+from aqualvs import __version__
+from aqualvs.check.finding import Finding, Severity, findings_table
+from aqualvs.control.vehicle import Mode, VehicleState
+from aqualvs.demo import bundled_dive
+from aqualvs.errors import AqualvsError
+from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
+from aqualvs.live.mavlink.ardusub_parameters import (
+    FOR_DISTANCE,
+    FOR_STICKS,
+    Advice,
+    Weight,
+    advise_on_distance,
+    advise_on_fail_safe,
+    advise_on_speed,
+    advise_on_station,
+)
+from aqualvs.live.mavlink.link import MavlinkLink
+from aqualvs.live.options import VehicleSetup
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources import open_source
+from aqualvs.sources.base import State
+
+_HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
+# Between heartbeats the attitude tells that the vehicle is there; channels show the pilot's sticks.
+_ATTITUDE_HZ, _CHANNELS_HZ = 10.0, 5.0
+_SUBMARINE = 12
+_SEVERITY = {
+    Weight.FINE: Severity.OK,
+    Weight.CARE: Severity.WARN,
+    Weight.BROKEN: Severity.BAD,
+}
+_MODES = {
+    Mode.OURS: "follow engages in it",
+    Mode.PILOT: "follow does not engage in it; choose {own}",
+    Mode.NO_STATION: "follow does not engage without its ground station",
+    Mode.IGNORED: "follow does not engage",
+    Mode.CONFLICT: "follow does not engage while two speak as the vehicle; use --mavlink-peer",
+    Mode.UNKNOWN: "follow does not engage",
+}
+
+
+def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> Iterator[Finding]:
+    """Wait for the heartbeat of an autopilot, listen for a while, and read its parameters.
+
+    Parameters
+    ----------
+    address : str
+        As in `parse_address`.
+    vehicle : VehicleSetup
+    rig : Path or None
+        Whose working range the autopilot's rangefinder should take.
+    """
+    working_range = None if rig is None else load_rig(rig).working_range
+    with contextlib.closing(MavlinkLink(address, vehicle.link)) as link:
+        end_s = time.monotonic() + _HEARTBEAT_S
+        while link.autopilot() is None and time.monotonic() < end_s:
+            time.sleep(0.05)
+        heard, health = link.autopilot(), link.health()
+        if heard is None:
+            yield Finding(
+                Severity.BAD,
+                f"{address}: no heartbeat of an autopilot in {_HEARTBEAT_S:.0f} s "
+                f"({health.detail}); add this machine as an endpoint in BlueOS, or check address "
+                "and port",
+            )
+            return
+        severity = Severity.OK if health.state is State.OK else Severity.WARN
+        yield Finding(severity, f"{address}: {health.detail}")
+        if heard.message.type != _SUBMARINE:
+            yield Finding(Severity.WARN, "not ArduSub: live sends to it, follow cannot steer it")
+            return
+        yield from _ardusub(link, vehicle, working_range)
+
+
+def _ardusub(
+    link: MavlinkLink, vehicle: VehicleSetup, working_range: tuple[float, float] | None
+) -> Iterator[Finding]:
+    began_s = time.monotonic()
+    before = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
+    told = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), patience_s=_LISTEN_S)
+    # The ground station is to be heard, and rates are to be counted, for some seconds.
+    time.sleep(max(0.0, began_s + _LISTEN_S - time.monotonic()))
+    span_s = time.monotonic() - began_s
+    after = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
+    attitude_hz, channels_hz = ((b - a) / span_s for a, b in zip(before, after, strict=True))
+    steering = vehicle.steering
+    state = ArduSubLink(link, steering, advises=False).state()
+    yield _mode(state, steering.own_modes)
+    yield _station(link, steering)
+    yield _attitude(attitude_hz)
+    yield _channels(channels_hz)
+    if not told:
+        yield Finding(
+            Severity.WARN,
+            "no parameter is told: the vehicle does not answer us; look its settings up in the "
+            "ground station (docs/ardusub.md lists them)",
+        )
+        return
+    advice = [advise_on_station(told, steering.ground_station)]
+    advice += advise_on_fail_safe(told) + advise_on_speed(told)
+    advice += advise_on_distance(told, working_range)
+    for one in advice:
+        yield _finding(one)
+
+
+def _finding(advice: Advice) -> Finding:
+    return Finding(_SEVERITY[advice.weight], advice.text)
+
+
+def _mode(state: VehicleState, own_modes: tuple[str, ...]) -> Finding:
+    means = _MODES[state.mode].format(own=" or ".join(own_modes))
+    armed = "armed" if state.armed else "disarmed: follow engages once it is armed"
+    fits = state.mode in (Mode.OURS, Mode.PILOT)
+    # The rest of it is told with the station's own line.
+    name = state.mode_name.partition(";")[0]
+    return Finding(Severity.OK if fits else Severity.WARN, f"mode {name}: {means}; {armed}")
+
+
+def _station(link: MavlinkLink, steering: ArduSubOptions) -> Finding:
+    station = steering.ground_station
+    beat = link.latest("HEARTBEAT", system=station)
+    if beat is not None and beat.age_s < _LISTEN_S:
+        return Finding(Severity.OK, f"ground station {station} is heard")
+    if steering.station_timeout_s is None:
+        return Finding(Severity.OK, f"ground station {station} is not heard, and need not be")
+    return Finding(
+        Severity.WARN,
+        f"ground station {station} is not heard: follow does not engage; let the router forward "
+        "its heartbeat, or set ground_station in the vehicle file",
+    )
+
+
+def _attitude(rate_hz: float) -> Finding:
+    words = f"ATTITUDE {rate_hz:.0f} Hz"
+    if rate_hz >= _ATTITUDE_HZ:
+        return Finding(Severity.OK, f"{words}: follow hears the vehicle between its heartbeats")
+    return Finding(
+        Severity.WARN,
+        f"{words}: follow takes the vehicle for silent between its heartbeats; set MAV1_EXTRA1 "
+        f"{_ATTITUDE_HZ:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)",
+    )
+
+
+def _channels(rate_hz: float) -> Finding:
+    words = f"RC_CHANNELS {rate_hz:.0f} Hz"
+    if rate_hz >= _CHANNELS_HZ:
+        return Finding(
+            Severity.OK, f"{words}: follow sees the pilot's sticks, and whether ours are obeyed"
+        )
+    return Finding(
+        Severity.WARN,
+        f"{words}: follow sees the pilot's sticks late or not at all, and not whether ours are "
+        "obeyed; set MAV1_RC_CHAN 10 (before 4.7: SR0_RC_CHAN; the number is that of the "
+        "autopilot's port)",
+    )
+
+
+_EXTRAS = {
+    "mavlink": (("pymavlink",), "MAVLink, .tlog and .BIN logs"),
+    "dds": (("cyclonedds",), "ROS 2 without ROS"),
+    "foxglove": (("foxglove-sdk",), "Foxglove live"),
+    "dashboard": (("starlette", "uvicorn", "websockets"), "the pilot's page"),
+    "bags": (("rosbags",), "ROS bags as source"),
+}
+"""Extra, the packages it brings, what they are for."""
+
+_N_FRAMES, _FRAME_RATE = 40, 25.0
+_LEAST_FREE_GB = 2.0
+_STREAM_S = 8.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoctorRequest:
+    """What to look at beyond the machine itself.
+
+    Attributes
+    ----------
+    source : str or None
+        Stream, camera or file.
+    rig : Path or None
+        Rig that the pictures should fit.
+    mavlink : str or None
+        Address of an autopilot.
+    vehicle : VehicleSetup
+        Who is to be there, and how it is to be steered.
+    """
+
+    source: str | None = None
+    rig: Path | None = None
+    mavlink: str | None = None
+    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
+
+
+def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
+    """Look at everything and print what was found.
+
+    Raises
+    ------
+    AqualvsError
+        At the end, if something does not work: the first such finding.
+    """
+    console = console or Console()
+    console.print(f"aqualvs {__version__}", style="bold", highlight=False)
+    looks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
+    if request.rig is not None:
+        looks.append(lambda: _rig_file(Path(str(request.rig))))
+    if request.source is not None:
+        looks.append(lambda: _stream(str(request.source), request.rig))
+    if request.mavlink is not None:
+        looks.append(lambda: autopilot(str(request.mavlink), request.vehicle, request.rig))
+    broken: list[str] = []
+    for look in looks:
+        found = list(_guarded(look))
+        console.print(findings_table(found))
+        broken += [finding.sentence for finding in found if finding.severity is Severity.BAD]
+    if broken:
+        raise AqualvsError(f"not ready: {broken[0]}")
+
+
+def _guarded(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    try:
+        yield from look()
+    except AqualvsError as fault:
+        yield Finding(Severity.BAD, str(fault))
+
+
+def _machine() -> Iterator[Finding]:
+    cores = os.cpu_count() or 1
+    words = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
+    yield Finding(Severity.OK if cores > 1 else Severity.WARN, words)
+    free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
+    if free_gb < _LEAST_FREE_GB:
+        yield Finding(
+            Severity.WARN, f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour"
+        )
+
+
+def _packages() -> Iterator[Finding]:
+    for extra, (packages, purpose) in _EXTRAS.items():
+        missing = [name for name in packages if not _installed(name)]
+        if missing:
+            yield Finding(
+                Severity.WARN,
+                f"{purpose}: {', '.join(missing)} missing; pip install 'aqualvs[{extra}]'",
+            )
+        else:
+            told = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+            yield Finding(Severity.OK, f"{purpose}: {told}")
+
+
+def _installed(package: str) -> bool:
+    try:
+        importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _pipeline() -> Iterator[Finding]:
+    """Decode and measure the bundled dive."""
+    with importlib.resources.as_file(bundled_dive()) as folder:
+        rig = load_rig(folder / "rig.yaml")
+        with open_source(folder / "dive.mp4") as source:
+            frames = list(itertools.islice(source, _N_FRAMES))
+        yield Finding(Severity.OK, f"H.264 decoded: {len(frames)} frames of the bundled dive")
+        yield _speed(rig, frames)
+
+
+def _speed(rig: Rig, frames: list[Frame]) -> Finding:
+    began = time.perf_counter()
+    scanner = Scanner(rig)
+    scanner.process(frames[0])
+    ready_s = time.perf_counter() - began
+    times, n_valid = [], 0
+    for frame in frames:
+        began = time.perf_counter()
+        n_valid += bool(scanner.process(frame).posture)
+        times.append(time.perf_counter() - began)
+    middle = statistics.median(times)
+    width, height = rig.size_px
+    words = (
+        f"posture in {n_valid} of {len(frames)} frames; {1e3 * middle:.1f} ms a frame of "
+        f"{width}x{height} px, first after {ready_s:.1f} s"
+    )
+    if n_valid < 0.9 * len(frames):
+        return Finding(Severity.BAD, f"{words}; the installation is broken, install aqualvs again")
+    if middle > 0.5 / _FRAME_RATE:
+        return Finding(Severity.WARN, f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
+    return Finding(Severity.OK, words)
+
+
+def _rig_file(path: Path) -> Iterator[Finding]:
+    rig = load_rig(path)
+    size = "x".join(map(str, rig.size_px))
+    yield Finding(Severity.OK, f"rig {rig.name!r}: {size} px, lasers: {len(rig.lasers)}")
+
+
+def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
+    """Take frames for a few seconds."""
+    rig = None if rig_file is None else load_rig(rig_file)
+    frames, span_s, health = _received(where)
+    if not frames:
+        yield Finding(
+            Severity.BAD,
+            f"{where}: no picture in {_STREAM_S:.0f} s ({health}); is the sender on, its address "
+            "this machine's, the port open in the firewall?",
+        )
+        return
+    height, width = frames[-1].luma.shape
+    lost = frames[-1].index - frames[0].index + 1 - len(frames)
+    rate = (len(frames) - 1) / span_s if span_s > 0 else 0.0
+    severity = Severity.WARN if lost else Severity.OK
+    yield Finding(
+        severity, f"{where}: {width}x{height} px, {rate:.1f} frames a second, {lost} lost"
+    )
+    if rig is not None:
+        yield _fit(rig, frames)
+
+
+def _received(where: str) -> tuple[list[Frame], float, str]:
+    """Return the frames of a few seconds, the time between first and last, and the feed's words."""
+    from aqualvs.live.runner import FrameReader, Mailbox
+    from aqualvs.sources.opening import open_feed
+
+    feed, mailbox = open_feed(where, realtime=True), Mailbox()
+    frames: list[Frame] = []
+    arrived_ns: list[int] = []
+    with FrameReader(feed, mailbox) as reader:
+        end = time.monotonic() + _STREAM_S
+        while time.monotonic() < end and len(frames) < 2 * _N_FRAMES and not mailbox.exhausted:
+            arrival = mailbox.take(0.2)
+            if arrival is not None:
+                frames.append(arrival.frame)
+                arrived_ns.append(arrival.arrived_ns)
+        words = reader.health().detail
+    if reader.fault is not None and not frames:
+        raise reader.fault
+    span_s = 1e-9 * (arrived_ns[-1] - arrived_ns[0]) if arrived_ns else 0.0
+    return frames, span_s, words
+
+
+def _fit(rig: Rig, frames: list[Frame]) -> Finding:
+    height, width = frames[-1].luma.shape
+    if (width, height) != rig.size_px:
+        need = "x".join(map(str, rig.size_px))
+        return Finding(
+            Severity.BAD,
+            f"the rig {rig.name!r} has pictures of {need} px; set the camera to that mode, or "
+            "calibrate in this one",
+        )
+    scanner = Scanner(rig)
+    n_valid = sum(bool(scanner.process(frame).posture) for frame in frames)
+    words = f"posture in {n_valid} of {len(frames)} frames with the rig {rig.name!r}"
+    if not n_valid:
+        reason = scanner.process(frames[-1]).posture
+        return Finding(Severity.WARN, f"{words}: {getattr(reason, 'detail', '')}")
+    return Finding(Severity.OK, words)

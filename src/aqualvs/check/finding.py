@@ -1,0 +1,185 @@
+"""Findings: what `aqualvs check` has to say, one sentence each.
+
+What a rig can measure, in words and tables: errors of posture, and of the water's index.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from rich.table import Table
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.expected_error import (
+    N_POINTS,
+    SIGMA_PX,
+    USUAL_RANGES,
+    ExpectedError,
+    expected_posture_errors,
+)
+from aqualvs.optics.rig import Rig, RigUncertainty
+
+
+class Severity(StrEnum):
+    """How much a finding matters."""
+
+    OK = "ok"
+    WARN = "warn"
+    BAD = "bad"
+    """Makes the rig useless as it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing found about a rig.
+
+    Attributes
+    ----------
+    severity : Severity
+    sentence : str
+        What was found, with the value, and the remedy where one is needed.
+    """
+
+    severity: Severity
+    sentence: str
+
+
+def findings_table(findings: Sequence[Finding]) -> Table:
+    """Return the findings for a terminal, a line each."""
+    style = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}
+    table = Table(box=None, show_header=False, padding=(0, 1))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        mark = style[finding.severity]
+        table.add_row(f"[{mark}]{finding.severity.value}[/]", escaped(finding.sentence))
+    return table
+
+
+def escaped(text: str) -> str:
+    """Return text that a terminal shows as it is, square brackets included."""
+    return text.replace("[", r"\[")
+
+
+def count_words(n: int, word: str) -> str:
+    """Return a number of things: "1 fault", "2 faults"."""
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"
+
+
+_INDEX_STEP = 1e-4
+# Systematic errors that a user should know of before the dive.
+_LARGE_SHARE, _LARGE_ANGLE_DEG = 0.005, 0.5
+
+
+def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedError, ...]:
+    """Return what to expect at the usual ranges that lie in the working range, if any do."""
+    if len(rig.lasers) < 2:
+        return ()
+    near, far = rig.working_range
+    inside = [wall for wall in USUAL_RANGES if near <= wall <= far]
+    return expected_posture_errors(rig, uncertainty, inside or [near, far])
+
+
+def check_errors(errors: Sequence[ExpectedError]) -> Iterator[Finding]:
+    """Say what to expect at each range, from noise and from the uncertainty of the rig."""
+    for expected in errors:
+        place = f"At {expected.wall_range * 1e3:.0f} mm"
+        if not expected.valid:
+            yield Finding(
+                Severity.WARN, f"{place} the stripes in the picture do not determine a plane."
+            )
+            continue
+        yield _noise_finding(expected, place)
+        yield _calibration_finding(expected, place)
+
+
+def _noise_finding(expected: ExpectedError, place: str) -> Finding:
+    range_mm, pitch, yaw = _shown_units(expected.sigma_noise)
+    sentence = (
+        f"{place} noise of {SIGMA_PX} px alone gives a standard deviation of {range_mm:.2g} mm in "
+        f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw"
+    )
+    if range_mm > 0.01e3 * expected.wall_range or max(pitch, yaw) > 1.0:
+        return Finding(
+            Severity.WARN, f"{sentence}; put the lasers farther from the camera or across."
+        )
+    return Finding(Severity.OK, f"{sentence}.")
+
+
+def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
+    range_mm, pitch, yaw = _shown_units(expected.sigma_calibration)
+    share = 1e-3 * range_mm / expected.wall_range
+    sentence = (
+        f"{place} the uncertainty of the rig leaves a systematic error of {range_mm:.2g} mm "
+        f"({share:.2%}) in range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw (one sigma)"
+    )
+    if share > _LARGE_SHARE or max(pitch, yaw) > _LARGE_ANGLE_DEG:
+        return Finding(
+            Severity.WARN,
+            f"{sentence}, more than {_LARGE_SHARE:.1%} or {_LARGE_ANGLE_DEG} degrees; calibrate "
+            "what is only assumed, or again with more pictures, nearer and farther ones.",
+        )
+    return Finding(Severity.OK, f"{sentence}.")
+
+
+def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
+    """Return what a pixel across each laser's stripe is worth."""
+    table = Table(title="Range error for a pixel", title_justify="left", box=None)
+    table.add_column("range mm", justify="right")
+    for laser in rig.lasers:
+        table.add_column(f"{escaped(laser.name)} mm/px", justify="right")
+    for expected in errors:
+        cells = (_shown(value * 1e3) for value in expected.per_pixel)
+        table.add_row(f"{expected.wall_range * 1e3:.0f}", *cells)
+    return table
+
+
+def error_table(errors: Sequence[ExpectedError]) -> Table:
+    """Return the standard deviations of posture to a wall ahead, by where they come from."""
+    title = f"Expected error, one sigma: a wall ahead, {SIGMA_PX} px on {N_POINTS} points a laser"
+    table = Table(title=title, title_justify="left", box=None)
+    table.add_column("range mm", justify="right")
+    table.add_column("from")
+    for name in ("range mm", "range %", "pitch deg", "yaw deg"):
+        table.add_column(name, justify="right")
+    for expected in errors:
+        rows = {
+            "rig": expected.sigma_calibration,
+            "pixel noise": expected.sigma_noise,
+            "both": expected.sigma,
+        }
+        for i, (name, sigmas) in enumerate(rows.items()):
+            range_mm, pitch, yaw = _shown_units(sigmas)
+            share = 0.1 * range_mm / expected.wall_range
+            place = "" if i else f"{expected.wall_range * 1e3:.0f}"
+            table.add_row(place, name, *map(_shown, (range_mm, share, pitch, yaw)))
+    return table
+
+
+def index_sigma(rig: Rig) -> float:
+    """Uncertainty of the water's index from a known target, infinite where it cannot be seen.
+
+    The target is a plate of 10 by 6 corners, 180 by 100 mm, held 0.4 m ahead at a known place,
+    each corner found to 0.1 px: what an index target on the vehicle gives in one picture.
+    """
+    if rig.dome is None:
+        return np.inf
+    x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
+    corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
+    more, seen_more = rig.in_water(rig.n_water + _INDEX_STEP).camera().project(corners)
+    here, seen = rig.camera().project(corners)
+    slope = (more - here)[seen & seen_more] / _INDEX_STEP
+    information = float(np.sum(slope**2)) / SIGMA_PX**2
+    return 1.0 / np.sqrt(information) if information > 0.0 else np.inf
+
+
+def _shown_units(sigmas: FloatArray) -> tuple[float, float, float]:
+    """Millimetres and degrees of (range, pitch, yaw)."""
+    range_m, pitch, yaw = sigmas.tolist()
+    return range_m * 1e3, math.degrees(pitch), math.degrees(yaw)
+
+
+def _shown(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"

@@ -1,0 +1,486 @@
+"""`aqualvs check rig.yaml`: is this rig sane, and what can it measure? In words.
+
+From what a rig was solved, how long ago and how well; and what should not be believed of it.
+
+How much of the outer medium a camera sees.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from aqualvs.check.finding import (
+    Finding,
+    Severity,
+    check_errors,
+    count_words,
+    error_table,
+    expected_errors,
+    findings_table,
+    index_sigma,
+    sensitivity_table,
+)
+from aqualvs.errors import RigError
+from aqualvs.geometry.planes import Rays
+from aqualvs.optics.camera import POSE_PARAMETERS, Camera
+from aqualvs.optics.expected_error import StripeView, see_stripe
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty, laser_parameter_names
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.sheet import sheet_in
+from aqualvs.optics.solved import (
+    ASSUMED,
+    SolvedStep,
+    assumptions,
+    completed_uncertainty,
+    is_exact,
+    rig_uncertainty,
+    solved_steps,
+)
+
+SURFACES = "surfaces"
+"""Extra of the step `lasers`: the surfaces that lasers were seen on, or how many there were."""
+
+# What good pictures leave: corners 0.05 to 0.2 px, stripes 0.1 to 0.3.
+_LARGE_RMS_PX = 1.0
+_OLD_DAYS = 365
+_FEW_PICTURES = {"camera": 5, "dome": 2}
+# Beyond these a calibration has not found what it was for.
+_LENS_M, _TURN, _FOCAL_SHARE, _INDEX = 2e-3, math.radians(0.5), 0.005, 2e-3
+_TILT, _OFFSET_M = math.radians(0.25), 2e-3
+
+
+def check_solved(
+    rig: Rig, steps: dict[str, SolvedStep], uncertainty: RigUncertainty, now: datetime
+) -> Iterator[Finding]:
+    """Return what is worth saying about how a rig was calibrated.
+
+    Parameters
+    ----------
+    rig : Rig
+    steps : dict of SolvedStep
+        As `solved_steps` gives them.
+    uncertainty : RigUncertainty
+        Of the rig.
+    now : datetime
+        With a time zone.
+    """
+    for name, step in steps.items():
+        yield _told(name, step, now)
+        yield from _doubts(name, step, now)
+    yield from _out_of_order(steps)
+    yield from _assumed(rig, steps)
+    yield from _loose(rig, uncertainty)
+
+
+def age_words(date: datetime, now: datetime) -> str:
+    """Return how long ago a date is: "today", "3 days ago", "5 months ago"."""
+    days = (now - date).days
+    if days < 1:
+        return "today"
+    for length, word, most in ((1, "day", 14), (7, "week", 60), (30.44, "month", 730)):
+        if days < most:
+            return f"{count_words(round(days / length), word)} ago"
+    return f"{count_words(round(days / 365.25), 'year')} ago"
+
+
+def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
+    verb = "were" if name == "lasers" else "was"
+    sentence = (
+        f"The {name} {verb} calibrated {age_words(step.date, now)} from "
+        f"{count_words(step.pictures, 'picture')} with {count_words(step.points, 'point')}, to "
+        f"{step.rms_px:.2g} px rms"
+    )
+    if step.rms_px > _LARGE_RMS_PX:
+        return Finding(
+            Severity.WARN,
+            f"{sentence}: good pictures leave 0.3 px or less; check the board's square size and "
+            "the medium, and calibrate again.",
+        )
+    return Finding(Severity.OK, f"{sentence}.")
+
+
+def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
+    days = (now - step.date).days
+    if days < -1:
+        yield Finding(
+            Severity.WARN,
+            f"The date of solved_from.{name}, {step.date:%Y-%m-%d}, is yet to come; set the clock "
+            "of the computer that calibrates.",
+        )
+    if days > _OLD_DAYS:
+        yield Finding(
+            Severity.WARN,
+            f"The calibration of the {name} is more than a year old; take one picture of a known "
+            "target, or calibrate again.",
+        )
+    if step.rms_px <= 0.0 and step.points > 0:
+        yield Finding(
+            Severity.WARN,
+            f"solved_from.{name}.rms_px is {step.rms_px:g}: no real picture fits that well.",
+        )
+    if step.pictures < _FEW_PICTURES.get(name, 1):
+        yield Finding(
+            Severity.WARN,
+            f"The calibration of the {name} rests on {count_words(step.pictures, 'picture')}; take "
+            f"at least {_FEW_PICTURES.get(name, 1)}, at different tilts and distances.",
+        )
+    surfaces = step.extras.get(SURFACES)
+    count = len(surfaces) if isinstance(surfaces, list) else surfaces
+    if isinstance(count, int | float) and count < 2:
+        yield Finding(
+            Severity.WARN,
+            "The lasers were seen on one surface only, and any plane through such a line fits it; "
+            "show their stripes at two distances at least.",
+        )
+
+
+def _out_of_order(steps: dict[str, SolvedStep]) -> Iterator[Finding]:
+    """Each of camera, dome and lasers rests on the one before."""
+    chain = [name for name in ("camera", "dome", "lasers") if name in steps]
+    for before, after in itertools.pairwise(chain):
+        if steps[before].date > steps[after].date:
+            verb = "were" if after == "lasers" else "was"
+            yield Finding(
+                Severity.WARN,
+                f"The {before} was calibrated after the {after}, which {verb} found with the "
+                f"{before} as it was before; run 'aqualvs calibrate {after}' again.",
+            )
+
+
+def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
+    """Numbers that nobody has said the uncertainty of, and what is assumed in its place."""
+    if is_exact(rig):
+        yield Finding(
+            Severity.OK,
+            "The rig's numbers count as exact (solved_from.uncertainty), as those of a simulated "
+            "dive are; take that out for a rig that was built.",
+        )
+    alike: dict[str, list[str]] = {}
+    for one in assumptions(rig):
+        alike.setdefault(one.words, []).append(f"the {one.what}")
+    for words, what in alike.items():
+        verb = "is" if len(what) == 1 else "are"
+        yield Finding(
+            Severity.OK,
+            f"How well {', '.join(what)} {verb} known is not written down; assumed (one sigma): "
+            f"{words}. 'aqualvs calibrate' finds it out.",
+        )
+    for name, step in steps.items():
+        numbers = step.extras.get(ASSUMED)
+        if isinstance(numbers, list) and numbers:
+            yield Finding(
+                Severity.OK,
+                f"The calibration of the {name} assumed how well {', '.join(map(str, numbers))} "
+                "are known: they were written by hand.",
+            )
+
+
+def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
+    """Numbers that are known so badly that the calibration did not determine them."""
+    lens = _largest(uncertainty, POSE_PARAMETERS[:3])
+    if lens > _LENS_M:
+        yield _warning(
+            f"The lens's place in the dome is known only to {lens * 1e3:.1f} mm",
+            "show the board nearer and in water, or at known distances",
+        )
+    turn = _largest(uncertainty, POSE_PARAMETERS[3:])
+    if turn > _TURN:
+        yield _warning(
+            f"The camera's rotation in the dome is known only to {math.degrees(turn):.1f} degrees",
+            "give the poses of the boards",
+        )
+    focal = _largest(uncertainty, ("fx", "fy")) / rig.focal_px
+    if focal > _FOCAL_SHARE:
+        yield _warning(
+            f"The focal length is known only to {focal:.1%}",
+            "show the board tilted, and as large as the picture",
+        )
+    index = _largest(uncertainty, ("n_water",))
+    if index > _INDEX:
+        yield _warning(
+            f"The water's index is known only to {index:.1g}",
+            "give temperature and salinity",
+        )
+    for laser in rig.lasers:
+        tilt_1, tilt_2, offset = laser_parameter_names(laser)[:3]
+        tilt, shift = _largest(uncertainty, (tilt_1, tilt_2)), _largest(uncertainty, (offset,))
+        if tilt > _TILT or shift > _OFFSET_M:
+            yield _warning(
+                f"Laser '{laser.name}' is known only to {math.degrees(tilt):.2g} degrees and "
+                f"{shift * 1e3:.2g} mm",
+                "show its stripe on more surfaces, near and far",
+            )
+
+
+def _largest(uncertainty: RigUncertainty, names: tuple[str, ...]) -> float:
+    """Largest standard deviation of any combination of some numbers; 0 where none is known."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(uncertainty.of(names))[-1]), 0.0))
+
+
+def _warning(fact: str, remedy: str) -> Finding:
+    return Finding(Severity.WARN, f"{fact} (one sigma); {remedy}, and calibrate again.")
+
+
+def field_of_view(camera: Camera) -> tuple[float, float]:
+    """Horizontal and vertical field of view in the outer medium, in radians; NaN where none."""
+    width, height = camera.size_px
+    middle_x, middle_y = (width - 1) / 2.0, (height - 1) / 2.0
+    ends = [[-0.5, middle_y], [width - 0.5, middle_y], [middle_x, -0.5], [middle_x, height - 0.5]]
+    rays = camera.rays(ends)
+    return _angle(rays, 0, 1), _angle(rays, 2, 3)
+
+
+def blind_fraction(camera: Camera) -> float:
+    """Fraction of the pixels, on a grid, that see nothing of the outer medium."""
+    width, height = camera.size_px
+    x, y = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33))
+    rays = camera.rays(np.stack([x, y], axis=-1))
+    return float(np.mean(~rays.valid))
+
+
+def _angle(rays: Rays, first: int, second: int) -> float:
+    cosine = float(rays.directions[first] @ rays.directions[second])
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+EXIT_SANE, EXIT_BAD = 0, 2
+
+_N_RANGES = 43
+
+
+def run_check(path: Path, console: Console | None = None) -> int:
+    """Check a rig file, print what was found, and return the exit code.
+
+    Returns
+    -------
+    int
+        0 where the rig is sane, warnings allowed; 2 where something is bad.
+
+    Raises
+    ------
+    RigError
+        If the file is not a rig file.
+    """
+    rig = load_rig(path, need_lasers=False)
+    console = console or Console()
+    try:
+        findings = check_rig(rig)
+    except RigError as error:
+        raise RigError(f"{path}: {error}") from None
+    console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
+    console.print(findings_table(findings))
+    errors = expected_errors(rig, completed_uncertainty(rig))
+    if errors:
+        console.print(sensitivity_table(rig, errors))
+        console.print(error_table(errors))
+    bad = any(finding.severity is Severity.BAD for finding in findings)
+    console.print(_verdict(findings), style="bold red" if bad else "bold", highlight=False)
+    return EXIT_BAD if bad else EXIT_SANE
+
+
+def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
+    """Return everything worth saying about a rig, in the order in which light passes it.
+
+    Parameters
+    ----------
+    rig : Rig
+    now : datetime, optional
+        With a time zone; calibrations are as old as it makes them. The computer's clock if left
+        out.
+
+    Raises
+    ------
+    RigError
+        If what calibrations have noted down in the rig cannot be understood.
+    """
+    camera, uncertainty = rig.camera(), rig_uncertainty(rig)
+    return [
+        *_check_lens(rig),
+        *_check_view(rig, camera),
+        _check_water(rig),
+        _check_index(rig),
+        *_check_lasers(rig, camera),
+        *(_check_pair(a, b) for a, b in itertools.combinations(rig.lasers, 2)),
+        *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
+        *check_errors(expected_errors(rig, completed_uncertainty(rig))),
+    ]
+
+
+def _check_lens(rig: Rig) -> Iterator[Finding]:
+    distance = float(np.linalg.norm(rig.dome_from_cam.translation))
+    if rig.dome is None:
+        yield Finding(Severity.WARN, "There is no dome: rays start at the lens, in the water.")
+    else:
+        gap = rig.dome.inner_radius - distance
+        if gap <= 0.0:
+            yield Finding(
+                Severity.BAD,
+                f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, outside the inner "
+                f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm.",
+            )
+        else:
+            yield Finding(
+                Severity.OK,
+                f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, "
+                f"{gap * 1e3:.1f} mm inside the dome.",
+            )
+    width, height = rig.size_px
+    across, down = (rig.lens.cx + 0.5) / width, (rig.lens.cy + 0.5) / height
+    if not (0.25 < across < 0.75 and 0.25 < down < 0.75):
+        yield Finding(
+            Severity.WARN,
+            f"The image centre ({rig.lens.cx:.0f}, {rig.lens.cy:.0f}) px is far from the middle of "
+            f"a {width}x{height} picture; was the camera calibrated at this size?",
+        )
+    ratio = rig.lens.fx / rig.lens.fy
+    if not 0.8 < ratio < 1.25:
+        yield Finding(
+            Severity.WARN,
+            f"The focal lengths {rig.lens.fx:.0f} and {rig.lens.fy:.0f} px differ by more than "
+            "pixels usually do; was the camera calibrated at this size?",
+        )
+
+
+def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
+    axis = rig.dome_from_cam.rotation[:, 2]
+    off = math.degrees(math.acos(min(max(float(axis[1]), -1.0), 1.0)))
+    if off >= 90.0:
+        yield Finding(
+            Severity.BAD,
+            f"The camera looks {off:.0f} degrees away from forward (the dome's y axis); correct "
+            "camera.rotation_deg.",
+        )
+    elif off > 30.0:
+        yield Finding(
+            Severity.WARN,
+            f"The camera looks {off:.0f} degrees away from forward (the dome's y axis); posture is "
+            "measured against the dome's axes.",
+        )
+    across, down = (math.degrees(angle) for angle in field_of_view(camera))
+    blind = blind_fraction(camera)
+    if math.isnan(across) or math.isnan(down) or blind > 0.0:
+        yield Finding(
+            Severity.WARN,
+            f"{blind:.0%} of the picture sees no water: the lens model ends or the dome reflects "
+            "there; check camera.distortion and the dome.",
+        )
+    else:
+        yield Finding(
+            Severity.OK, f"The field of view in the water is {across:.0f} by {down:.0f} degrees."
+        )
+
+
+def _check_water(rig: Rig) -> Finding:
+    n = rig.n_water
+    if 1.32 <= n <= 1.36:
+        return Finding(Severity.OK, f"The water's index {n:.4f} is that of {_water_name(n)}.")
+    if abs(n - rig.n_air) < 1e-3:
+        return Finding(
+            Severity.WARN, f"The water's index {n:.4f} is that of air: this rig is for the bench."
+        )
+    return Finding(
+        Severity.BAD,
+        f"The water's index {n:.4f} is not that of water, which has 1.330 to 1.345 for green "
+        "light; correct water.n, or give temperature_c and salinity_permille.",
+    )
+
+
+def _water_name(n: float) -> str:
+    # Quan & Fry at 532 nm: fresh 1.334 to 1.336, sea (35 per mille) 1.340 to 1.343.
+    if 1.330 <= n < 1.3375:
+        return "fresh water"
+    return "sea water" if 1.3375 <= n <= 1.345 else "no usual water, but possible"
+
+
+def _check_index(rig: Rig) -> Finding:
+    sigma = index_sigma(rig)
+    if sigma < 5e-4:
+        return Finding(
+            Severity.OK,
+            f"The lens is far enough from the dome's centre to see the water's index: one picture "
+            f"of a known target gives it to {sigma:.1g}.",
+        )
+    if rig.dome is None:
+        return Finding(Severity.OK, "Without a dome the water's index does not enter.")
+    seen = "not at all" if sigma > 0.1 else f"only to {sigma:.1g}"
+    return Finding(
+        Severity.OK,
+        f"This lens, so near the dome's centre, can see the water's index {seen}; give it by "
+        "temperature and salinity. It matters as little to the range.",
+    )
+
+
+def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
+    if not rig.lasers:
+        yield Finding(
+            Severity.BAD, "There are no lasers; run 'aqualvs calibrate lasers' or write them."
+        )
+    if len(rig.lasers) == 1:
+        yield Finding(
+            Severity.WARN,
+            "One laser draws one line on a target: points, but no pitch and yaw; add a second.",
+        )
+    for laser in rig.lasers:
+        yield _check_laser(rig, camera, laser)
+
+
+def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
+    near, far = rig.working_range
+    walls = np.geomspace(near, far, _N_RANGES)
+    sheet = sheet_in(laser, rig.n_air, rig.n_water)
+    views = [see_stripe(camera, sheet, float(wall)) for wall in walls]
+    seen = np.array([view.visible for view in views])
+    if not seen.any():
+        return Finding(
+            Severity.BAD,
+            f"Laser '{laser.name}' never crosses the picture between {near * 1e3:.0f} and "
+            f"{far * 1e3:.0f} mm; check the sign of its offset_mm and its normal.",
+        )
+    picked = [i for i in (0, _N_RANGES // 2, _N_RANGES - 1) if seen[i]] or [int(np.argmax(seen))]
+    places = ", ".join(_place(float(walls[i]), views[i]) for i in picked)
+    if seen.all():
+        return Finding(Severity.OK, f"Laser '{laser.name}' crosses the picture {places}.")
+    return Finding(
+        Severity.WARN,
+        f"Laser '{laser.name}' is in the picture only from {walls[seen][0] * 1e3:.0f} to "
+        f"{walls[seen][-1] * 1e3:.0f} mm of the working range {near * 1e3:.0f} to "
+        f"{far * 1e3:.0f} mm: {places}.",
+    )
+
+
+def _place(wall: float, view: StripeView) -> str:
+    x, y = view.pixels[len(view.pixels) // 2]
+    return f"at {wall * 1e3:.0f} mm for {view.length_px:.0f} px through ({x:.0f}, {y:.0f})"
+
+
+def _check_pair(a: Laser, b: Laser) -> Finding:
+    cosine = float(a.plane.normal @ b.plane.normal)
+    angle = math.degrees(math.acos(min(abs(cosine), 1.0)))
+    pair = f"Lasers '{a.name}' and '{b.name}'"
+    apart = abs(a.plane.offset - math.copysign(1.0, cosine) * b.plane.offset)
+    if angle < 1.0 and apart < 5e-3:
+        return Finding(
+            Severity.BAD, f"{pair} lie in one plane, so the two draw one line; check their normals."
+        )
+    if angle < 15.0:
+        return Finding(
+            Severity.WARN,
+            f"{pair} meet at {angle:.0f} degrees only: tilt across their stripes is told by the "
+            "distance between them alone.",
+        )
+    return Finding(Severity.OK, f"{pair} meet at {angle:.0f} degrees.")
+
+
+def _verdict(findings: Sequence[Finding]) -> str:
+    count = {s: sum(finding.severity is s for finding in findings) for s in Severity}
+    if count[Severity.BAD]:
+        faults = count_words(count[Severity.BAD], "fault")
+        return f"This rig cannot measure as it is: mend {faults}."
+    if count[Severity.WARN]:
+        return f"This rig is sane, with {count_words(count[Severity.WARN], 'warning')}."
+    return "This rig is sane."

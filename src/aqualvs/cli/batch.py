@@ -1,0 +1,129 @@
+"""The command line of batches: a signature only; the body is imported in it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aqualvs.cli.command import (
+    MAX_WORKERS,
+    Celsius,
+    Detector,
+    Fit,
+    MeshFilter,
+    Refraction,
+    Salinity,
+    Target,
+    WaterIndex,
+    given,
+    importing,
+)
+
+
+def batch(
+    context: typer.Context,
+    dives: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DIVES",
+            help="Videos, recordings, folders, patterns such as 'dives/**/*.mp4', or a list (CSV "
+            "or YAML) with columns dive, rig, name, water_n, temperature_c, salinity, log, "
+            "log_offset_s.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Folder to write, or to go on with.", show_default=False),
+    ],
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rig file of all dives; if left out, NAME.rig.yaml or rig.yaml beside each dive.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            max=MAX_WORKERS,
+            help="Processes on this machine; one per core by default.",
+            show_default=False,
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Dask scheduler whose workers do it, such as tcp://192.168.1.10:8786.",
+            show_default=False,
+        ),
+    ] = None,
+    target: Target = "auto",
+    detector: Detector = "ridge",
+    mesh_filter: MeshFilter = "none",
+    fit: Fit = "robust",
+    water_n: WaterIndex = None,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    dome: Refraction = True,
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of folders of images.", show_default=False)
+    ] = None,
+    index_target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target on the vehicle (target.yaml) that tells the water's index on the way; "
+            "dives are then not cut.",
+            show_default=False,
+        ),
+    ] = None,
+    report: Annotated[bool, typer.Option(help="Write report.html for each dive.")] = True,
+    net: Annotated[
+        bool,
+        typer.Option(
+            "--net",
+            help="Tell the state of each dive's net too, as aqualvs net does; a list may name the "
+            "vehicles' logs.",
+        ),
+    ] = False,
+    twine_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="With --net: diameter of the bare twine, where it is known.", show_default=False
+        ),
+    ] = None,
+    stretch_m: Annotated[
+        float | None,
+        typer.Option(
+            help="With --net: length of a stretch of net, 0.5 by default.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Measure many dives."""
+    from aqualvs.workers import start_method
+
+    if scheduler is None:
+        start_method.prepare(start_method.FOR_BATCHES)
+    with importing():
+        from aqualvs.batch import command as body
+        from aqualvs.nets.target_file import net_request
+        from aqualvs.results.run_request import Water, scanner_options
+
+    request = body.BatchRequest(
+        dives=tuple(dives),
+        out=out,
+        rig=rig,
+        water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
+        scheduler=scheduler,
+        n_workers=workers,
+        no_dome=not dome,
+        fps=fps,
+        scanner=scanner_options(target, detector, mesh_filter, fit),
+        chosen=given(context, ("target", "detector", "mesh_filter", "fit")),
+        target=target,
+        index_target=index_target,
+        report=report,
+        net=net_request(wanted=net, twine_mm=twine_mm, stretch_m=stretch_m),
+    )
+    raise typer.Exit(body.batch(request, typer.echo))

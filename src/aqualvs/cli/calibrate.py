@@ -1,0 +1,356 @@
+"""Signatures and help of `aqualvs calibrate ...` and `aqualvs board ...`; bodies are elsewhere."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from aqualvs.cli.command import Celsius, CheckedCommand, Overwrite, Salinity
+
+calibrate = typer.Typer(
+    name="calibrate",
+    help="Make a rig file from pictures: camera, dome, lasers, water, in this order.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+Pictures = Annotated[
+    list[str], typer.Argument(help="Pictures, folders of them, or patterns such as 'air/*.png'.")
+]
+BoardFile = Annotated[
+    Path, typer.Option("--board", help="Board in the pictures (board.yaml).", show_default=False)
+]
+RigIn = Annotated[
+    Path, typer.Option("--rig", help="Rig file of the step before.", show_default=False)
+]
+RigOut = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        "-o",
+        help="Rig file to write; one that is there is kept under a dated name.",
+        show_default=False,
+    ),
+]
+Medium = Annotated[
+    str | None,
+    typer.Option(
+        metavar="air|water|N",
+        help="What was outside the dome: air, the rig's water, or an index.",
+        show_default=False,
+    ),
+]
+
+
+@calibrate.command(
+    cls=CheckedCommand,
+    help="Intrinsics of the camera, from a board in air, without the dome.",
+    epilog="Example: aqualvs calibrate camera air/*.png --board board.yaml -o rig.yaml",
+)
+def camera(
+    images: Pictures,
+    board: BoardFile,
+    out: RigOut,
+    nominal: Annotated[
+        Path | None,
+        typer.Option(
+            help="What is known of the rig beforehand: a rig file, or name, dome and lasers.",
+            show_default=False,
+        ),
+    ] = None,
+    model: Annotated[
+        Literal["opencv", "fisheye"], typer.Option(help="Distortion model.")
+    ] = "opencv",
+    coefficients: Annotated[
+        Literal["auto", "0", "4", "5", "8"],
+        typer.Option(help="Distortion coefficients; auto takes as many as the data support."),
+    ] = "auto",
+) -> None:
+    """Calibrate the camera."""
+    from aqualvs.calibrate import camera as body
+
+    body.calibrate_camera(
+        body.CameraRequest(
+            images=tuple(images),
+            board=board,
+            out=out,
+            nominal=nominal,
+            model=model,
+            n_coefficients=None if coefficients == "auto" else int(coefficients),
+        ),
+        typer.echo,
+    )
+
+
+@calibrate.command(
+    cls=CheckedCommand,
+    help="Place of the lens in the dome, from a board outside it, in air, in water, or both. "
+    "With poses (distance only, or full) the camera's rotation is found too.",
+    epilog="Example: aqualvs calibrate dome rail/*.png --board board.yaml --poses poses.csv "
+    "--rig rig.yaml -o rig.yaml",
+)
+def dome(
+    images: Pictures,
+    board: BoardFile,
+    rig: RigIn,
+    out: RigOut,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="What is known of the boards' poses (poses.csv): distances, or full poses.",
+            show_default=False,
+        ),
+    ] = None,
+    medium: Medium = "air",
+    water_images: Annotated[
+        list[str] | None,
+        typer.Option(help="Further pictures, taken in water; repeatable.", show_default=False),
+    ] = None,
+    water_board: Annotated[
+        Path | None,
+        typer.Option(help="Board of those, if it is another one.", show_default=False),
+    ] = None,
+    water_poses: Annotated[
+        Path | None, typer.Option(help="Poses of those.", show_default=False)
+    ] = None,
+    inner_radius_mm: Annotated[
+        float | None, typer.Option(help="Inner radius of the dome.", show_default=False)
+    ] = None,
+    thickness_mm: Annotated[
+        float | None, typer.Option(help="Thickness of the dome.", show_default=False)
+    ] = None,
+    n_acrylic: Annotated[
+        float | None, typer.Option(help="Index of the dome's material.", show_default=False)
+    ] = None,
+    radius_tolerance_mm: Annotated[
+        float, typer.Option(help="How well the radius is known (one sigma).")
+    ] = 0.1,
+    thickness_tolerance_mm: Annotated[
+        float, typer.Option(help="How well the thickness is known (one sigma).")
+    ] = 0.1,
+    acrylic_tolerance: Annotated[
+        float, typer.Option(help="How well the material's index is known (one sigma).")
+    ] = 0.003,
+    distance_sigma_mm: Annotated[
+        float, typer.Option(help="How well the poses' distances are known (one sigma).")
+    ] = 0.2,
+    refine_intrinsics: Annotated[
+        bool,
+        typer.Option(
+            "--refine-intrinsics/--keep-intrinsics",
+            help="Let the intrinsics move within what the camera's calibration says of them.",
+        ),
+    ] = True,
+) -> None:
+    """Calibrate the dome."""
+    from aqualvs.calibrate import dome as body
+
+    body.calibrate_dome(
+        body.DomeRequest(
+            images=tuple(images),
+            board=board,
+            rig=rig,
+            out=out,
+            poses=poses,
+            medium=medium or "air",
+            water_images=tuple(water_images or ()),
+            water_board=water_board,
+            water_poses=water_poses,
+            inner_radius_mm=inner_radius_mm,
+            thickness_mm=thickness_mm,
+            n_acrylic=n_acrylic,
+            radius_tolerance_mm=radius_tolerance_mm,
+            thickness_tolerance_mm=thickness_tolerance_mm,
+            acrylic_tolerance=acrylic_tolerance,
+            distance_sigma_mm=distance_sigma_mm,
+            refine_intrinsics=refine_intrinsics,
+        ),
+        typer.echo,
+    )
+
+
+@calibrate.command(
+    cls=CheckedCommand,
+    help="Laser planes, all lasers on at once, from a box of markers (--box), or from stripes on "
+    "a plane that carries a board (--board).",
+    epilog="Example: aqualvs calibrate lasers box/*.png --box box.yaml --rig rig.yaml -o rig.yaml",
+)
+def lasers(
+    images: Pictures,
+    rig: RigIn,
+    out: RigOut,
+    box: Annotated[
+        Path | None, typer.Option(help="Box of markers (box.yaml).", show_default=False)
+    ] = None,
+    board: Annotated[
+        Path | None,
+        typer.Option(help="Board on the plane that the stripes lie on.", show_default=False),
+    ] = None,
+    medium: Medium = None,
+    n_lasers: Annotated[
+        int | None,
+        typer.Option("--lasers", help="How many there are, if known.", show_default=False),
+    ] = None,
+    names: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,C", help="Names, left to right by image.", show_default=False),
+    ] = None,
+    wavelength_nm: Annotated[
+        float | None,
+        typer.Option(
+            help="Wavelength of the lasers, for example 650 for red ones; without it that of the "
+            "rig's lasers, or else green.",
+            show_default=False,
+        ),
+    ] = None,
+    board_offset_mm: Annotated[
+        float, typer.Option(help="How far the board stands before the stripes' plane.")
+    ] = 0.0,
+    refine: Annotated[
+        bool,
+        typer.Option("--refine", help="Refine camera, dome and water together with the planes."),
+    ] = False,
+) -> None:
+    """Calibrate the lasers."""
+    from aqualvs.calibrate import lasers as body
+
+    body.calibrate_lasers(
+        body.LasersRequest(
+            images=tuple(images),
+            rig=rig,
+            out=out,
+            box=box,
+            board=board,
+            medium=medium,
+            n_lasers=n_lasers,
+            names=None if names is None else tuple(name.strip() for name in names.split(",")),
+            board_offset_mm=board_offset_mm,
+            refine=refine,
+            wavelength_nm=wavelength_nm,
+        ),
+        typer.echo,
+    )
+
+
+@calibrate.command(
+    cls=CheckedCommand,
+    help="Refractive index of the water, from a target fixed on the vehicle. SOURCE is a video, "
+    "pictures, or a folder of them.",
+    epilog="Example: aqualvs calibrate water dive.mp4 --target target.yaml --rig rig.yaml "
+    "-o rig.yaml",
+)
+def water(
+    source: Annotated[list[str], typer.Argument(help="Video, pictures, or a folder of them.")],
+    target: Annotated[
+        Path,
+        typer.Option(help="Target on the vehicle (target.yaml).", show_default=False),
+    ],
+    rig: RigIn,
+    out: RigOut,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of pictures.", show_default=False)
+    ] = None,
+    place_sigma_mm: Annotated[
+        float, typer.Option(help="How well the target's place is known (one sigma).")
+    ] = 0.2,
+    turn_sigma_deg: Annotated[
+        float, typer.Option(help="How well the target's turn is known (one sigma).")
+    ] = 0.1,
+) -> None:
+    """Calibrate the water."""
+    from aqualvs.calibrate import water as body
+
+    body.calibrate_water(
+        body.WaterRequest(
+            source=tuple(source),
+            target=target,
+            rig=rig,
+            out=out,
+            temperature_c=temperature_c,
+            salinity=salinity,
+            fps=fps,
+            place_sigma_mm=place_sigma_mm,
+            turn_sigma_deg=turn_sigma_deg,
+        ),
+        typer.echo,
+    )
+
+
+def board(
+    kind: Annotated[
+        Literal["charuco", "chessboard", "box", "plate"],
+        typer.Argument(
+            help="A board for camera and dome, the markers of a box for the lasers, or a plate "
+            "of markers, fixed on the vehicle, for the water."
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="OUT.pdf and OUT.yaml are written.", show_default=False),
+    ],
+    paper: Annotated[
+        str, typer.Option(metavar="a4..a0|letter|WxH|fit", help="Paper; WxH in millimetres.")
+    ] = "a4",
+    squares_x: Annotated[
+        int | None, typer.Option(help="Squares, or markers of a plate, across.", show_default=False)
+    ] = None,
+    squares_y: Annotated[
+        int | None, typer.Option(help="Squares, or markers of a plate, down.", show_default=False)
+    ] = None,
+    square_mm: Annotated[
+        float | None,
+        typer.Option(help="Side of a square; as large as fits if left out.", show_default=False),
+    ] = None,
+    marker_mm: Annotated[
+        float | None, typer.Option(help="Side of a marker.", show_default=False)
+    ] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(help="OpenCV's name of the markers.", show_default=False)
+    ] = None,
+    border_mm: Annotated[
+        float | None, typer.Option(help="Light border of a board.", show_default=False)
+    ] = None,
+    width_mm: Annotated[float, typer.Option(help="Width of the box, inside.")] = 400.0,
+    height_mm: Annotated[float, typer.Option(help="Height of the box, inside.")] = 380.0,
+    depth_mm: Annotated[float, typer.Option(help="Depth of the box, inside.")] = 700.0,
+    first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
+    position_mm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z",
+            help="Where the plate's first corner is in the dome's frame.",
+            show_default=False,
+        ),
+    ] = None,
+    rotation_deg: Annotated[
+        tuple[float, float, float],
+        typer.Option(metavar="X Y Z", help="Rotation vector of the plate in the dome's frame."),
+    ] = (0.0, 0.0, 0.0),
+    overwrite: Overwrite = False,
+) -> None:
+    """Print a target."""
+    from aqualvs.calibrate import board as body
+
+    body.print_board(
+        body.BoardRequest(
+            kind=kind,
+            out=out,
+            paper=paper,
+            squares_x=squares_x,
+            squares_y=squares_y,
+            square_mm=square_mm,
+            marker_mm=marker_mm,
+            dictionary=dictionary,
+            border_mm=border_mm,
+            width_mm=width_mm,
+            height_mm=height_mm,
+            depth_mm=depth_mm,
+            first_id=first_id,
+            position_mm=position_mm,
+            rotation_deg=rotation_deg,
+            overwrite=overwrite,
+        ),
+        typer.echo,
+    )

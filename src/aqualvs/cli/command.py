@@ -1,0 +1,174 @@
+"""A command whose values are checked before it runs, whatever they are for.
+
+Imports of much, without looking for garbage on the way.
+
+Options that several commands share, and which of them the user gave.
+"""
+
+import contextlib
+import gc
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from typer.core import TyperCommand
+
+from aqualvs.errors import OptionError
+from aqualvs.special_files import refuse_special
+
+
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """Leave what is imported inside alone, now and later: none of it becomes garbage.
+
+    To look through it again and again takes a sixth of the time of importing.
+    """
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if collected:
+            gc.enable()
+
+
+MAX_WORKERS = 1024
+"""Processes on one machine; more are a slip of the finger that would fill its memory."""
+
+OutFolder = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what this command wrote there before.")
+]
+Target = Annotated[
+    str,
+    typer.Option(metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."),
+]
+Detector = Annotated[
+    Literal["ridge", "threshold"],
+    typer.Option(help="Stripe detector; threshold is the paper's, for comparison."),
+]
+MeshFilter = Annotated[
+    Literal["none", "paper"],
+    typer.Option(help="Filter for nets; paper is the paper's Algorithm 1."),
+]
+Fit = Annotated[
+    Literal["robust", "pseudo_inverse"],
+    typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
+]
+WaterIndex = Annotated[
+    float | None, typer.Option(help="Refractive index of the water.", show_default=False)
+]
+Celsius = Annotated[
+    float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
+]
+Salinity = Annotated[
+    float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
+]
+Refraction = Annotated[
+    bool, typer.Option("--dome/--no-dome", help="Refract at the dome, or ignore it.")
+]
+IndexTarget = Annotated[
+    Path | None,
+    typer.Option(
+        help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
+        show_default=False,
+    ),
+]
+VehicleFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--vehicle-file",
+        metavar="FILE",
+        help="MAVLink: system ids, ground station, modes, peers, key (YAML; docs/ardusub.md).",
+        show_default=False,
+    ),
+]
+MavlinkPeer = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="MAVLink, listening: hear nobody else, such as 192.168.2.2 or 192.168.2.0/24; "
+        "repeatable.",
+    ),
+]
+MavlinkKey = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="MAVLink: sign, and hear nobody without this key; a passphrase or 64 hex digits.",
+        show_default=False,
+    ),
+]
+
+
+def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
+    """Return which of these parameters the user gave."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    return frozenset(
+        name for name, source in sources.items() if source and source.name != "DEFAULT"
+    )
+
+
+_MAX_INTEGER = 2**31 - 1
+
+
+class CheckedCommand(TyperCommand):
+    """A command that refuses values that no option and no argument can take.
+
+    Refused are numbers that are not finite, or too large for a 32-bit integer; text that is not
+    UTF-8; and paths of pipes, devices and sockets.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Check the values and run the command.
+
+        Raises
+        ------
+        OptionError
+            With the option and its value.
+        """
+        for parameter in self.params:
+            for value in _plain(ctx.params.get(parameter.name)):
+                _check(value, _name(parameter))
+        return super().invoke(ctx)
+
+
+def _plain(value: Any) -> Iterator[Any]:
+    """Yield the values of a parameter that may take several."""
+    if isinstance(value, list | tuple):
+        for one in value:
+            yield from _plain(one)
+    else:
+        yield value
+
+
+def _name(parameter: Any) -> str:
+    """Return a parameter as the user writes it."""
+    if parameter.param_type_name == "option":
+        return str(max(parameter.opts, key=len))
+    return str(parameter.name).upper()
+
+
+def _check(value: Any, name: str) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise OptionError(f"{name} {value:g}: give a finite number")
+    if isinstance(value, int) and abs(value) > _MAX_INTEGER:
+        raise OptionError(f"{name} {value}: too large; give a number up to {_MAX_INTEGER}")
+    if isinstance(value, str | Path) and not _is_text(str(value)):
+        raise OptionError(f"{name} {str(value)!r}: not UTF-8; rename it")
+    if isinstance(value, Path):
+        refuse_special(value, OptionError)
+
+
+def _is_text(value: str) -> bool:
+    """Return whether a text can be written as UTF-8; bytes that cannot come in as surrogates."""
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -1,0 +1,143 @@
+"""The command line of `aqualvs design`: a signature only; its body is imported when it runs."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from aqualvs.cli.command import Overwrite
+
+
+def design(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DESIGN]", help="Design file (YAML).", show_default=False),
+    ] = None,
+    example: Annotated[
+        bool, typer.Option("--example", help="Print a design file to begin with, and end.")
+    ] = False,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rig file of a rig that exists, in a design's place.", show_default=False
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder for rig.yaml, errors.png, picture.png.", show_default=False
+        ),
+    ] = None,
+    image: Annotated[
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture.", show_default=False),
+    ] = None,
+    fov_deg: Annotated[
+        float | None, typer.Option(help="Field of view across, in air.", show_default=False)
+    ] = None,
+    dome_mm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RADIUS:THICKNESS", help="Inner radius and thickness.", show_default=False
+        ),
+    ] = None,
+    lens_mm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Lens from the dome's centre: right, ahead, up.",
+            show_default=False,
+        ),
+    ] = None,
+    baseline_mm: Annotated[
+        float | None, typer.Option(help="Lasers from the dome's centre.", show_default=False)
+    ] = None,
+    lasers: Annotated[int | None, typer.Option(help="How many.", show_default=False)] = None,
+    fan_deg: Annotated[
+        float | None, typer.Option(help="Opening of a laser's fan.", show_default=False)
+    ] = None,
+    range_mm: Annotated[
+        str | None,
+        typer.Option(metavar="NEAR:FAR", help="Working range.", show_default=False),
+    ] = None,
+    turn: Annotated[
+        bool, typer.Option("--turn", help="Look for the stripes' best directions, too.")
+    ] = False,
+    tilt: Annotated[
+        bool, typer.Option("--tilt/--no-tilt", help="Look for the lasers' best angles.")
+    ] = True,
+    changes: Annotated[bool, typer.Option(help="Say which changes would help most.")] = True,
+    overwrite: Overwrite = False,
+) -> None:
+    """Predict what a design measures."""
+    from aqualvs.design import command
+    from aqualvs.design.file import EXAMPLE
+
+    if example:
+        typer.echo(EXAMPLE, nl=False)
+        return
+    given = {
+        "camera": {
+            **_numbers(image, "x", ("width_px", "height_px"), "--image"),
+            "fov_deg": fov_deg,
+        },
+        "dome": _numbers(dome_mm, ":", ("inner_radius_mm", "thickness_mm"), "--dome-mm"),
+        "lens": _listed(lens_mm, ",", "position_mm", 3, "--lens-mm"),
+        "lasers": {
+            "count": lasers,
+            "baseline_mm": baseline_mm,
+            "fan_deg": None if rig else fan_deg,
+        },
+        **_listed(range_mm, ":", "working_range_mm", 2, "--range-mm"),
+    }
+    request = command.DesignRequest(
+        design=file,
+        rig=rig,
+        out=out,
+        given=_without_none(given),
+        fan_deg=fan_deg,
+        turn=turn,
+        tilt=tilt,
+        try_changes=changes,
+        overwrite=overwrite,
+    )
+    command.design_and_tell(request)
+
+
+def _without_none(given: dict[str, Any]) -> dict[str, Any]:
+    """Return what the user gave: empty parts and keys without a value are left out."""
+    kept: dict[str, Any] = {}
+    for key, value in given.items():
+        if isinstance(value, dict):
+            value = {name: one for name, one in value.items() if one is not None}
+        if value:
+            kept[key] = value
+    return kept
+
+
+def _numbers(text: str | None, between: str, names: tuple[str, ...], option: str) -> dict[str, Any]:
+    """Return named numbers of an option such as 1920x1080."""
+    found = _split(text, between, len(names), option)
+    return dict(zip(names, found, strict=False))
+
+
+def _listed(text: str | None, between: str, name: str, count: int, option: str) -> dict[str, Any]:
+    """Return one named list of numbers, or nothing."""
+    found = _split(text, between, count, option)
+    return {name: found} if found else {}
+
+
+def _split(text: str | None, between: str, count: int, option: str) -> list[float | int]:
+    if text is None:
+        return []
+    from aqualvs.errors import OptionError
+
+    pieces = text.split(between)
+    try:
+        if len(pieces) != count:
+            raise ValueError
+        return [int(p) if re.fullmatch(r"[+-]?\d+", p.strip()) else float(p) for p in pieces]
+    except ValueError:
+        shown = between.join("N" * count)
+        raise OptionError(f"{option} {text}: write {count} numbers as {shown}") from None

@@ -1,0 +1,103 @@
+"""The command line of the paper's experiments: a signature only; the body is imported in it.
+
+The command line of the benchmark: signatures only; bodies are imported when they run.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aqualvs.cli.command import Overwrite
+
+
+def benchmark(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[LEVEL|DIVE]...",
+            help="Which levels or dives; all if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(help="Frames of every dive, for a quick look.", show_default=False),
+    ] = None,
+    overwrite: Overwrite = False,
+    list_: Annotated[bool, typer.Option("--list", help="List levels and dives and exit.")] = False,
+) -> None:
+    """Render the benchmark set."""
+    from aqualvs.errors import OptionError
+    from aqualvs.experiments.benchmark import set as body
+
+    if list_:
+        body.tell_dives(typer.echo)
+        return
+    if out is None:
+        raise OptionError("--out: missing; give the folder to write")
+    body.make_set(out, names or [], typer.echo, n_frames=frames, overwrite=overwrite)
+
+
+def score(
+    truth: Annotated[
+        Path, typer.Option(help="Folder of the set, from 'aqualvs benchmark'.", show_default=False)
+    ],
+    results: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=PATH]...",
+            help="What a system answered: a folder with DIVE.csv or DIVE/posture.csv, or one CSV "
+            "with a column dive.",
+            show_default=False,
+        ),
+    ] = None,
+    own: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run aqualvs and its baselines over the set into this folder, and score them too.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder for scores.csv, .json and .md.", show_default=False
+        ),
+    ] = None,
+    dives: Annotated[bool, typer.Option("--dives", help="Show every dive in the table.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Score systems."""
+    from aqualvs.experiments.benchmark import score as body
+
+    body.score_and_tell(
+        results or [], truth, typer.echo, own=own, out=out, dives=dives, overwrite=overwrite
+    )
+
+
+def reproduce(
+    experiments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="EXPERIMENT",
+            help="Names from --list; all of them if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
+        "out/reproduce"
+    ),
+    list_: Annotated[bool, typer.Option("--list", help="List the experiments and exit.")] = False,
+) -> None:
+    """Run the paper's experiments."""
+    from aqualvs.experiments import command as body
+
+    if list_:
+        body.tell_experiments(typer.echo)
+        return
+    request = body.ReproduceRequest(names=tuple(experiments or ()), out=out)
+    raise typer.Exit(body.reproduce(request, typer.echo))

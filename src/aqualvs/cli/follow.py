@@ -1,0 +1,210 @@
+"""The command line of hold and follow: a signature only; bodies are imported when they run.
+
+The command line of controllers: signatures only; bodies are imported when they run.
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from aqualvs.cli.command import MavlinkKey, MavlinkPeer, Overwrite, VehicleFileOption
+
+
+def tune(
+    model: Annotated[
+        str, typer.Argument(help="Vehicle model: bluerov2_heavy, bluerov2 or videoray.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Gains file; printed if left out.", show_default=False),
+    ] = None,
+    overwrite: Overwrite = False,
+    delay_ms: Annotated[
+        float,
+        typer.Option(help="Usual delay from the exposure to the vehicle. Less makes it faster."),
+    ] = 120.0,
+    greatest_delay_ms: Annotated[
+        float, typer.Option(help="Delay at which it must still be stable.")
+    ] = 200.0,
+    rate_hz: Annotated[float, typer.Option(help="Frames a second.")] = 25.0,
+    current: Annotated[float, typer.Option(help="Greatest current in m/s.")] = 0.5,
+) -> None:
+    """Make gains for a vehicle, and say what margins they leave."""
+    from aqualvs.control.tune import TuneOptions
+    from aqualvs.errors import OptionError
+    from aqualvs.follow import tune as body
+
+    if not rate_hz > 0.0:
+        raise OptionError(f"--rate-hz {rate_hz:g}: must be positive")
+    options = TuneOptions(
+        delay=1e-3 * delay_ms,
+        greatest_delay=1e-3 * greatest_delay_ms,
+        frame=1.0 / rate_hz,
+        current=current,
+    )
+    body.tune_and_tell(
+        body.TuneRequest(model=model, output=output, overwrite=overwrite, options=options),
+        typer.echo,
+    )
+
+
+def follow(
+    source: Annotated[
+        str | None,
+        typer.Argument(help="Stream or camera of a real vehicle.", show_default=False),
+    ] = None,
+    sim: Annotated[bool, typer.Option("--sim", help="Simulate vehicle, sea and net.")] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("follow"),
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="Plan file (YAML; docs/missions.md).", show_default=False),
+    ] = None,
+    hold_range: Annotated[
+        float | None,
+        typer.Option(
+            "--range", help="Range to hold in metres; 0.6 if left out.", show_default=False
+        ),
+    ] = None,
+    yaw: Annotated[float, typer.Option(help="Yaw to hold, in degrees; 0 is square.")] = 0.0,
+    gains: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|NAME",
+            help="Gains: a file of 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray.",
+            show_default=False,
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Vehicle: rig file (YAML).", show_default=False)
+    ] = None,
+    mavlink: Annotated[
+        str | None,
+        typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.", show_default=False),
+    ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
+    dashboard: Annotated[
+        bool,
+        typer.Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time."),
+    ] = False,
+    dashboard_address: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where to serve it.")
+    ] = "127.0.0.1:8100",
+    token: Annotated[
+        str | None,
+        typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.", show_default=False),
+    ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Vehicle: record from the start.")
+    ] = False,
+    record_to: Annotated[
+        Path | None,
+        typer.Option(help="Vehicle: folder of recordings; that of -o if left out."),
+    ] = None,
+    record_video: Annotated[
+        bool, typer.Option("--record-video", help="Vehicle: record the pictures too.")
+    ] = False,
+    target: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE",
+            help="Vehicle: what the lasers hit: a word, or a net.yaml.",
+        ),
+    ] = "auto",
+    water_n: Annotated[
+        float | None,
+        typer.Option(help="Vehicle: refractive index of the water.", show_default=False),
+    ] = None,
+    vehicle: Annotated[
+        Literal["bluerov2", "bluerov2-heavy", "videoray"], typer.Option(help="Sim: which one.")
+    ] = "bluerov2",
+    seconds: Annotated[float, typer.Option(help="Sim: how long.")] = 60.0,
+    current: Annotated[float, typer.Option(help="Sim: current in m/s.")] = 0.3,
+    current_to: Annotated[
+        float, typer.Option(help="Sim: where it flows, in degrees to the right; 0: onto the net.")
+    ] = 60.0,
+    waves: Annotated[float, typer.Option(help="Sim: amplitude of the waves in metres.")] = 0.1,
+    cage_radius: Annotated[
+        float, typer.Option(help="Sim: of a round net seen from inside, in metres; 0: flat.")
+    ] = 0.0,
+    net_sway: Annotated[
+        float, typer.Option(help="Sim: the net moves to and fro by so many metres.")
+    ] = 0.0,
+    pilot_gain: Annotated[float, typer.Option(help="Sim: ArduSub's pilot gain.")] = 0.5,
+    rendered: Annotated[
+        bool, typer.Option("--rendered", help="Sim: render every frame and measure in it.")
+    ] = False,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="Sim, rendered: camera that takes the frames; ideal, webcam, action or pal.",
+            show_default=False,
+        ),
+    ] = None,
+    fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
+    seed: Annotated[int, typer.Option(min=0, help="Sim: of waves and noise.")] = 0,
+    freeze: Annotated[
+        float | None,
+        typer.Option(help="Sim: the picture stands still from this second on.", show_default=False),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Hold a distance to a net, or follow it."""
+    from aqualvs.errors import OptionError
+    from aqualvs.follow import command as body
+
+    aim = body.Aim(plan=plan, range=hold_range, yaw=math.radians(yaw))
+    if sim:
+        if source is not None or any((mavlink, vehicle_file, mavlink_peer, mavlink_key)):
+            raise OptionError("--sim: has no source and no --mavlink; leave them out")
+        request = body.SimRequest(
+            out=out,
+            aim=aim,
+            vehicle=vehicle,
+            gains=gains,
+            pilot_gain=pilot_gain,
+            current=current,
+            current_to=math.radians(current_to),
+            waves=waves,
+            cage_radius=cage_radius,
+            net_sway=net_sway,
+            seconds=seconds,
+            fps=fps,
+            rendered=rendered,
+            camera=camera,
+            seed=seed,
+            freeze=freeze,
+            dashboard=dashboard_address if dashboard else None,
+            token=token,
+            overwrite=overwrite,
+        )
+        raise typer.Exit(body.simulate_and_tell(request, typer.echo))
+    if source is None or rig is None or mavlink is None or gains is None:
+        raise OptionError(
+            "follow: give SOURCE, --rig, --mavlink and --gains for a vehicle, or --sim to try it"
+        )
+    from aqualvs.follow.vehicle import FollowRequest, follow_and_tell
+    from aqualvs.live.options import vehicle_setup
+    from aqualvs.results.run_request import Water, scanner_options
+
+    dive = FollowRequest(
+        source=source,
+        rig=rig,
+        mavlink=mavlink,
+        vehicle=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key),
+        gains=gains,
+        out=out,
+        aim=aim,
+        dashboard=dashboard_address if dashboard else None,
+        token=token,
+        record=record,
+        record_to=record_to,
+        record_video=record_video,
+        water=Water(n_water=water_n, temperature_c=None, salinity=None),
+        scanner=scanner_options(target, "ridge", "none", "robust"),
+        overwrite=overwrite,
+    )
+    raise typer.Exit(follow_and_tell(dive, typer.echo))

@@ -1,0 +1,146 @@
+"""The command line of live runs: signatures only; bodies are imported when they run."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from aqualvs.cli.command import (
+    Celsius,
+    IndexTarget,
+    MavlinkKey,
+    MavlinkPeer,
+    Salinity,
+    Target,
+    VehicleFileOption,
+    WaterIndex,
+)
+
+
+def live(
+    source: Annotated[
+        str, typer.Argument(help="Stream, camera or file; docs/sources.md has a table.")
+    ],
+    rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).", show_default=False)],
+    mavlink: Annotated[
+        list[str] | None,
+        typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
+    ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
+    json: Annotated[
+        list[str] | None, typer.Option(help="Send lines of JSON by UDP to HOST:PORT; repeatable.")
+    ] = None,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Publish to ROS 2.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="Publish to ROS 1 (Noetic).")] = False,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve Foxglove at ws://127.0.0.1:8765.")
+    ] = False,
+    foxglove_address: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where to serve Foxglove.")
+    ] = "127.0.0.1:8765",
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Serve the pilot's page at http://127.0.0.1:8100.")
+    ] = False,
+    dashboard_address: Annotated[
+        str,
+        typer.Option(
+            metavar="HOST:PORT", help="Where to serve it; other than 127.0.0.1 needs a token."
+        ),
+    ] = "127.0.0.1:8100",
+    token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="AQUALVS_TOKEN",
+            help="Password of the page; made and printed if one is needed.",
+            show_default=False,
+        ),
+    ] = None,
+    record: Annotated[bool, typer.Option("--record", help="Record from the start.")] = False,
+    record_to: Annotated[Path, typer.Option(help="Folder of recordings.")] = Path("dives"),
+    record_video: Annotated[
+        bool, typer.Option("--record-video", help="Record the pictures too.")
+    ] = False,
+    smooth: Annotated[
+        bool, typer.Option("--filter", help="Smooth over time; raw values stay available.")
+    ] = False,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Files: every frame, as fast as possible.")
+    ] = False,
+    fps: Annotated[
+        float | None, typer.Option(help="Of images, or asked of a camera.", show_default=False)
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Picture size asked of a camera.", show_default=False),
+    ] = None,
+    pixel_format: Annotated[
+        str | None,
+        typer.Option(help="Asked of a camera: h264, mjpeg, yuyv422.", show_default=False),
+    ] = None,
+    transport: Annotated[
+        Literal["tcp", "udp"] | None,
+        typer.Option(help="How RTSP shall send; tcp if left out.", show_default=False),
+    ] = None,
+    target: Target = "auto",
+    detector: Annotated[Literal["ridge", "threshold"], typer.Option(help="Stripe detector.")] = (
+        "ridge"
+    ),
+    water_n: WaterIndex = None,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    index_target: IndexTarget = None,
+) -> None:
+    """Measure live."""
+    from aqualvs.live import command as body
+    from aqualvs.live.options import OutputRequest, vehicle_setup
+    from aqualvs.results.run_request import Water, scanner_options
+
+    request = body.LiveRequest(
+        source=source,
+        rig=rig,
+        feed=body.FeedRequest(fps=fps, size=size, pixel_format=pixel_format, transport=transport),
+        outputs=OutputRequest(
+            mavlink=tuple(mavlink or ()),
+            link=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key).link,
+            json=tuple(json or ()),
+            ros2=ros2,
+            ros1=ros1,
+            foxglove=foxglove_address if foxglove else None,
+        ),
+        dashboard=dashboard_address if dashboard else None,
+        token=token,
+        record=record,
+        record_to=record_to,
+        record_video=record_video,
+        smooth=smooth,
+        fast=fast,
+        water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
+        scanner=scanner_options(target, detector, "none", "robust"),
+        index_target=index_target,
+    )
+    raise typer.Exit(body.live_and_tell(request, typer.echo))
+
+
+def doctor(
+    source: Annotated[
+        str | None, typer.Argument(help="Stream, camera or file to look at.", show_default=False)
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig that the pictures should fit.", show_default=False)
+    ] = None,
+    mavlink: Annotated[
+        str | None, typer.Option(help="Autopilot to listen for.", show_default=False)
+    ] = None,
+    vehicle_file: VehicleFileOption = None,
+    mavlink_peer: MavlinkPeer = None,
+    mavlink_key: MavlinkKey = None,
+) -> None:
+    """Look at the machine."""
+    from aqualvs.check.doctor import DoctorRequest, run_doctor
+    from aqualvs.live.options import vehicle_setup
+
+    setup = vehicle_setup(vehicle_file, mavlink_peer, mavlink_key)
+    request = DoctorRequest(source=source, rig=rig, mavlink=mavlink, vehicle=setup)
+    run_doctor(request)

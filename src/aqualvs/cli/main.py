@@ -1,0 +1,309 @@
+"""The command line: signatures and help only.
+
+Bodies live in their own modules and are imported when their command runs, so that `--help` needs
+neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
+
+Standard output and standard error, whose loss costs no result.
+"""
+
+import contextlib
+import errno
+import functools
+import gc
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, TextIO
+
+import typer
+
+from aqualvs import __version__
+from aqualvs.cli.batch import batch
+from aqualvs.cli.calibrate import board, calibrate
+from aqualvs.cli.command import CheckedCommand
+from aqualvs.cli.design import design
+from aqualvs.cli.experiments import benchmark, reproduce, score
+from aqualvs.cli.follow import follow, tune
+from aqualvs.cli.live import doctor, live
+from aqualvs.cli.run import check, demo, figures, net, net_change, report, run, simulate
+from aqualvs.errors import AqualvsError
+
+
+class LenientStream:
+    """A text stream that remembers a fault instead of raising it.
+
+    Whoever reads the output may go before the end, as `head` does, and a terminal may be closed. A
+    dive under way is measured to its end all the same.
+
+    Parameters
+    ----------
+    stream : TextIO
+
+    Attributes
+    ----------
+    fault : OSError or None
+        Why nothing is written any more.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.fault: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Write a text, or drop it after a fault."""
+        if self.fault is None:
+            with self._noting():
+                return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Hand over what was written."""
+        if self.fault is None:
+            with self._noting():
+                self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        """Return whatever else the stream has."""
+        return getattr(self._stream, name)
+
+    @contextlib.contextmanager
+    def _noting(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as fault:
+            self.fault = fault
+
+
+@contextlib.contextmanager
+def lenient_output() -> Iterator[LenientStream | None]:
+    """Make standard output and error lenient inside, and let them take every character.
+
+    Yields
+    ------
+    output : LenientStream or None
+        Standard output; None where it is closed.
+    """
+    before = sys.stdout, sys.stderr
+    output = None if sys.stdout is None else _lenient(sys.stdout)
+    errors = None if sys.stderr is None else _lenient(sys.stderr)
+    sys.stdout, sys.stderr = output, errors
+    try:
+        yield output
+    finally:
+        for stream in (output, errors):
+            if stream is not None:
+                stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def drop_output() -> None:
+    """Lead standard output nowhere, so that the interpreter's last flush does not fail."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _lenient(stream: TextIO) -> LenientStream:
+    # A name that the terminal's encoding lacks is no reason to fail.
+    reconfigure = getattr(stream, "reconfigure", None)
+    if reconfigure is not None:
+        reconfigure(errors="backslashreplace")
+    return LenientStream(stream)
+
+
+# Matrices here are small: threads of the linear algebra gain nothing, and where another process
+# keeps the cores busy they wait for each other twenty times as long. Before NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# No plugin of Pydantic has anything to do here, and to look for one reads what every package that
+# is installed says of itself.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+
+app = typer.Typer(
+    name="aqualvs",
+    help="Underwater laser vision: range, pitch and yaw to a net or wall.",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+_command = functools.partial(app.command, cls=CheckedCommand)
+
+
+_command(
+    help="Run the bundled dive and compare it with its truth.",
+    epilog="Example: aqualvs demo -o out/demo",
+)(demo)
+_command(
+    help="Measure a dive: range, pitch and yaw for every frame, all points, and a report. "
+    "SOURCE is a video, a folder of images, an address (rtsp://, udp://, http://), or a recording "
+    "(dive.mcap), which brings its own rig and options.",
+    epilog="Example: aqualvs run dive.mp4 --rig rig.yaml -o out/dive",
+)(run)
+_command(
+    help="Measure live: a stream, a camera or a file in real time, to pilot, autopilot, ROS, "
+    "Foxglove and recording. Ctrl-C ends it.",
+    epilog="Example: aqualvs live udp://0.0.0.0:5600 --rig rig.yaml --dashboard "
+    "--mavlink udpout:192.168.2.2:14550",
+)(live)
+_command(
+    help="Tell the state of a net: meshes, twine, fouling, holes, and a map. SOURCE is a dive "
+    "(video or images, which is run into DIR first) or the folder of a run.",
+    epilog="Example: aqualvs net out/dive --log vehicle.tlog",
+)(net)
+_command(
+    "net-change",
+    help="Compare a net between dates: how fouling grew and where, which holes are new, grown, "
+    "gone, or were not passed. RUN is the folder of a run with the state of its net, or of a "
+    "batch.",
+    epilog="Example: aqualvs net-change out/2026-05-01 out/2026-05-22 -o out/change",
+)(net_change)
+_command(
+    help="Measure many dives, on this machine or on many, each as aqualvs run does it; writes a "
+    "summary and one Parquet data set. Run it again to go on after an interruption: what is "
+    "finished is kept. Exit code 1 if a dive could not be finished.",
+    epilog="Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026",
+)(batch)
+_command(
+    help="Write the report of a run again. After a run that was killed, its points are completed "
+    "first.",
+    epilog="Example: aqualvs report out/dive --truth truth.csv",
+)(report)
+_command(
+    help="Draw a run's reflections in a laser's plane, with what the filters take for net: "
+    "pictures after figures 13 and 14 of the paper, and the filter's binary image.",
+    epilog="Example: aqualvs figures out/dive -o out/figures",
+)(figures)
+app.add_typer(calibrate)
+_command(
+    help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
+    epilog="Example: aqualvs board charuco --paper a3 -o board",
+)(board)
+_command(
+    help="Say in words whether a rig is sane and what it can measure.",
+    epilog="Example: aqualvs check rig.yaml --against last",
+)(check)
+_command(
+    help="Predict what a camera, a dome and lasers would measure, and tilt the lasers best. "
+    "DESIGN is a file; options take the place of what it says, or of the example's numbers.",
+    epilog="Example: aqualvs design --image 1920x1080 --fov-deg 69 --dome-mm 51:6 "
+    "--baseline-mm 150 --lasers 3 --range-mm 300:1200 -o out/design",
+)(design)
+_command(
+    help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
+    "SCENARIO is a name from --list or a YAML file.",
+    epilog="Example: aqualvs simulate net_diamond --camera webcam -o out/net",
+)(simulate)
+_command(
+    help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",
+    epilog="Example: aqualvs follow --sim -o out/follow",
+)(follow)
+_command(
+    help="Make gains for a vehicle model, and say what margins they leave.",
+    epilog="Example: aqualvs tune bluerov2_heavy -o gains.yaml",
+)(tune)
+_command(
+    help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
+    epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",
+)(doctor)
+_command(
+    help="Repeat the paper's experiments in a simulated tank, each beside what the paper prints: "
+    "figures, tables and one page, reproduce.html. Without a name, all of them.",
+    epilog="Example: aqualvs reproduce distance angles -o out/reproduce",
+)(reproduce)
+_command(
+    help="Render the public benchmark set: dives by difficulty, each with its truth and its rig.",
+    epilog="Example: aqualvs benchmark sun fouled -o bench",
+)(benchmark)
+_command(
+    help="Score what systems answered on a benchmark set, side by side: plain CSV in, scores out.",
+    epilog="Example: aqualvs score mine=out/mine --truth bench --own out/own -o scores",
+)(score)
+
+# Older versions of Typer keep this class in Click, newer ones in a private module of their own.
+_USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
+_EXIT_BAD_INPUT = 2
+# Characters of a fault.
+_LONGEST = 2000
+_EXIT_INTERRUPTED = 130
+_EXIT_BROKEN_PIPE = 141
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"aqualvs {__version__}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str or None
+        Without the program's name; None takes them from the process.
+
+    Returns
+    -------
+    exit_code : int
+        0, or 2 for bad input, or 128 + signal for a run that was stopped; 141 where all went well
+        but nobody read the output to its end.
+    """
+    with lenient_output() as output:
+        code = _exit_code(arguments)
+    code = _complete(code, output, ends=arguments is None)
+    if arguments is None:
+        # The process ends here. To look once more through all that was imported for what refers to
+        # itself would take a third of a second.
+        gc.freeze()
+    return code
+
+
+def _exit_code(arguments: Sequence[str] | None) -> int:
+    try:
+        listed = None if arguments is None else list(arguments)
+        code = app(args=listed, prog_name="aqualvs", standalone_mode=False)
+    except AqualvsError as fault:
+        return _complain(str(fault), _EXIT_BAD_INPUT)
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain("interrupted", _EXIT_INTERRUPTED)
+    except OSError as fault:
+        if fault.filename is None:
+            raise
+        return _complain(f"{os.fsdecode(fault.filename)}: {fault.strerror}", _EXIT_BAD_INPUT)
+    except _USAGE_ERROR as fault:
+        return _complain(f"{_usage(fault)}; see aqualvs --help", _EXIT_BAD_INPUT)
+    return int(code or 0)
+
+
+def _usage(fault: Exception) -> str:
+    """Return what is wrong with the arguments, as the parser words it, in one line."""
+    message = getattr(fault, "format_message", fault.__str__)()
+    return " ".join(str(message).split()).rstrip(".")
+
+
+def _complain(message: str, code: int) -> int:
+    # Names of files, and values in them, may hold line feeds and other control characters.
+    line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message)
+    if len(line) > _LONGEST:
+        # A value of a megabyte in a file; the name of the file is at the front, the remedy behind.
+        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+    print(f"aqualvs: error: {line}", file=sys.stderr)
+    return code
+
+
+def _complete(code: int, output: LenientStream | None, *, ends: bool) -> int:
+    """Return the exit code with regard to whether the output was read."""
+    fault = None if output is None else output.fault
+    if fault is None:
+        return code
+    if ends:
+        drop_output()
+    if fault.errno == errno.EPIPE:
+        return code or _EXIT_BROKEN_PIPE
+    return _complain(f"standard output: cannot be written ({fault.strerror})", _EXIT_BAD_INPUT)

@@ -1,0 +1,287 @@
+"""The command line of dives, measured and simulated: signatures only.
+
+Bodies are imported when they run.
+
+The command line that compares a net between dates: a signature; the body is imported in it.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aqualvs.cli.command import (
+    MAX_WORKERS,
+    Celsius,
+    Detector,
+    Fit,
+    IndexTarget,
+    MeshFilter,
+    OutFolder,
+    Overwrite,
+    Refraction,
+    Salinity,
+    Target,
+    WaterIndex,
+    given,
+    importing,
+)
+
+
+def net_change(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...",
+            help="Folders of runs with the state of their net (aqualvs net), or of batches.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)],
+    date: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="YYYY-MM-DD|auto",
+            help="Day of the dive, once for every RUN in their order; else from the names or the "
+            "video's clock.",
+            show_default=False,
+        ),
+    ] = None,
+    cell_m: Annotated[float, typer.Option(help="Side of the map's cells.")] = 1.0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare a net between dates."""
+    from aqualvs.net_survey import change_command as body
+
+    request = body.NetChangeRequest(
+        runs=tuple(runs), out=out, dates=tuple(date or ()), cell_m=cell_m, overwrite=overwrite
+    )
+    body.net_change(request, typer.echo)
+
+
+def run(
+    context: typer.Context,
+    source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
+    out: OutFolder,
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", help="Rig file; a recording has its own.", show_default=False),
+    ] = None,
+    overwrite: Overwrite = False,
+    target: Target = "auto",
+    detector: Detector = "ridge",
+    mesh_filter: MeshFilter = "none",
+    fit: Fit = "robust",
+    water_n: WaterIndex = None,
+    temperature_c: Celsius = None,
+    salinity: Salinity = None,
+    dome: Refraction = True,
+    frames: Annotated[
+        str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
+    ] = ":",
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of a folder of images.", show_default=False)
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Write overlay.mp4 too.")] = False,
+    report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the truth to compare with.", show_default=False)
+    ] = None,
+    index_target: IndexTarget = None,
+    net: Annotated[
+        bool, typer.Option("--net", help="Tell the state of the net too, see aqualvs net.")
+    ] = False,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
+    ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=MAX_WORKERS,
+            help="Processes that measure; one per core by default.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Measure a dive."""
+    with importing():
+        from aqualvs import pipeline as body
+        from aqualvs.nets.target_file import NetRequest
+        from aqualvs.results.run_request import FrameWindow, RunRequest, Water, scanner_options
+        from aqualvs.workers.start_method import n_cores
+
+    request = RunRequest(
+        source=source,
+        rig=rig,
+        out=out,
+        overwrite=overwrite,
+        water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
+        no_dome=not dome,
+        frames=FrameWindow.parse(frames),
+        fps=fps,
+        scanner=scanner_options(target, detector, mesh_filter, fit),
+        target=target,
+        chosen=given(context, ("target", "detector", "mesh_filter", "fit")),
+        mcap=mcap,
+        overlay=overlay,
+        report=report,
+        truth=truth,
+        index_target=index_target,
+        net=NetRequest() if net else None,
+        n_processes=workers or n_cores(),
+    )
+    raise typer.Exit(body.run_and_tell(request, typer.echo))
+
+
+def net(
+    source: Annotated[str, typer.Argument(help="Folder of a run, or video, folder of images.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write; of a run its own if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="Rig file, for a dive; a run has its own.", show_default=False),
+    ] = None,
+    target: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|net|solid|FILE", help="As for aqualvs run, which a dive needs first."
+        ),
+    ] = "auto",
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN.",
+            show_default=False,
+        ),
+    ] = None,
+    log_offset_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Log's clock minus the dive's; found from the motion if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    twine_mm: Annotated[
+        float | None,
+        typer.Option(help="Diameter of the bare twine, where it is known.", show_default=False),
+    ] = None,
+    stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
+    overwrite: Overwrite = False,
+) -> None:
+    """Tell the state of a net."""
+    from aqualvs.net_survey import command as body
+    from aqualvs.nets.target_file import NetRequest
+
+    request = NetRequest(twine_mm=twine_mm, stretch_m=stretch_m, log=log, log_offset_s=log_offset_s)
+    place = body.NetSource(source=source, rig=rig, out=out, target=target, overwrite=overwrite)
+    raise typer.Exit(body.net(place, request, typer.echo))
+
+
+def figures(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    out: OutFolder,
+    frame: Annotated[
+        int | None,
+        typer.Option(help="Frame; the one that shows most if left out.", show_default=False),
+    ] = None,
+    laser: Annotated[
+        str | None,
+        typer.Option(help="Laser's name; the one that shows most if left out.", show_default=False),
+    ] = None,
+    target: Annotated[
+        Path | None,
+        typer.Option(
+            help="Target file (net.yaml) with the parameters of the paper's filter.",
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw a run's reflections."""
+    from aqualvs.report import mesh_figures as body
+
+    body.figures(
+        folder, out, typer.echo, frame=frame, laser=laser, target=target, overwrite=overwrite
+    )
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the truth to show.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a report again."""
+    from aqualvs.report.run_page import write_report
+    from aqualvs.results.folder import REPORT_HTML, claim_run, recover
+
+    if recover(folder):
+        typer.echo(f"{folder}: points completed from the journal of a run that was killed")
+    # To write it again is what the command is for.
+    with claim_run(folder, [REPORT_HTML], overwrite=True):
+        typer.echo(f"report: {write_report(folder, truth=truth)}")
+
+
+def simulate(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Scenario name or YAML file.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig file; the example rig if left out.", show_default=False)
+    ] = None,
+    camera: Annotated[
+        str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
+    ] = "ideal",
+    overwrite: Overwrite = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
+) -> None:
+    """Render a dive."""
+    from aqualvs.experiments import simulate as body
+
+    if list_:
+        body.tell_scenarios(typer.echo)
+    else:
+        body.simulate(scenario, rig, out, typer.echo, camera=camera, overwrite=overwrite)
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out/demo"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Run the bundled dive."""
+    from aqualvs import demo as body
+
+    raise typer.Exit(body.demo(out, typer.echo, overwrite=overwrite))
+
+
+def check(
+    rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")],
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="last|FILE",
+            help="Say what has moved since the last calibration, or an older rig file.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Check a rig."""
+    if against is not None:
+        from aqualvs.check.comparison import last_calibration, run_compare
+
+        is_word = str(against) == "last" and not against.exists()
+        raise typer.Exit(run_compare(rig, last_calibration(rig) if is_word else against))
+    from aqualvs.check.rig import run_check
+
+    raise typer.Exit(run_check(rig))

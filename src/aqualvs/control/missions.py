@@ -1,0 +1,528 @@
+"""What a mission asks of the controllers, update by update; and the simplest one: hold.
+
+Follow a net: constant distance, square to it, at a constant speed along it.
+
+Survey a net as one mows a lawn: along it, down a step, and back.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+from aqualvs.control.vehicle import Setpoint, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.scanning.posture import Posture
+
+
+class Stage(StrEnum):
+    """Where a mission is; the value is what logs say in `stage`."""
+
+    IDLE = "idle"
+    """Nobody steers."""
+    HOLDING = "holding"
+    FOLLOWING = "following"
+    CHANGING_DEPTH = "changing_depth"
+    WAITING = "waiting"
+    """Without the target: neutral, it may come back."""
+    OVER = "over"
+    """All done: holding where it ended, until the pilot takes over."""
+    GAVE_UP = "gave_up"
+    """The target stayed away for too long."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether the mission never goes on by itself."""
+        return self in (Stage.OVER, Stage.GAVE_UP)
+
+    @property
+    def halts(self) -> bool:
+        """Whether there must be no thrust."""
+        return self in (Stage.IDLE, Stage.WAITING, Stage.GAVE_UP)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guidance:
+    """What a mission wants now.
+
+    Attributes
+    ----------
+    setpoint : Setpoint or None
+        Range and yaw; None where nothing is to be held.
+    sway : float
+        Speed through the water along the target, to the right positive, in m/s.
+    down : float
+        Speed of descent, in m/s; 0 keeps the depth.
+    stage : Stage
+    """
+
+    setpoint: Setpoint | None
+    sway: float = 0.0
+    down: float = 0.0
+    stage: Stage = Stage.HOLDING
+
+
+class Mission(Protocol):
+    """A plan that unfolds by what the vehicle and the lasers tell."""
+
+    @property
+    def sways(self) -> bool:
+        """Whether it needs a vehicle that can move sideways."""
+
+    def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
+        """Return what to do now.
+
+        Parameters
+        ----------
+        now_s : float
+            Monotonic, in seconds. Only steps forward of up to a second count as time spent.
+        posture : Posture or None
+            The present one; None where there is none. While nobody steers there are no updates.
+        state : VehicleState
+            Depth and heading are used where they are known.
+        """
+
+    def restart(self) -> None:
+        """Begin with the next update to go on after a stop: time spent so far stays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LossOptions:
+    """What to do without the target.
+
+    Attributes
+    ----------
+    after : float
+        Seconds without a posture after which the mission waits.
+    steady : float
+        Seconds of postures in a row before it goes on.
+    give_up : float
+        Seconds of waiting after which it ends.
+    """
+
+    after: float = 0.15
+    steady: float = 0.1
+    give_up: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense.
+
+        Raises
+        ------
+        OptionError
+            If one is not positive.
+        """
+        if not (self.after > 0.0 and self.steady >= 0.0 and self.give_up > self.after):
+            raise OptionError(
+                f"loss: after {self.after:g} s, steady {self.steady:g} s, give up "
+                f"{self.give_up:g} s; the first is positive, the last greater than it"
+            )
+
+
+class LossWatch:
+    """Tells whether the target is there, waited for, or gone.
+
+    Attributes
+    ----------
+    stage : Stage or None
+        WAITING, GAVE_UP, or None while the target is there.
+    spent_s : float
+        Time since the last update that counts as spent with the target, in seconds.
+    """
+
+    # Longer steps are gaps (a stopped process, a mission that was halted), not time spent.
+    LONGEST_STEP_S = 1.0
+
+    def __init__(self, options: LossOptions | None = None) -> None:
+        self.options = options or LossOptions()
+        self.stage: Stage | None = None
+        self.spent_s = 0.0
+        self._last_s = math.nan
+        self._away_s = 0.0
+        self._back_s = 0.0
+
+    def restart(self) -> None:
+        """Start anew with the target there."""
+        self.stage, self.spent_s = None, 0.0
+        self._last_s, self._away_s, self._back_s = math.nan, 0.0, 0.0
+
+    def update(self, now_s: float, there: bool) -> Stage | None:
+        """Take in whether there is a posture at this time; return the stage."""
+        step = now_s - self._last_s
+        step = step if 0.0 < step <= self.LONGEST_STEP_S else 0.0
+        self._last_s = now_s
+        if self.stage is not Stage.GAVE_UP:
+            self._count(step, there)
+        self.spent_s = step if self.stage is None and there else 0.0
+        return self.stage
+
+    def _count(self, step: float, there: bool) -> None:
+        self._back_s = self._back_s + step if there else 0.0
+        if there and (self.stage is None or self._back_s >= self.options.steady):
+            self.stage, self._away_s = None, 0.0
+            return
+        self._away_s += step
+        if self._away_s >= self.options.give_up:
+            self.stage = Stage.GAVE_UP
+        elif self._away_s >= self.options.after:
+            self.stage = Stage.WAITING
+
+
+class HoldMission:
+    """Hold a range and yaw, for some time or for good; after that time it holds on.
+
+    Parameters
+    ----------
+    setpoint : Setpoint or None
+        Kept in `setpoint`, which may be set anew at any time.
+    duration : float, optional
+        Seconds with the target after which it is `Stage.OVER`; endless if left out.
+    loss : LossOptions, optional
+        What to do without the target.
+    """
+
+    def __init__(
+        self,
+        setpoint: Setpoint | None,
+        *,
+        duration: float = math.inf,
+        loss: LossOptions | None = None,
+    ) -> None:
+        if not duration > 0.0:
+            raise OptionError(f"hold: duration {duration:g} s; must be positive")
+        self.setpoint = setpoint
+        self._duration = duration
+        self._watch = LossWatch(loss)
+        self._spent_s = 0.0
+
+    @property
+    def sways(self) -> bool:
+        """Whether it needs a vehicle that can move sideways: never."""
+        return False
+
+    def restart(self) -> None:
+        """Go on after a stop."""
+        self._watch.restart()
+
+    def update(
+        self,
+        now_s: float,
+        posture: Posture | None,
+        state: VehicleState,  # noqa: ARG002
+    ) -> Guidance:
+        """Return the setpoint, at rest."""
+        lost = self._watch.update(now_s, posture is not None)
+        self._spent_s += self._watch.spent_s
+        if lost is Stage.GAVE_UP:
+            return Guidance(setpoint=None, stage=lost)
+        here = Stage.OVER if self._spent_s >= self._duration else Stage.HOLDING
+        return Guidance(setpoint=self.setpoint, stage=lost or here)
+
+
+@dataclass(frozen=True, slots=True)
+class Sector:
+    """Bearings of the net from `begin` clockwise to `end`, in radians."""
+
+    begin: float
+    end: float
+
+    def holds(self, bearing: float) -> bool:
+        """Return whether a bearing lies in it."""
+        full = 2.0 * math.pi
+        return (bearing - self.begin) % full <= (self.end - self.begin) % full
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LegOptions:
+    """How far one goes along the net before turning round or ending; whichever comes first.
+
+    Attributes
+    ----------
+    time : float
+        Seconds with the target in sight.
+    distance : float
+        Metres, by the speed through the water: a current along the net counts for or against it.
+    sector : Sector or None
+        Of the net's bearing: heading plus the posture's yaw. A leg ends where it leaves the sector
+        after it has been inside.
+    """
+
+    time: float = math.inf
+    distance: float = math.inf
+    sector: Sector | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense.
+
+        Raises
+        ------
+        OptionError
+            If a time or distance is not positive.
+        """
+        if not (self.time > 0.0 and self.distance > 0.0):
+            raise OptionError(
+                f"leg: time {self.time:g} s, distance {self.distance:g} m; must be positive"
+            )
+
+    @property
+    def ends(self) -> bool:
+        """Whether there is an end at all."""
+        return math.isfinite(min(self.time, self.distance)) or self.sector is not None
+
+
+def bearing_of(posture: Posture, state: VehicleState) -> float | None:
+    """Return the compass direction of the target's far normal, in [0, 2 pi); None if unknown."""
+    if state.heading is None or not math.isfinite(state.heading + posture.yaw):
+        return None
+    return (state.heading + posture.yaw) % (2.0 * math.pi)
+
+
+class Leg:
+    """One way along the net: counts what has been gone.
+
+    Parameters
+    ----------
+    options : LegOptions
+        Where it ends.
+    """
+
+    def __init__(self, options: LegOptions) -> None:
+        self._options = options
+        self._time = self._distance = 0.0
+        self._inside = False
+        self._done = False
+
+    @property
+    def done(self) -> bool:
+        """Whether it has come to its end."""
+        return self._done
+
+    def go(self, spent_s: float, speed: float, bearing: float | None) -> None:
+        """Count seconds at a speed, and look where the net faces."""
+        self._time += spent_s
+        self._distance += spent_s * abs(speed)
+        self._done |= self._time >= self._options.time
+        self._done |= self._distance >= self._options.distance
+        sector = self._options.sector
+        if sector is None or bearing is None:
+            return
+        inside = sector.holds(bearing)
+        self._done |= self._inside and not inside
+        self._inside |= inside
+
+
+class FollowMission:
+    """Go along the net in one direction.
+
+    Parameters
+    ----------
+    setpoint : Setpoint
+        Range and yaw on the way.
+    sway : float
+        Speed through the water, to the right positive, in m/s.
+    leg : LegOptions, optional
+        Where it ends; never if left out.
+    loss : LossOptions, optional
+        What to do without the target.
+
+    Raises
+    ------
+    OptionError
+        If the speed is 0.
+    """
+
+    def __init__(
+        self,
+        setpoint: Setpoint,
+        sway: float,
+        *,
+        leg: LegOptions | None = None,
+        loss: LossOptions | None = None,
+    ) -> None:
+        if not (sway != 0.0 and math.isfinite(sway)):
+            raise OptionError(f"follow: speed {sway:g} m/s; choose one, or hold instead")
+        self.setpoint, self._sway = setpoint, sway
+        self._leg = Leg(leg or LegOptions())
+        self._watch = LossWatch(loss)
+
+    @property
+    def sways(self) -> bool:
+        """Whether it needs a vehicle that can move sideways: always."""
+        return True
+
+    def restart(self) -> None:
+        """Go on after a stop."""
+        self._watch.restart()
+
+    def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
+        """Return setpoint and speed."""
+        lost = self._watch.update(now_s, posture is not None)
+        bearing = None if posture is None else bearing_of(posture, state)
+        self._leg.go(self._watch.spent_s, self._sway, bearing)
+        return paced(self.setpoint, self._sway, lost, self._leg.done)
+
+
+def paced(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Guidance:
+    """Return the guidance along the net, or at its end, or without the target."""
+    if lost is Stage.GAVE_UP:
+        return Guidance(setpoint=None, stage=lost)
+    if lost is not None or done:
+        return Guidance(setpoint=setpoint, stage=lost or Stage.OVER)
+    return Guidance(setpoint=setpoint, sway=sway, stage=Stage.FOLLOWING)
+
+
+# Descent asked for by a depth's error, in m/s per m, and how near a depth must be come to.
+_DESCENT_GAIN, _DEPTH_REACHED = 0.8, 0.07
+# Seconds that a depth must be kept before the next leg, so that a wave does not count.
+_DEPTH_STEADY_S = 1.0
+
+
+class Turn(StrEnum):
+    """What happens at the end of a leg."""
+
+    BACK = "back"
+    """The next leg goes the other way: a part of a net."""
+    ON = "on"
+    """The next leg goes on the same way: round a cage."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyOptions:
+    """The lawn and the mower.
+
+    Attributes
+    ----------
+    depths : tuple of float
+        One leg at each, in this order; metres, down positive.
+    sway : float
+        Speed of the first leg through the water, to the right positive, in m/s.
+    leg : LegOptions
+        Where each leg ends.
+    turn : Turn
+        Whether the next leg goes back or on.
+    descent : float
+        Greatest speed between depths, in m/s.
+    patience : float
+        Seconds that a change of depth may take beyond what it should before the next leg begins
+        all the same: something is in the way.
+    """
+
+    depths: tuple[float, ...]
+    sway: float
+    leg: LegOptions
+    turn: Turn = Turn.BACK
+    descent: float = 0.1
+    patience: float = 20.0
+
+    def __post_init__(self) -> None:
+        """Refuse what has no end or no direction.
+
+        Raises
+        ------
+        OptionError
+            Naming the value.
+        """
+        if not self.depths or not all(depth >= 0.0 for depth in self.depths):
+            raise OptionError(f"survey: depths {list(self.depths)} m; give one or more, 0 or more")
+        if not (self.sway != 0.0 and math.isfinite(self.sway)):
+            raise OptionError(f"survey: speed {self.sway:g} m/s; choose one, or hold instead")
+        if not self.leg.ends:
+            raise OptionError("survey: legs have no end; give a time, a distance or bearings")
+        if not (self.descent > 0.0 and self.patience > 0.0):
+            raise OptionError(
+                f"survey: descent {self.descent:g} m/s, patience {self.patience:g} s; must be "
+                "positive"
+            )
+
+
+class SurveyMission:
+    """Legs along the net, one at each depth.
+
+    The vehicle's own depth hold keeps the depth on the way; between legs it is asked to sink or
+    rise, holding range and yaw. Without a known depth, changes wait.
+
+    Parameters
+    ----------
+    setpoint : Setpoint
+        Range and yaw on the way.
+    options : SurveyOptions
+        The lawn.
+    loss : LossOptions, optional
+        What to do without the target.
+
+    Attributes
+    ----------
+    i_leg : int
+        The leg gone now, or whose depth is sought; counts from 0.
+    """
+
+    def __init__(
+        self, setpoint: Setpoint, options: SurveyOptions, *, loss: LossOptions | None = None
+    ) -> None:
+        self.setpoint = setpoint
+        self._options = options
+        self._watch = LossWatch(loss)
+        self.i_leg = 0
+        self._leg: Leg | None = None
+        self._begin_change()
+
+    @property
+    def sways(self) -> bool:
+        """Whether it needs a vehicle that can move sideways: always."""
+        return True
+
+    @property
+    def depth(self) -> float:
+        """Of the present leg, in metres."""
+        return self._options.depths[min(self.i_leg, len(self._options.depths) - 1)]
+
+    def restart(self) -> None:
+        """Go on after a stop."""
+        self._watch.restart()
+
+    def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
+        """Return what leg or change of depth asks for."""
+        lost = self._watch.update(now_s, posture is not None)
+        if self.i_leg >= len(self._options.depths) or lost is not None:
+            over = self.i_leg >= len(self._options.depths)
+            return paced(self.setpoint, 0.0, lost, over)
+        if self._leg is None and not self._depth_reached(state):
+            return Guidance(
+                setpoint=self.setpoint, down=self._descent(state), stage=Stage.CHANGING_DEPTH
+            )
+        return self._along(posture, state)
+
+    def _along(self, posture: Posture | None, state: VehicleState) -> Guidance:
+        """Go on with the leg; at its end take the next."""
+        leg = self._leg = self._leg or Leg(self._options.leg)
+        back = self._options.turn is Turn.BACK and self.i_leg % 2 == 1
+        sway = -self._options.sway if back else self._options.sway
+        leg.go(self._watch.spent_s, sway, None if posture is None else bearing_of(posture, state))
+        if not leg.done:
+            return paced(self.setpoint, sway, None, False)
+        self.i_leg += 1
+        self._begin_change()
+        return paced(self.setpoint, 0.0, None, self.i_leg >= len(self._options.depths))
+
+    def _begin_change(self) -> None:
+        self._leg = None
+        self._changing_s = self._steady_s = 0.0
+        self._allowed_s = math.inf
+
+    def _descent(self, state: VehicleState) -> float:
+        """Return the speed of descent towards the leg's depth."""
+        if state.depth is None or not math.isfinite(state.depth):
+            return 0.0
+        wanted = _DESCENT_GAIN * (self.depth - state.depth)
+        return min(max(wanted, -self._options.descent), self._options.descent)
+
+    def _depth_reached(self, state: VehicleState) -> bool:
+        if state.depth is None or not math.isfinite(state.depth):
+            return False
+        left = abs(self.depth - state.depth)
+        if math.isinf(self._allowed_s):
+            self._allowed_s = left / self._options.descent + self._options.patience
+        self._changing_s += self._watch.spent_s
+        near = left <= _DEPTH_REACHED
+        self._steady_s = self._steady_s + self._watch.spent_s if near else 0.0
+        return self._steady_s >= _DEPTH_STEADY_S or self._changing_s >= self._allowed_s

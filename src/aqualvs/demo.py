@@ -1,0 +1,46 @@
+"""`aqualvs demo`: the bundled dive, measured and compared with its truth."""
+
+import importlib.resources
+from collections.abc import Callable
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from aqualvs.errors import SourceError
+from aqualvs.pipeline import run_and_tell
+from aqualvs.results.run_request import RunRequest
+
+_FILES = ("dive.mp4", "rig.yaml", "truth.csv")
+
+
+def demo(out: Path, tell: Callable[[str], object], *, overwrite: bool = False) -> int:
+    """Run the bundled dive, tell posture and error, and return the exit code.
+
+    Parameters
+    ----------
+    out : Path
+        Folder to write.
+    tell : callable
+        Takes one line of text.
+    overwrite : bool
+        Whether to replace a run that is already there.
+
+    Raises
+    ------
+    AqualvsError
+        If the installation lacks the dive, or `out` cannot be written.
+    """
+    with importlib.resources.as_file(bundled_dive()) as folder:
+        dive, rig, truth = (_present(folder / name) for name in _FILES)
+        request = RunRequest(source=str(dive), rig=rig, truth=truth, out=out, overwrite=overwrite)
+        return run_and_tell(request, tell)
+
+
+def bundled_dive() -> Traversable:
+    """Return the folder with the dive that comes with the package."""
+    return importlib.resources.files("aqualvs") / "data" / "demo"
+
+
+def _present(path: Path) -> Path:
+    if not path.is_file():
+        raise SourceError(f"{path}: missing from this installation; install aqualvs again")
+    return path

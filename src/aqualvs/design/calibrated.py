@@ -1,0 +1,253 @@
+"""What a camera that is not quite right makes of walls, if its lasers are calibrated with it.
+
+Lasers are calibrated on boards that the same camera sees. What is wrong with the camera moves the
+boards, and the lasers with them: stripes on a wall are then found where a board would be found.
+
+What it costs that the lens is not in the dome's centre.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.calibration.solver.initial_pose import target_pose
+from aqualvs.calibration.targets.targets import View
+from aqualvs.check.finding import index_sigma
+from aqualvs.design.settings import Design, Tolerances
+from aqualvs.errors import CalibrationError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.optics.expected_error import WallView
+from aqualvs.optics.rig import Laser, Rig, rig_moved_by
+
+# The boards that lasers are calibrated on: how they lean (radians), where in the working range
+# they are held (as powers), corners to a side, and half a side as a share of the range: they fill
+# the picture.
+_LEANS = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
+_PLACES = (0.15, 0.85)
+_N_CORNERS = 11
+_HALF_BOARD = 0.8
+_N_POINTS, _LEAST_POINTS = 161, 40
+
+
+def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
+    """Return what is left of the camera's tolerances once the lasers are calibrated with it.
+
+    Parameters
+    ----------
+    design : Design
+        With its lasers tilted as they will be.
+    ranges : sequence of float
+        Walls square ahead, metres.
+
+    Returns
+    -------
+    mapping from cause to array, shape (W, 3)
+        Standard deviations of (range, pitch, yaw), m and rad; NaN where lasers light no board.
+    """
+    rig = design.nominal_rig()
+    walls = [WallView.ahead(rig, wall) for wall in ranges]
+    truth = np.array([[wall, 0.0, 0.0] for wall in ranges])
+    found = {}
+    for cause, steps in _steps(rig, design.tolerances).items():
+        squares = np.zeros((len(walls), 3))
+        for step in steps:
+            moved = rig_moved_by(rig, list(step), np.array([*step.values()]))
+            believed = lasers_by(moved, rig)
+            if believed is None:
+                squares += np.nan
+                continue
+            read = np.array([wall.read_by(believed) for wall in walls])
+            squares += (read - truth) ** 2
+        found[cause] = np.sqrt(squares)
+    return found
+
+
+def _steps(rig: Rig, tolerances: Tolerances) -> dict[str, list[Mapping[str, float]]]:
+    """Return one-sigma steps of the camera's numbers, by cause."""
+    lens, turn, dome = tolerances.lens, tolerances.rotation, tolerances.dome
+    focal = {"fx": tolerances.focal * rig.lens.fx, "fy": tolerances.focal * rig.lens.fy}
+    steps: dict[str, list[Mapping[str, float]]] = {
+        "lens place": [{f"lens_{axis}": lens} for axis in "xyz"],
+        "camera rotation": [{f"rotation_{axis}": turn} for axis in "xyz"],
+        "focal length": [focal],
+    }
+    if rig.dome is not None:
+        steps["dome"] = [{"inner_radius": dome}, {"thickness": dome}]
+    return steps
+
+
+def lasers_by(believed: Rig, true: Rig) -> Rig | None:
+    """Return a rig with the lasers that it would find if it were right, from what another sees.
+
+    Boards in the working range tell, through the believed camera, where they are, and the stripes
+    on them where the lasers are: a calibration without noise.
+
+    Parameters
+    ----------
+    believed : Rig
+        Whose camera is taken to be right.
+    true : Rig
+        Who makes the pictures.
+
+    Returns
+    -------
+    Rig or None
+        None where the boards, or the stripes on them, cannot be used.
+    """
+    lit: list[list[FloatArray]] = [[] for _ in true.lasers]
+    for board in _boards(true.working_range):
+        found = _found(believed, true, board)
+        if found is None:
+            continue
+        for points, laser in zip(lit, true.lasers, strict=True):
+            points.append(_stripe_on(board, found, laser, believed, true))
+    if any(sum(map(len, points)) < _LEAST_POINTS for points in lit):
+        return None
+    lasers = (
+        replace(laser, plane=_fitted(np.concatenate(points)), window=None)
+        for laser, points in zip(true.lasers, lit, strict=True)
+    )
+    return replace(believed, lasers=tuple(lasers))
+
+
+def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
+    """Poses `dome_from_board`; boards lie in their x-z plane."""
+    near, far = working_range
+    for share in _PLACES:
+        middle = np.array([0.0, near * (far / near) ** share, 0.0])
+        for lean in _LEANS:
+            yield SE3(rotation_from_rotvec(lean), middle)
+
+
+def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
+    """Where a board seems to be."""
+    half = _HALF_BOARD * float(board.translation[1])
+    x, z = np.meshgrid(*(np.linspace(-half, half, _N_CORNERS),) * 2)
+    corners = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    camera = true.camera()
+    pixels, valid = camera.project(board.apply(corners))
+    seen = valid & camera.inside_image(pixels)
+    view = View("board", np.flatnonzero(seen), corners[seen], pixels[seen])
+    try:
+        return target_pose(believed.camera(), view, max_rms_px=np.inf).dome_from_target
+    except CalibrationError:
+        return None
+
+
+def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -> FloatArray:
+    """Points (N, 3) of a laser's stripe on a board as the believed camera places them."""
+    face = board.rotate([0.0, 1.0, 0.0])
+    along = np.cross(laser.plane.normal, face)
+    length = float(np.linalg.norm(along))
+    if length < 1e-3:
+        return np.empty((0, 3))
+    rows = np.stack([laser.plane.normal, face, along / length])
+    middle = board.translation
+    start = np.linalg.solve(rows, [laser.plane.offset, face @ middle, rows[2] @ middle])
+    half = _HALF_BOARD * float(middle[1])
+    points = start + np.linspace(-half, half, _N_POINTS)[:, None] * rows[2]
+    camera = true.camera()
+    pixels, valid = camera.project(points)
+    on_board = np.abs(board.inverse().apply(points)) <= half
+    seen = valid & camera.inside_image(pixels) & on_board.all(axis=-1)
+    normal = found.rotate([0.0, 1.0, 0.0])
+    surface = Plane(normal, float(normal @ found.translation))
+    placed, met = surface.intersect(believed.camera().rays(pixels[seen]))
+    return placed[met]
+
+
+def _fitted(points: FloatArray) -> Plane:
+    """Return the plane with the least squared distances from points."""
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle)[2][-1]
+    return Plane(normal, float(normal @ middle))
+
+
+INDEX_ERROR = 0.005
+"""About what sea water's index is above fresh water's."""
+
+_USUAL = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
+# A lens farther out than this share of the inner radius has no room.
+_ROOM = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetCost:
+    """What an offset of the lens, ahead of the dome's centre, costs.
+
+    Attributes
+    ----------
+    offset : float
+        Metres.
+    neglected : array, shape (W, 3)
+        Errors of (range, pitch, yaw), in m and rad, where the lens is taken to be in the centre
+        and all else is right.
+    calibrated : array, shape (W, 3)
+        The same where the lasers, too, were calibrated with the lens taken to be in the centre: on
+        boards, whose places are then wrong as well. NaN where no board's place can be told.
+    aside : array, shape (W, 3)
+        As `neglected`, for an equal offset to the right.
+    index_error : array, shape (W, 3)
+        Errors where the offset is known, but the water's index is taken too large by
+        `INDEX_ERROR`.
+    index_sigma : float
+        How well one picture of a known target tells the water's index; see
+        `aqualvs.check.finding.index_sigma`.
+    """
+
+    offset: float
+    neglected: FloatArray
+    calibrated: FloatArray
+    aside: FloatArray
+    index_error: FloatArray
+    index_sigma: float
+
+
+def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, ...]:
+    """Return the costs of offsets from none to what the dome has room for.
+
+    Among them are the design's own offset and its centring tolerance. None without a dome.
+
+    Parameters
+    ----------
+    design : Design
+        With its lasers tilted as they will be.
+    ranges : sequence of float
+        Walls square ahead, metres.
+    """
+    dome = design.rig.dome
+    if dome is None:
+        return ()
+    own = float(np.linalg.norm(design.rig.dome_from_cam.translation))
+    offsets = {round(value, 5) for value in (*_USUAL, own, design.centring)}
+    rig = design.nominal_rig()
+    room = _ROOM * dome.inner_radius
+    return tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= room)
+
+
+def _cost(rig: Rig, offset: float, ranges: Sequence[float]) -> OffsetCost:
+    centred = _with_lens(rig, (0.0, 0.0, 0.0))
+    ahead, aside = _with_lens(rig, (0.0, offset, 0.0)), _with_lens(rig, (offset, 0.0, 0.0))
+    return OffsetCost(
+        offset=offset,
+        neglected=_errors(ahead, centred, ranges),
+        calibrated=_errors(ahead, lasers_by(centred, ahead), ranges),
+        aside=_errors(aside, centred, ranges),
+        index_error=_errors(ahead, ahead.in_water(rig.n_water + INDEX_ERROR), ranges),
+        index_sigma=index_sigma(ahead),
+    )
+
+
+def _with_lens(rig: Rig, position: tuple[float, float, float]) -> Rig:
+    return replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.array(position)))
+
+
+def _errors(true: Rig, believed: Rig | None, ranges: Sequence[float]) -> FloatArray:
+    """Return what `believed` reads of what `true` sees, less the truth (W, 3); NaN where none."""
+    if believed is None:
+        return np.full((len(ranges), 3), np.nan)
+    read = [WallView.ahead(true, wall).read_by(believed) - [wall, 0.0, 0.0] for wall in ranges]
+    return np.array(read)

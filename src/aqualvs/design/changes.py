@@ -1,0 +1,315 @@
+"""Which change of a design helps most: each is tried, with the lasers tilted anew.
+
+The best angles for a design's lasers.
+
+Coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69): one laser after the other
+takes the best of its candidates, the others being as they are, until none changes. What a stripe
+tells adds up over the lasers (`stripes`), so the candidates are traced once for each grid; grids
+become finer about the best.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.design.judge import Judge, Lot, predict, score
+from aqualvs.design.settings import Design, Mount, tangential
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.lens import Lens
+from aqualvs.scanning.plane_fit import SharedError
+
+TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
+"""Tilts among which the best is sought."""
+
+_DEG = math.pi / 180.0
+# Steps of tilt and stripe from grid to grid, and how many to each side after the first.
+_TILT_STEPS = (2.5 * _DEG, 0.5 * _DEG, 0.1 * _DEG)
+_STRIPE_STEPS = (15.0 * _DEG, 5.0 * _DEG, 1.0 * _DEG)
+_HALF_TILTS, _HALF_STRIPES = 6, 3
+# The first grid is so much wider where the stripe's direction is free, too.
+_WIDER = 2.0
+# Choices of each kind that the exchange starts from.
+_N_STARTS = 8
+_MOST_ROUNDS = 20
+
+
+def best_angles(design: Design, *, quick: bool = False) -> Design:
+    """Return the design with the best angles for the mounts that are free to turn.
+
+    The fans of the mounts that turn are swung so that their middles are abreast of the forward
+    axis halfway through the working range.
+
+    Parameters
+    ----------
+    design : Design
+    quick : bool
+        Start from the mounts' own angles alone: enough where a design has changed but little.
+    """
+    if not any(mount.free_tilt or mount.free_stripe for mount in design.mounts):
+        return design
+    judge = Judge(design)
+    halfway = math.sqrt(math.prod(design.rig.working_range))
+    mounts = list(design.mounts)
+    for i in range(len(_TILT_STEPS)):
+        lots = [_candidates(mount, i, halfway) for mount in mounts]
+        traced = [judge.trace(lot) for lot in lots]
+        starts = [[_nearest(one, lot) for one, lot in zip(mounts, lots, strict=True)]]
+        if i == 0 and not quick:
+            starts += _starts(lots)
+        _, picked = min((_exchange(judge, traced, one) for one in starts), key=lambda x: x[0])
+        mounts = [lot[k] for lot, k in zip(lots, picked, strict=True)]
+    return design.with_mounts(mounts)
+
+
+def _exchange(judge: Judge, lots: Sequence[Lot], start: Sequence[int]) -> tuple[float, list[int]]:
+    """Let every laser take its best candidate until none changes."""
+    picked, least = list(start), math.inf
+    for _ in range(_MOST_ROUNDS):
+        before = list(picked)
+        for i, lot in enumerate(lots):
+            others = lot.take([])
+            for j, other in enumerate(lots):
+                if j != i:
+                    others = others.joined(other.take([picked[j]]))
+            _, totals = judge.judge(lot, others)
+            picked[i] = int(np.argmin(totals))
+            least = float(totals[picked[i]])
+        if picked == before:
+            break
+    return least, picked
+
+
+def _candidates(mount: Mount, i_grid: int, halfway: float) -> list[Mount]:
+    """Return a mount at all angles of a grid; the middle of later grids is the mount itself."""
+    if not (mount.free_tilt or mount.free_stripe):
+        return [mount]
+    tilts, stripes = [mount.tilt], [mount.stripe]
+    first = i_grid == 0
+    if mount.free_tilt:
+        low, high = TILT_LIMITS
+        step = _TILT_STEPS[0] * (_WIDER if mount.free_stripe else 1.0)
+        whole = np.arange(low, high + 1e-9, step).tolist()
+        tilts = whole if first else _around(mount.tilt, _TILT_STEPS[i_grid], _HALF_TILTS)
+    if mount.free_stripe:
+        whole = np.arange(0.0, math.pi - 1e-9, _STRIPE_STEPS[0]).tolist()
+        stripes = whole if first else _around(mount.stripe, _STRIPE_STEPS[i_grid], _HALF_STRIPES)
+    return [
+        replace(mount, tilt=float(np.clip(tilt, *TILT_LIMITS)), stripe=stripe % math.pi).aimed_at(
+            halfway
+        )
+        for stripe in stripes
+        for tilt in tilts
+    ]
+
+
+def _nearest(mount: Mount, lot: Sequence[Mount]) -> int:
+    """Return the candidate whose angles are nearest to a mount's."""
+    off = [abs(one.tilt - mount.tilt) + abs(math.sin(one.stripe - mount.stripe)) for one in lot]
+    return int(np.argmin(off))
+
+
+def _around(middle: float, step: float, half: int) -> list[float]:
+    steps: list[float] = (middle + step * np.arange(-half, half + 1)).tolist()
+    return steps
+
+
+def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
+    """Return choices to start from: alike for all lasers, and mixed (the same at every call)."""
+    shares = (np.arange(_N_STARTS) + 0.5) / _N_STARTS
+    alike = [[share] * len(lots) for share in shares.tolist()]
+    mixed = np.random.default_rng(0).uniform(size=(_N_STARTS, len(lots))).tolist()
+    return [
+        [int(share * len(lot)) for share, lot in zip(start, lots, strict=True)]
+        for start in alike + mixed
+    ]
+
+
+# Lasers are not put nearer to each other than this, in metres.
+_ROOM = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a change would do; all numbers are shares of what is now, 1 is no change.
+
+    Attributes
+    ----------
+    words : str
+        What is changed.
+    score : float
+        Root mean square of all errors, in goals, on walls and nets.
+    noise_range, noise_angle : float
+        Errors of a single frame on a wall, from noise alone, root mean square over the range.
+    systematic_range, systematic_angle : float
+        Errors from the tolerances of lasers and water.
+    """
+
+    words: str
+    score: float
+    noise_range: float
+    noise_angle: float
+    systematic_range: float
+    systematic_angle: float
+
+
+def changes(design: Design) -> list[Change]:
+    """Try every change and return them, the most helpful first.
+
+    Parameters
+    ----------
+    design : Design
+        With its lasers tilted as they will be. Those that are free to turn are turned again.
+    """
+    now = _measures(design)
+    tried = ((words, change(design)) for words, change in _CHANGES.items())
+    found = [
+        Change(words, *(_measures(best_angles(new, quick=True)) / now).tolist())
+        for words, new in tried
+        if new is not None
+    ]
+    return sorted(found, key=lambda change: change.score)
+
+
+def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Score, then noise and tolerances for range (as a share) and angles."""
+    told = predict(design)
+    parts = [score(design).error]
+    for sigma in (told.wall, told.systematic_total):
+        parts.append(_rms(sigma[:, 0] / told.ranges))
+        parts.append(_rms(np.hypot(sigma[:, 1], sigma[:, 2])))
+    return np.array(parts)
+
+
+def _rms(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _moved(design: Design, move: Callable[[Mount], Mount]) -> Design:
+    return design.with_mounts([move(mount) for mount in design.mounts])
+
+
+def _wider_baseline(design: Design) -> Design:
+    def move(mount: Mount) -> Mount:
+        x, y, z = mount.position
+        return replace(mount, position=(1.2 * x, y, 1.2 * z))
+
+    return _moved(design, move)
+
+
+def _finer(design: Design) -> Design:
+    rig = design.rig
+    lens, (width, height) = rig.lens, rig.size_px
+    # The centre of the top-left pixel is (0, 0), its corner (-0.5, -0.5).
+    finer = Lens(
+        model=lens.model,
+        fx=2.0 * lens.fx,
+        fy=2.0 * lens.fy,
+        cx=2.0 * lens.cx + 0.5,
+        cy=2.0 * lens.cy + 0.5,
+        distortion=lens.distortion,
+    )
+    return replace(design, rig=replace(rig, lens=finer, size_px=(2 * width, 2 * height)))
+
+
+def _longer_lens(share: float) -> Callable[[Design], Design]:
+    def change(design: Design) -> Design:
+        lens = design.rig.lens
+        longer = Lens(
+            model=lens.model,
+            fx=share * lens.fx,
+            fy=share * lens.fy,
+            cx=lens.cx,
+            cy=lens.cy,
+            distortion=lens.distortion,
+        )
+        return replace(design, rig=replace(design.rig, lens=longer))
+
+    return change
+
+
+def _one_more(design: Design) -> Design | None:
+    """Add a laser across the axis from one that has room there: where it helps most."""
+    tried = [
+        best_angles(design.with_mounts([*design.mounts, _new_mount(design, place)]), quick=True)
+        for place in _free_places(design)
+    ]
+    return min(tried, key=lambda one: score(one).total, default=None)
+
+
+def _new_mount(design: Design, place: tuple[float, float, float]) -> Mount:
+    names = {mount.name for mount in design.mounts}
+    name = next(name for name in (f"extra_{i}" for i in range(1, 99)) if name not in names)
+    tilt, fan = design.mounts[0].tilt, design.mounts[0].fan
+    return Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
+
+
+def _free_places(design: Design) -> Iterator[tuple[float, float, float]]:
+    places = [mount.position for mount in design.mounts]
+    for x, y, z in places:
+        across = (-x, y, -z)
+        if all(math.dist(across, other) > _ROOM for other in places):
+            yield across
+
+
+def _turned(design: Design) -> Design | None:
+    if all(mount.free_stripe for mount in design.mounts):
+        return None
+    return _moved(design, lambda mount: replace(mount, free_stripe=True))
+
+
+def _crossing(design: Design) -> Design | None:
+    return replace(design, avoid_crossings=False) if design.avoid_crossings else None
+
+
+def _centred(design: Design) -> Design | None:
+    pose = design.rig.dome_from_cam
+    if design.rig.dome is None or float(np.linalg.norm(pose.translation)) < 1e-4:
+        return None
+    centred = SE3(pose.rotation, np.zeros(3))
+    return replace(design, rig=replace(design.rig, dome_from_cam=centred))
+
+
+def _averaged(design: Design) -> Design:
+    """Four frames in which stripes have moved over the target: all noise halves."""
+    noise = design.noise
+    wall, net = (
+        SharedError(0.5 * one.shift_px, 0.5 * one.tilt_px) for one in (noise.wall, noise.net)
+    )
+    halved = replace(noise, point=0.5 * noise.point, strand=0.5 * noise.strand, wall=wall, net=net)
+    return replace(design, noise=halved)
+
+
+def _better_known(*names: str) -> Callable[[Design], Design]:
+    def change(design: Design) -> Design:
+        halved = {name: 0.5 * getattr(design.tolerances, name) for name in names}
+        return replace(design, tolerances=replace(design.tolerances, **halved))
+
+    return change
+
+
+def _nearer(design: Design) -> Design | None:
+    near, far = design.rig.working_range
+    if 0.8 * far <= near:
+        return None
+    return replace(design, rig=replace(design.rig, working_range=(near, 0.8 * far)))
+
+
+_CHANGES: dict[str, Callable[[Design], Design | None]] = {
+    "baseline 20 % longer": _wider_baseline,
+    "twice the pixels, each way": _finer,
+    "focal length 25 % longer": _longer_lens(1.25),
+    "focal length 20 % shorter": _longer_lens(0.8),
+    "one more laser": _one_more,
+    "stripes turned to their best directions": _turned,
+    "stripes may cross": _crossing,
+    "fan of 90 degrees": lambda design: _moved(
+        design, lambda mount: replace(mount, fan=math.radians(90.0))
+    ),
+    "lens in the dome's centre": _centred,
+    "mean of four frames": _averaged,
+    "lasers known twice as well": _better_known("laser_angle", "laser_offset"),
+    "water's index known twice as well": _better_known("n_water"),
+    "working range ends 20 % nearer": _nearer,
+}

@@ -1,0 +1,178 @@
+"""`aqualvs design`: predict what a design measures, and tilt its lasers best."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from aqualvs.design.calibrated import camera_errors, offset_costs
+from aqualvs.design.changes import best_angles, changes
+from aqualvs.design.file import (
+    FAN_DEG,
+    design_from,
+    design_of_rig,
+    example_content,
+    load_design,
+    merged_content,
+)
+from aqualvs.design.judge import predict, score, together
+from aqualvs.design.report import (
+    ERRORS_PNG,
+    PICTURE_PNG,
+    cause_table,
+    centring_words,
+    change_table,
+    draw_figures,
+    error_table,
+    findings,
+    lasers_table,
+    offset_table,
+    shown_ranges,
+    summary,
+)
+from aqualvs.design.settings import Design
+from aqualvs.errors import OptionError
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.results.files import Claim, writing
+
+RIG_YAML = "rig.yaml"
+
+# Ranges at which it is looked whether a stripe is in the picture.
+_N_SEEN = 181
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DesignRequest:
+    """What is asked for; see `aqualvs design --help`.
+
+    Attributes
+    ----------
+    design, rig : Path or None
+        A design file, or a rig file that exists; the example if neither is given.
+    out : Path or None
+        Folder to write.
+    given : mapping
+        What takes the place of the file's values, as `merged_content` takes it.
+    fan_deg : float or None
+        Of the lasers of a rig.
+    turn : bool
+        Whether to look for the best directions of the stripes of lasers that are tilted, too.
+    tilt : bool
+        Whether to look for the best angles.
+    try_changes : bool
+        Whether to say which changes would help.
+    overwrite : bool
+        Whether to replace what this command wrote to `out` before.
+    """
+
+    design: Path | None = None
+    rig: Path | None = None
+    out: Path | None = None
+    given: Mapping[str, Any] = field(default_factory=dict)
+    fan_deg: float | None = None
+    turn: bool = False
+    tilt: bool = True
+    try_changes: bool = True
+    overwrite: bool = False
+
+
+def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
+    """Judge a design and print what it measures.
+
+    Raises
+    ------
+    AqualvsError
+        If a file or an option cannot be used, or the folder cannot be written.
+    """
+    console = console or Console()
+    design = _asked_for(request)
+    names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG)
+    files = [(request.out or Path()) / name for name in names]
+    with Claim("design", files, overwrite=request.overwrite):
+        if request.turn:
+            turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
+            design = design.with_mounts(turned)
+        best = best_angles(design) if request.tilt else design
+        for line in summary(best):
+            _say(console, line)
+        console.print()
+        if request.rig is not None and request.tilt:
+            _tell_errors(console, design, "As it is: one sigma on a wall or net square ahead")
+            error, better = score(design).error, score(best).error
+            _say(console, f"Tilted best, its errors are {better / error:.0%} of that.\n")
+        _tell_errors(console, best, "Expected error: one sigma on a wall or net square ahead")
+        costs = offset_costs(best, best.rig.working_range)
+        if costs:
+            console.print(offset_table(costs, best.rig.working_range))
+            _say(console, centring_words(best, costs, best.rig.working_range))
+            console.print()
+        if request.try_changes:
+            console.print(change_table(changes(best)))
+            console.print()
+        if request.out is not None:
+            _write(best, request.out, console)
+
+
+def _tell_errors(console: Console, design: Design, title: str) -> None:
+    """Print where the lasers are, what they measure, and which tolerance makes which error."""
+    closely = predict(design, np.geomspace(*design.rig.working_range, _N_SEEN))
+    ranges = shown_ranges(design.rig.working_range)
+    told = predict(design, ranges)
+    causes = {**camera_errors(design, ranges), **told.systematic}
+    console.print(lasers_table(design, closely))
+    for line in findings(design, closely):
+        _say(console, line)
+    console.print()
+    console.print(error_table(told, together(causes), title))
+    console.print()
+    middle = int(np.argmin(np.abs(told.ranges - math.sqrt(math.prod(design.rig.working_range)))))
+    console.print(cause_table(causes, middle, ranges[middle]))
+    console.print()
+
+
+def _asked_for(request: DesignRequest) -> Design:
+    if request.rig is not None:
+        if request.design is not None:
+            raise OptionError("give either a design file or --rig, not both")
+        if request.given:
+            names = ", ".join(request.given)
+            raise OptionError(f"--rig: the rig file says {names} itself; change them there")
+        return design_of_rig(load_rig(request.rig), request.fan_deg or FAN_DEG)
+    if request.design is not None:
+        return load_design(request.design, request.given)
+    content = merged_content(example_content(), request.given)
+    return design_from(content, name="design", folder=Path())
+
+
+def _write(design: Design, out: Path, console: Console) -> None:
+    with writing(out):
+        save_rig(designed_rig(design), out / RIG_YAML)
+        pictures = draw_figures(design, out)
+    for path in (out / RIG_YAML, *pictures):
+        _say(console, f"written: {path}")
+
+
+def _say(console: Console, sentence: str) -> None:
+    console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
+
+def designed_rig(design: Design) -> Rig:
+    """Return the nominal rig with its lasers, and a note of their mounts."""
+    mounts = [
+        {
+            "name": mount.name,
+            "position_mm": [round(value * 1e3, 3) for value in mount.position],
+            "stripe_deg": round(math.degrees(mount.stripe), 2),
+            "tilt_deg": round(math.degrees(mount.tilt), 2),
+            "swing_deg": round(math.degrees(mount.swing), 2),
+            "fan_deg": round(math.degrees(mount.fan), 2),
+        }
+        for mount in design.mounts
+    ]
+    rig = design.nominal_rig()
+    return replace(rig, solved_from={**rig.solved_from, "design": {"mounts": mounts}})

@@ -1,0 +1,388 @@
+"""`design.yaml`: what is known before anything is bought, in millimetres and degrees."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from aqualvs.control.gains_file import NotNegative, Number, Part, Positive, parse_settings
+from aqualvs.design.settings import (
+    Design,
+    Goals,
+    Mount,
+    NetFacts,
+    Noise,
+    Tolerances,
+    mount_of_laser,
+    ring,
+    tangential,
+)
+from aqualvs.errors import OptionError, RigError
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Dome
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.water import seawater_index_vacuum
+from aqualvs.scanning.plane_fit import SharedError
+from aqualvs.yamlfile import parse_yaml, read_yaml
+
+KEY, VERSION = "aqualvs_design", 1
+FAN_DEG = 68.0
+"""Full opening of a fan of which nothing is said: the simulator's lasers."""
+
+EXAMPLE = """\
+# A design for aqualvs design: lengths in mm, angles in degrees, frame 'dome' (docs/hardware.md).
+aqualvs_design: 1
+name: rov
+camera: {width_px: 1920, height_px: 1080, fov_deg: 69}  # across, in air; or {rig: calibrated.yaml}
+dome: {inner_radius_mm: 51, thickness_mm: 6, n_acrylic: 1.49}  # leave out for a bare lens
+lens: {position_mm: [0, 6, 0], centring_mm: 1}
+water: {temperature_c: 12, salinity_permille: 35}  # or {n: 1.3400}
+lasers: {count: 3, baseline_mm: 150, back_mm: 0, fan_deg: 68}
+# or, in place of lasers, one by one; tilts and stripes that are left out are looked for:
+# mounts:
+# - {name: lower, position_mm: [0, 0, -150], stripe_deg: 0}
+# - {name: left, position_mm: [-160, 0, 0], stripe_deg: 90, tilt_deg: 12, fan_deg: 60}
+working_range_mm: [300, 1200]
+net: {bar_mm: 15, twine_mm: 2.5}
+goals: {range_percent: 0.5, angle_deg: 0.5}  # errors that are equally bad
+avoid_crossings: true
+"""
+
+_N_AIR = 1.0003
+_MM = 1e-3
+
+_Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
+# A hundred metres, and the pictures of the largest cameras: beyond them numbers are slips.
+_MOST_MM, _MOST_PX = 1e5, 32_768
+_Place = Annotated[float, Field(ge=-_MOST_MM, le=_MOST_MM, allow_inf_nan=False)]
+_Length = Annotated[float, Field(gt=0.0, le=_MOST_MM, allow_inf_nan=False)]
+_Triple = Annotated[list[_Place], Field(min_length=3, max_length=3)]
+_Pixels = Annotated[int, Field(gt=0, le=_MOST_PX)]
+_Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
+_Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
+
+
+class CameraPart(Part):
+    """`camera`: size and field of view, or a rig file with its intrinsics."""
+
+    width_px: _Pixels | None = None
+    height_px: _Pixels | None = None
+    fov_deg: Annotated[float, Field(gt=0.0, lt=220.0, allow_inf_nan=False)] | None = None
+    model: Literal["opencv", "fisheye"] = "opencv"
+    rig: str | None = None
+
+
+class DomePart(Part):
+    """`dome`."""
+
+    inner_radius_mm: _Length
+    thickness_mm: Annotated[float, Field(ge=0.0, le=_MOST_MM, allow_inf_nan=False)]
+    n_acrylic: _Index = 1.49
+
+
+class LensPart(Part):
+    """`lens`: where its projection centre is to be, and how far it may be off."""
+
+    position_mm: _Triple = Field(default=[0.0, 0.0, 0.0])
+    centring_mm: NotNegative = 1.0
+
+
+class WaterPart(Part):
+    """`water`: its index, or what it follows from."""
+
+    n: _Index | None = None
+    temperature_c: Number | None = None
+    salinity_permille: Number | None = None
+
+
+class LasersPart(Part):
+    """`lasers`: evenly round the dome."""
+
+    count: Annotated[int, Field(ge=1, le=8)] = 3
+    baseline_mm: _Length
+    back_mm: _Place = 0.0
+    fan_deg: _Fan = FAN_DEG
+    turn_stripes: bool = False
+
+
+class MountPart(Part):
+    """One of `mounts`; what is left out is looked for."""
+
+    name: str
+    position_mm: _Triple
+    stripe_deg: Number | Literal["best"] | None = None
+    tilt_deg: _Tilt | None = None
+    fan_deg: _Fan = FAN_DEG
+
+
+class NetPart(Part):
+    """`net`."""
+
+    bar_mm: _Length = 15.0
+    twine_mm: _Length = 2.5
+
+
+class NoisePart(Part):
+    """`noise`: one sigma, see docs/hardware.md."""
+
+    point_px: Positive = Noise().point
+    strand_px: Positive = Noise().strand
+    wall_shift_px: NotNegative = Noise().wall.shift_px
+    wall_tilt_px: NotNegative = Noise().wall.tilt_px
+    net_shift_px: NotNegative = Noise().net.shift_px
+    net_tilt_px: NotNegative = Noise().net.tilt_px
+
+
+class TolerancesPart(Part):
+    """`tolerances`: one sigma of what calibration leaves open."""
+
+    lens_mm: NotNegative = 0.03
+    rotation_deg: NotNegative = 0.01
+    focal_percent: NotNegative = 0.01
+    dome_mm: NotNegative = 0.05
+    n_water: NotNegative = 0.0003
+    laser_deg: NotNegative = 0.005
+    laser_mm: NotNegative = 0.07
+
+
+class GoalsPart(Part):
+    """`goals`."""
+
+    range_percent: Positive = 0.5
+    angle_deg: Positive = 0.5
+
+
+class DesignFile(Part):
+    """A whole design file."""
+
+    aqualvs_design: int
+    name: str = "design"
+    camera: CameraPart
+    dome: DomePart | None = None
+    lens: LensPart = LensPart()
+    water: WaterPart = WaterPart(n=1.3345)
+    lasers: LasersPart | None = None
+    mounts: Annotated[list[MountPart], Field(min_length=1)] | None = None
+    working_range_mm: Annotated[list[_Length], Field(min_length=2, max_length=2)]
+    net: NetPart = NetPart()
+    noise: NoisePart = NoisePart()
+    tolerances: TolerancesPart = TolerancesPart()
+    goals: GoalsPart = GoalsPart()
+    avoid_crossings: bool = True
+
+
+def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
+    """Read a design file.
+
+    Parameters
+    ----------
+    path : Path
+    given : mapping, optional
+        What the command line puts in place of the file's values, as `merged_content` takes it.
+
+    Raises
+    ------
+    OptionError, RigError
+        One line: file, place, value, remedy.
+    """
+    content = read_yaml(path, "a design file", OptionError)
+    if not isinstance(content, Mapping):
+        raise OptionError(f"{path}: is no design; such a file begins with '{KEY}: {VERSION}'")
+    merged = merged_content(content, given or {})
+    return design_from(merged, name=str(path), folder=path.parent)
+
+
+def example_content() -> dict[str, Any]:
+    """Return the content of `EXAMPLE`."""
+    content: dict[str, Any] = parse_yaml(EXAMPLE, "the example", OptionError)
+    return content
+
+
+def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a file with single values replaced; `given` maps part to its keys."""
+    merged = dict(content)
+    for part, values in given.items():
+        if part == "lasers" and "mounts" in merged:
+            raise OptionError("the file has mounts one by one; change them there, not by options")
+        here = merged.get(part)
+        if isinstance(here, Mapping) and isinstance(values, Mapping):
+            merged[part] = {**here, **values}
+        else:
+            merged[part] = values
+    return merged
+
+
+def design_from(content: object, *, name: str, folder: Path) -> Design:
+    """Return the design that the content of a design file describes.
+
+    Parameters
+    ----------
+    content : object
+        What YAML made of the file.
+    name : str
+        How messages call it.
+    folder : Path
+        Where a rig file that it names is looked for.
+
+    Raises
+    ------
+    OptionError, RigError
+        One line: file, place, value, remedy.
+    """
+    file = parse_settings(content, DesignFile, KEY, VERSION, name)
+    try:
+        return _design(file, folder)
+    except RigError as fault:
+        raise RigError(f"{name}: {fault}") from None
+    except OptionError as fault:
+        raise OptionError(f"{name}: {fault}") from None
+
+
+def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
+    """Return the design of a rig that exists: its lasers may be tilted, but stay where they are.
+
+    Raises
+    ------
+    RigError
+        If a laser can draw no stripe.
+    """
+    fan = math.radians(fan_deg)
+    mounts = tuple(mount_of_laser(laser, rig, fan) for laser in rig.lasers)
+    return Design(rig=rig, mounts=mounts)
+
+
+def _design(file: DesignFile, folder: Path) -> Design:
+    near, far = (value * _MM for value in file.working_range_mm)
+    if not near < far:
+        raise OptionError(
+            f"working_range_mm is {file.working_range_mm}; write the nearest range first, then a "
+            "larger one"
+        )
+    lens, size_px = _lens(file.camera, folder)
+    position = np.array(file.lens.position_mm) * _MM
+    dome = file.dome
+    rig = Rig(
+        name=file.name,
+        size_px=size_px,
+        lens=lens,
+        dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, position),
+        dome=None
+        if dome is None
+        else Dome(dome.inner_radius_mm * _MM, dome.thickness_mm * _MM, dome.n_acrylic),
+        n_air=_N_AIR,
+        n_water=_water_index(file.water),
+        lasers=(),
+        working_range=(near, far),
+    )
+    rig.camera()
+    return Design(
+        rig=rig,
+        mounts=_mounts(file),
+        centring=file.lens.centring_mm * _MM,
+        noise=_noise(file.noise),
+        tolerances=_tolerances(file.tolerances),
+        net=NetFacts(bar=file.net.bar_mm * _MM, twine=file.net.twine_mm * _MM),
+        goals=Goals(
+            range_share=file.goals.range_percent / 100.0,
+            angle=math.radians(file.goals.angle_deg),
+        ),
+        avoid_crossings=file.avoid_crossings,
+    )
+
+
+def _lens(camera: CameraPart, folder: Path) -> tuple[Lens, tuple[int, int]]:
+    if camera.rig is not None:
+        if camera.width_px or camera.height_px or camera.fov_deg:
+            raise OptionError(
+                "camera names a rig and numbers of its own; keep either 'rig', or width_px, "
+                "height_px and fov_deg"
+            )
+        rig = load_rig(folder / camera.rig, need_lasers=False)
+        return rig.lens, rig.size_px
+    width, height, fov_deg = camera.width_px, camera.height_px, camera.fov_deg
+    if width is None or height is None or fov_deg is None:
+        raise OptionError(
+            "camera lacks a number; write width_px, height_px and fov_deg, or 'rig: FILE' of a "
+            "calibrated camera"
+        )
+    half = math.radians(fov_deg) / 2.0
+    fisheye = camera.model == "fisheye"
+    if not fisheye and fov_deg >= 150.0:
+        raise OptionError(
+            f"camera.fov_deg is {fov_deg:g}, too wide for the opencv model; add 'model: fisheye'"
+        )
+    focal = 0.5 * width / (half if fisheye else math.tan(half))
+    middle = (width - 1) / 2.0, (height - 1) / 2.0
+    model = LensModel(camera.model)
+    return Lens(model=model, fx=focal, fy=focal, cx=middle[0], cy=middle[1]), (width, height)
+
+
+def _water_index(water: WaterPart) -> float:
+    if water.n is not None:
+        if water.temperature_c is not None or water.salinity_permille is not None:
+            raise OptionError("water gives n and what it would follow from; keep one of them")
+        return water.n
+    if water.temperature_c is None or water.salinity_permille is None:
+        raise OptionError("water has no index; write n, or temperature_c and salinity_permille")
+    return float(seawater_index_vacuum(water.temperature_c, water.salinity_permille, n_air=_N_AIR))
+
+
+def _mounts(file: DesignFile) -> tuple[Mount, ...]:
+    lasers, mounts = file.lasers, file.mounts
+    if (lasers is None) == (mounts is None):
+        raise OptionError("write either 'lasers' (evenly round the dome) or 'mounts' (one by one)")
+    if lasers is not None:
+        placed = ring(
+            lasers.count,
+            lasers.baseline_mm * _MM,
+            lasers.back_mm * _MM,
+            math.radians(lasers.fan_deg),
+        )
+        return tuple(replace(mount, free_stripe=lasers.turn_stripes) for mount in placed)
+    assert mounts is not None
+    names = [part.name for part in mounts]
+    if len(set(names)) < len(names):
+        raise OptionError("two mounts have one name; give each a name of its own")
+    return tuple(_mount(part) for part in mounts)
+
+
+def _mount(part: MountPart) -> Mount:
+    x, y, z = (value * _MM for value in part.position_mm)
+    given = part.stripe_deg
+    stripe = math.radians(given) % math.pi if isinstance(given, float | int) else None
+    return Mount(
+        name=part.name,
+        position=(x, y, z),
+        stripe=tangential((x, y, z)) if stripe is None else stripe,
+        tilt=math.radians(part.tilt_deg or 0.0),
+        fan=math.radians(part.fan_deg),
+        free_tilt=part.tilt_deg is None,
+        free_stripe=given == "best",
+    )
+
+
+def _noise(part: NoisePart) -> Noise:
+    return Noise(
+        point=part.point_px,
+        strand=part.strand_px,
+        wall=SharedError(part.wall_shift_px, part.wall_tilt_px),
+        net=SharedError(part.net_shift_px, part.net_tilt_px),
+    )
+
+
+def _tolerances(part: TolerancesPart) -> Tolerances:
+    return Tolerances(
+        lens=part.lens_mm * _MM,
+        rotation=math.radians(part.rotation_deg),
+        focal=part.focal_percent / 100.0,
+        dome=part.dome_mm * _MM,
+        n_water=part.n_water,
+        laser_angle=math.radians(part.laser_deg),
+        laser_offset=part.laser_mm * _MM,
+    )

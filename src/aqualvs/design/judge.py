@@ -1,0 +1,396 @@
+"""How good a choice of laser angles is: errors over the working range, in goals, and penalties.
+
+Errors of range, pitch and yaw that a design will have, from noise and from tolerances.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.design.settings import Design, Mount, Noise, Tolerances, index_step
+from aqualvs.design.stripes import Stripes, line_pixels, see_stripes
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.linear_algebra import invert_symmetric
+
+# Fewer search lines are no stripe to the scanner; and two lasers at least make a posture.
+MIN_LINES = 16
+"""Points that a stripe must have to count as visible."""
+_SINGULAR = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """What a design measures on walls and nets square ahead, at W ranges.
+
+    Attributes
+    ----------
+    ranges : array, shape (W,)
+        Metres.
+    stripes : Stripes
+        Of the design's lasers, L of them.
+    wall, net : array, shape (W, 3)
+        Standard deviations of (range, pitch, yaw) of a single frame from noise, on a wall and on
+        the design's net, in m and rad; NaN where there is no posture.
+    systematic : mapping from cause to array, shape (W, 3)
+        Standard deviations that the tolerances of lasers and water make, each alone; the same in
+        all frames. Those of the camera are in `calibrated.camera_errors`.
+    strands : array, shape (L, W)
+        Strands of the net that each stripe meets.
+    crossing : bool array, shape (L, L, W)
+        Whether two stripes cross in the picture.
+    """
+
+    ranges: FloatArray
+    stripes: Stripes
+    wall: FloatArray
+    net: FloatArray
+    systematic: dict[str, FloatArray]
+    strands: FloatArray
+    crossing: BoolArray
+
+    @property
+    def visible(self) -> BoolArray:
+        """Whether each laser's stripe is in the picture, shape (L, W)."""
+        return np.asarray(self.stripes.lines >= MIN_LINES)
+
+    @property
+    def valid(self) -> BoolArray:
+        """At which ranges there is a posture, shape (W,)."""
+        return np.asarray(np.isfinite(self.wall).all(axis=-1))
+
+    @property
+    def systematic_total(self) -> FloatArray:
+        """Standard deviations of these tolerances together, shape (W, 3)."""
+        return together(self.systematic)
+
+
+def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) -> Prediction:
+    """Predict a design's errors.
+
+    Parameters
+    ----------
+    design : Design
+    ranges : sequence of float, optional
+        Walls square to the forward axis, metres; the design's own if left out.
+    """
+    walls = design.ranges if ranges is None else np.asarray(ranges, np.float64)
+    camera = design.rig.camera()
+    stripes = see_stripes(camera, design.mounts, walls, index_step(camera, design.tolerances))
+    solid, mesh = wall_sums(stripes, design.noise), net_sums(stripes, design)
+    return Prediction(
+        ranges=walls,
+        stripes=stripes,
+        wall=_sigmas(posture_covariance(solid, walls)),
+        net=_sigmas(posture_covariance(mesh, walls)),
+        systematic=_systematic(stripes, design.tolerances, walls),
+        strands=stripes.length * design.net.strands_per_metre,
+        crossing=crossings(stripes),
+    )
+
+
+def together(causes: Mapping[str, FloatArray]) -> FloatArray:
+    """Return the standard deviation (W, 3) that independent causes make together."""
+    total: FloatArray = np.sqrt(np.sum([sigma**2 for sigma in causes.values()], axis=0))
+    return total
+
+
+@dataclass(frozen=True, slots=True)
+class Sums:
+    """Normal equations of wall fits, and the scatter that shared errors add.
+
+    Attributes
+    ----------
+    matrix : array, shape (..., W, 3, 3)
+        sum w X X', for errors of 1 px.
+    scatter : array, shape (..., W, 3, 3)
+        Covariance of sum w X r, where r are the residuals.
+    """
+
+    matrix: FloatArray
+    scatter: FloatArray
+
+    def total(self) -> "Sums":
+        """Return the sums over the first axis: over the lasers."""
+        return Sums(self.matrix.sum(axis=0), self.scatter.sum(axis=0))
+
+
+def wall_parts(stripes: Stripes, noise: Noise) -> Sums:
+    """Return what each stripe (K, W) adds on an unbroken wall."""
+    shared = noise.wall.shift_px, noise.wall.tilt_px
+    return _parts(stripes, np.ones_like(stripes.lines), noise.point, shared)
+
+
+def net_parts(stripes: Stripes, design: Design) -> Sums:
+    """Return what each stripe (K, W) adds on the design's net: one point for every strand."""
+    noise = design.noise
+    shared = noise.net.shift_px, noise.net.tilt_px
+    return _parts(stripes, net_share(stripes, design), noise.strand, shared)
+
+
+def net_share(stripes: Stripes, design: Design) -> FloatArray:
+    """Return the strands of the design's net for every point on a wall, (K, W)."""
+    strands = stripes.length * design.net.strands_per_metre
+    share: FloatArray = np.minimum(strands / np.maximum(stripes.lines, 1.0), 1.0)
+    return share
+
+
+def wall_sums(stripes: Stripes, noise: Noise) -> Sums:
+    """Return the sums of all stripes on a wall."""
+    return wall_parts(stripes, noise).total()
+
+
+def net_sums(stripes: Stripes, design: Design) -> Sums:
+    """Return the sums of all stripes on the design's net."""
+    return net_parts(stripes, design).total()
+
+
+def _parts(stripes: Stripes, share: FloatArray, point: float, shared: tuple[float, float]) -> Sums:
+    """Keep `share` of the points (K, W), each with a noise of `point` pixels."""
+    matrix = stripes.matrix * share[..., None, None]
+    pulls = stripes.own[..., :2, :] * share[..., None, None] * np.array(shared)[:, None]
+    return Sums(matrix, point**2 * matrix + outer(pulls))
+
+
+def outer(pulls: FloatArray) -> FloatArray:
+    """Return the sum of q q' over pulls (..., M, 3), shape (..., 3, 3)."""
+    summed: FloatArray = np.einsum("...mi,...mj->...ij", pulls, pulls)
+    return summed
+
+
+def laser_scatter(stripes: Stripes, tolerances: Tolerances) -> FloatArray:
+    """Return what errors of each laser's plane add to the scatter, shape (K, W, 3, 3)."""
+    sizes = np.array([tolerances.laser_angle, tolerances.laser_angle, tolerances.laser_offset])
+    return outer(stripes.own[..., 2:, :] * sizes[:, None])
+
+
+def posture_covariance(sums: Sums, ranges: FloatArray) -> FloatArray:
+    """Return the covariance (..., W, 3, 3) of range, pitch and yaw; NaN where there is none.
+
+    The posture's derivatives by m at a wall square ahead are -range², range and range.
+    """
+    inverse = inverse_of(sums.matrix)
+    covariance = inverse @ sums.scatter @ inverse
+    order = [1, 2, 0]
+    scale = np.stack([-(ranges**2), ranges, ranges], axis=-1)
+    picked = covariance[..., order, :][..., :, order]
+    posture: FloatArray = picked * scale[..., :, None] * scale[..., None, :]
+    return posture
+
+
+def inverse_of(matrix: FloatArray) -> FloatArray:
+    """Invert symmetric matrices (..., 3, 3); NaN where a direction is not determined."""
+    size = np.trace(matrix, axis1=-2, axis2=-1)
+    known = np.isfinite(size) & (size > 0.0)
+    safe = np.where(known[..., None, None], matrix, np.eye(3))
+    least = np.linalg.eigvalsh(safe)[..., 0]
+    known &= least > _SINGULAR * np.where(known, size, 1.0)
+    inverse = np.linalg.inv(np.where(known[..., None, None], safe, np.eye(3)))
+    return np.where(known[..., None, None], inverse, np.nan)
+
+
+def crossings(stripes: Stripes) -> BoolArray:
+    """Tell which stripes (K, K, W) cross where the camera sees both."""
+    crossing: BoolArray = cross(stripes, stripes)
+    crossing[np.arange(len(crossing)), np.arange(len(crossing))] = False
+    return crossing
+
+
+def cross(one: Stripes, other: Stripes) -> BoolArray:
+    """Tell which stripes of two lots, (K, L, W), cross within their visible parts."""
+    e, f = one.along[:, None, None], other.along[None, :, None]
+    apart = other.centre[None] - one.centre[:, None]
+    turn = _turn(e, f)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s, t = _turn(apart, f) / turn, _turn(apart, e) / turn
+        here = (s >= one.ends[:, None, :, 0]) & (s <= one.ends[:, None, :, 1])
+        there = (t >= other.ends[None, ..., 0]) & (t <= other.ends[None, ..., 1])
+    met: BoolArray = here & there & (np.abs(turn) > 1e-9)
+    return met
+
+
+def _turn(a: FloatArray, b: FloatArray) -> FloatArray:
+    turn: FloatArray = a[..., 0] * b[..., 2] - a[..., 2] * b[..., 0]
+    return turn
+
+
+def _systematic(
+    stripes: Stripes, tolerances: Tolerances, ranges: FloatArray
+) -> dict[str, FloatArray]:
+    """Return standard deviations (W, 3) by cause."""
+    matrix = stripes.matrix.sum(axis=0)
+    scatters = {"water index": outer(stripes.common.sum(axis=0))}
+    angle = np.array([tolerances.laser_angle] * 2)[:, None]
+    offset = np.array([tolerances.laser_offset])[:, None]
+    scatters["laser angles"] = outer(stripes.own[..., 2:4, :] * angle).sum(axis=0)
+    scatters["laser offsets"] = outer(stripes.own[..., 4:, :] * offset).sum(axis=0)
+    return {
+        cause: _sigmas(posture_covariance(Sums(matrix, scatter), ranges))
+        for cause, scatter in scatters.items()
+    }
+
+
+def _sigmas(covariance: FloatArray) -> FloatArray:
+    # What cancels leaves rounding, which may be negative.
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+# A stripe should keep clear of the border by this share of the picture's height, so that targets
+# that are not square stay in view, and be at least so long.
+_MARGIN_SHARE, _LENGTH_SHARE = 0.05, 0.3
+# What a stripe that is out of the picture costs, in goals; and what a crossing may cost.
+_OUT_COST, _CROSSING_SHARE = 20.0, 0.3
+# What no posture counts as, in goals squared.
+_NO_POSTURE = 1e4
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How good a choice of angles is; less is better.
+
+    Attributes
+    ----------
+    error : float
+        Root mean square of the errors of range, pitch and yaw over the working range, from noise
+        and the tolerances of lasers and water, on walls and nets alike, in goals.
+    total : float
+        The same with what missing and crossing stripes cost.
+    """
+
+    error: float
+    total: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lot:
+    """Candidates for one laser, K of them, or the chosen stripes of several.
+
+    Attributes
+    ----------
+    stripes : Stripes
+    parts : tuple of (matrix, scatter, common)
+        On a wall and on the net: arrays (K, W, 3, 3), (K, W, 3, 3) and (K, W, G, 3).
+    """
+
+    stripes: Stripes
+    parts: tuple[tuple[FloatArray, FloatArray, FloatArray], ...]
+
+    def take(self, rows: Sequence[int]) -> "Lot":
+        """Return the named rows of K."""
+        picked = list(rows)
+        parts = tuple((m[picked], s[picked], c[picked]) for m, s, c in self.parts)
+        return Lot(self.stripes.take(picked), parts)
+
+    def joined(self, other: "Lot") -> "Lot":
+        """Return these rows followed by another's."""
+        parts = tuple(
+            (np.concatenate([a, x]), np.concatenate([b, y]), np.concatenate([c, z]))
+            for (a, b, c), (x, y, z) in zip(self.parts, other.parts, strict=True)
+        )
+        return Lot(self.stripes.joined(other.stripes), parts)
+
+    def __len__(self) -> int:
+        """Return K."""
+        return len(self.stripes.lines)
+
+
+class Judge:
+    """Judges choices of stripes for one design."""
+
+    def __init__(self, design: Design) -> None:
+        self._design = design
+        self._camera = design.rig.camera()
+        self._ranges = design.ranges
+        self._steps = index_step(self._camera, design.tolerances)
+        self._height = min(design.rig.size_px)
+
+    def trace(self, mounts: Sequence[Mount]) -> Lot:
+        """Return what the camera sees of mounts, with a margin for turned targets."""
+        design, margin = self._design, _MARGIN_SHARE * self._height
+        stripes = see_stripes(self._camera, mounts, self._ranges, self._steps, margin)
+        scatter = laser_scatter(stripes, design.tolerances)
+        share = net_share(stripes, design)[..., None, None]
+        wall, net = wall_parts(stripes, design.noise), net_parts(stripes, design)
+        on_wall = wall.matrix, wall.scatter + scatter, stripes.common
+        on_net = net.matrix, net.scatter + share**2 * scatter, share * stripes.common
+        return Lot(stripes, (on_wall, on_net))
+
+    def judge(self, lot: Lot, others: Lot) -> tuple[FloatArray, FloatArray]:
+        """Return error and total (see `Score`) of every candidate (K,) beside other lasers."""
+        goals = self._design.goals
+        wanted = np.array([goals.range_share, goals.angle, goals.angle])
+        squares = np.zeros((len(lot), len(self._ranges)))
+        for candidates, rest in zip(lot.parts, others.parts, strict=True):
+            matrix, scatter, common = (part.sum(axis=0) for part in rest)
+            _add_squares(*candidates, matrix, scatter, common, self._ranges, wanted, squares)
+        error = np.sqrt(squares.mean(axis=-1) / len(lot.parts))
+        short = self._shortfall(lot.stripes) + self._shortfall(others.stripes).sum()
+        total = error * (1.0 + _CROSSING_SHARE * self._crossings(lot.stripes, others.stripes))
+        return error, total + _OUT_COST * short / (1 + len(others))
+
+    def _shortfall(self, stripes: Stripes) -> FloatArray:
+        """How much of each stripe's least length is missing, (K,), mean over the ranges."""
+        least = _LENGTH_SHARE * self._height / line_pixels(self._camera)
+        missing: FloatArray = np.maximum(1.0 - stripes.lines / least, 0.0).mean(axis=-1)
+        return missing
+
+    def _crossings(self, one: Stripes, others: Stripes) -> FloatArray:
+        """Share of pairs and ranges (K,) at which stripes cross in the picture."""
+        n = len(others.lines)
+        if not self._design.avoid_crossings or n == 0:
+            return np.zeros(len(one.lines))
+        pairs = cross(one, others).mean(axis=-1).sum(axis=-1)
+        among = float(np.triu(cross(others, others).mean(axis=-1), 1).sum())
+        share: FloatArray = (pairs + among) / (n * (n + 1) / 2)
+        return share
+
+
+def score(design: Design) -> Score:
+    """Return how good the angles of a design's mounts are."""
+    judge = Judge(design)
+    lot = judge.trace(design.mounts)
+    errors, totals = judge.judge(lot.take([0]), lot.take(range(1, len(lot))))
+    return Score(float(errors[0]), float(totals[0]))
+
+
+@kernel
+def _add_squares(
+    matrix: FloatArray,
+    scatter: FloatArray,
+    common: FloatArray,
+    rest_matrix: FloatArray,
+    rest_scatter: FloatArray,
+    rest_common: FloatArray,
+    ranges: FloatArray,
+    wanted: FloatArray,
+    squares: FloatArray,
+) -> None:
+    """Add the mean square error in goals of every candidate and range to `squares` (K, W)."""
+    whole, inverse, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    scale = np.empty(3)
+    for k in range(matrix.shape[0]):
+        for w in range(matrix.shape[1]):
+            for i in range(3):
+                for j in range(3):
+                    whole[i, j] = matrix[k, w, i, j] + rest_matrix[w, i, j]
+                    middle[i, j] = scatter[k, w, i, j] + rest_scatter[w, i, j]
+            for g in range(common.shape[2]):
+                for i in range(3):
+                    for j in range(3):
+                        middle[i, j] += (common[k, w, g, i] + rest_common[w, g, i]) * (
+                            common[k, w, g, j] + rest_common[w, g, j]
+                        )
+            square = _NO_POSTURE
+            if invert_symmetric(whole, inverse):
+                # Yaw, range and pitch by m, each in its goal.
+                scale[0], scale[1] = ranges[w] / wanted[2], ranges[w] / wanted[0]
+                scale[2] = ranges[w] / wanted[1]
+                square = 0.0
+                for axis in range(3):
+                    for i in range(3):
+                        for j in range(3):
+                            variance = inverse[axis, i] * middle[i, j] * inverse[j, axis]
+                            square += scale[axis] ** 2 * variance / 3.0
+            squares[k, w] += min(square, _NO_POSTURE) if square >= 0.0 else _NO_POSTURE

@@ -1,0 +1,392 @@
+"""A design and what it measures, in tables.
+
+Two pictures of a design: errors over range, and where in the picture the stripes are.
+
+Matplotlib is asked for when a picture is drawn, and only its Agg canvas: no display is needed.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from aqualvs.check.finding import escaped
+from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost, camera_errors
+from aqualvs.design.changes import Change
+from aqualvs.design.judge import Prediction, predict, together
+from aqualvs.design.settings import Design, Mount
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.report.figure_style import new_canvas
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_STEPS_MM = (10, 20, 50, 100, 200, 250, 500, 1000, 2000)
+_MOST_ROWS = 6
+
+
+def shown_ranges(working_range: tuple[float, float]) -> list[float]:
+    """Return round ranges, in metres, from the nearest to the farthest."""
+    near, far = (value * 1e3 for value in working_range)
+    step = next((s for s in _STEPS_MM if (far - near) / s <= _MOST_ROWS - 2), far - near)
+    first = math.floor(near / step) + 1
+    inner = [step * i for i in range(first, math.ceil(far / step))]
+    return [value * 1e-3 for value in (near, *inner, far)]
+
+
+def summary(design: Design) -> list[str]:
+    """Return what is judged, in two or three lines."""
+    rig = design.rig
+    width, height = rig.size_px
+    fov = 2.0 * math.degrees(math.atan(0.5 * width / rig.lens.fx))
+    if rig.lens.model == "fisheye":
+        fov = math.degrees(width / rig.lens.fx)
+    x, y, z = (value * 1e3 for value in rig.dome_from_cam.translation.tolist())
+    if rig.dome is None:
+        housing = "bare lens"
+    else:
+        radius, thickness = rig.dome.inner_radius * 1e3, rig.dome.thickness * 1e3
+        housing = f"dome {radius:g} mm + {thickness:g} mm"
+    return [
+        f"{rig.name}: {width}x{height} px, {fov:.0f} degrees across in air, {housing}, lens at "
+        f"({x:g}, {y:g}, {z:g}) mm, water n = {rig.n_water:.4f}",
+        f"net: bars of {design.net.bar * 1e3:g} mm, twine {design.net.twine * 1e3:g} mm: "
+        f"{design.net.lit_share:.0%} of a stripe falls on it",
+    ]
+
+
+def lasers_table(design: Design, told: Prediction) -> Table:
+    """Return how to mount the lasers, and from where to where they are in the picture."""
+    table = _table("Lasers: where, at what angles, at which ranges in the picture")
+    headings = ("x\nmm", "y\nmm", "z\nmm", "baseline\nmm", "stripe\ndeg", "tilt\ndeg")
+    for name in (*headings, "swing\ndeg", "seen\nmm"):
+        table.add_column(name, justify="right")
+    for mount, visible in zip(design.mounts, told.visible, strict=True):
+        place = [f"{value * 1e3 + 0.0:.0f}".replace("-0", "0", 1) for value in mount.position]
+        angles = [_angle(mount.stripe), _angle(mount.tilt), _angle(mount.swing)]
+        table.add_row(
+            escaped(mount.name),
+            *place,
+            f"{mount.baseline * 1e3:.0f}",
+            *angles,
+            _interval(told.ranges, visible),
+        )
+    return table
+
+
+def _angle(angle: float) -> str:
+    return f"{math.degrees(angle):.1f}".replace("-0.0", "0.0")
+
+
+def _interval(ranges: FloatArray, visible: BoolArray) -> str:
+    """Ranges at which a stripe is in the picture; as many pieces as there are."""
+    pieces = []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]]).astype(int)))
+    for first, last in edges.reshape(-1, 2):
+        pieces.append(f"{ranges[first] * 1e3:.0f}-{ranges[last - 1] * 1e3:.0f}")
+    return ", ".join(pieces) or "nowhere"
+
+
+def error_table(told: Prediction, systematic: FloatArray, title: str) -> Table:
+    """Return one sigma of range, pitch and yaw by range; `systematic` (W, 3) is all of it."""
+    table = _table(title, first="range\nmm", right=True)
+    table.add_column("\nfrom")
+    for name in ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg"):
+        table.add_column(name, justify="right")
+    table.add_column("points on a wall,\nstrands on a net")
+    for i, wall in enumerate(told.ranges):
+        lines, strands = told.stripes.lines[:, i], told.strands[:, i]
+        rows = (
+            ("wall", told.wall[i], _counts(lines)),
+            ("net", told.net[i], _counts(strands)),
+            ("tolerances", systematic[i], ""),
+        )
+        for j, (name, sigma, points) in enumerate(rows):
+            first = "" if j else f"{wall * 1e3:.0f}"
+            table.add_row(first, name, *_cells(sigma, float(wall)), points)
+    return table
+
+
+def _counts(numbers: FloatArray) -> str:
+    return " + ".join(f"{value:.0f}" for value in numbers)
+
+
+def _cells(sigma: FloatArray, wall: float) -> Iterator[str]:
+    values = sigma[0] * 1e3, 100.0 * sigma[0] / wall, *np.degrees(sigma[1:])
+    return (_shown(float(value)) for value in values)
+
+
+def _shown(value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    return f"{value:.3f}" if abs(value) < 9.995 else f"{value:.1f}"
+
+
+def cause_table(causes: Mapping[str, FloatArray], i: int, wall: float) -> Table:
+    """Return what each tolerance makes of the posture at the i-th range, `wall` in metres."""
+    table = _table(f"Tolerances at {wall * 1e3:.0f} mm, one by one", first="\nfrom")
+    for name in ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg"):
+        table.add_column(name, justify="right")
+    for cause, sigma in causes.items():
+        table.add_row(cause, *_cells(sigma[i], wall))
+    return table
+
+
+def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
+    """Return what offsets of the lens cost, at the nearest and the farthest range."""
+    table = _table("Lens ahead of the dome's centre: range error", first="offset\nmm", right=True)
+    near, far = (f"{value * 1e3:.0f} mm" for value in (ranges[0], ranges[-1]))
+    for name in (
+        f"neglected\n{near}",
+        f"\n{far}",
+        f"in calibration too\n{near}",
+        f"\n{far}",
+        f"n +{INDEX_ERROR:g}\n{far}",
+        "n told to\n+-",
+    ):
+        table.add_column(name, justify="right")
+    for cost in costs:
+        wide = cost.index_sigma
+        table.add_row(
+            f"{cost.offset * 1e3:g}",
+            _percent(cost.neglected[0, 0] / ranges[0]),
+            _percent(cost.neglected[-1, 0] / ranges[-1]),
+            _percent(cost.calibrated[0, 0] / ranges[0]),
+            _percent(cost.calibrated[-1, 0] / ranges[-1]),
+            _percent(cost.index_error[-1, 0] / ranges[-1]),
+            "not at all" if not wide < 0.1 else f"{wide:.1g}",
+        )
+    return table
+
+
+def centring_words(design: Design, costs: Sequence[OffsetCost], ranges: Sequence[float]) -> str:
+    """Return what the design's centring tolerance costs who does not calibrate the dome."""
+    off = min(costs, key=lambda one: abs(one.offset - design.centring))
+    shares = _percents(off.neglected, ranges), _percents(off.calibrated, ranges)
+    yaw = " and ".join(f"{angle:+.2f}" for angle in np.degrees(off.aside[:, 2]))
+    return (
+        f"A lens that sits {off.offset * 1e3:g} mm off its place, if nobody calibrates the dome: "
+        f"{shares[0]} of range, and {shares[1]} if the lasers are calibrated with the same "
+        f"mistake; as much to the side turns yaw by {yaw} degrees "
+        f"({' and '.join(f'{wall * 1e3:.0f}' for wall in ranges)} mm)."
+    )
+
+
+def _percents(errors: FloatArray, ranges: Sequence[float]) -> str:
+    shares = (_percent(e / wall) for e, wall in zip(errors[:, 0], ranges, strict=True))
+    return " and ".join(shares)
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100.0 * share:+.2f} %".replace("-0.00", "+0.00")
+
+
+def change_table(found: Sequence[Change]) -> Table:
+    """Return what changes would do, the most helpful first."""
+    table = _table("Changes, lasers tilted anew: errors grow by so many per cent", first="\nchange")
+    for name in ("\nall", "noise\nrange", "\nangle", "tolerances\nrange", "\nangle"):
+        table.add_column(name, justify="right")
+    for one in found:
+        values = (
+            one.score,
+            one.noise_range,
+            one.noise_angle,
+            one.systematic_range,
+            one.systematic_angle,
+        )
+        table.add_row(one.words, *(_change(value) for value in values))
+    return table
+
+
+def _change(share: float) -> str:
+    if not math.isfinite(share):
+        return "-"
+    percent = round(100.0 * (share - 1.0))
+    return f"{percent:+d}" if percent else "0"
+
+
+def findings(design: Design, told: Prediction) -> list[str]:
+    """Return what a table does not say: missing postures, stripes out of the picture, crossings."""
+    lines = []
+    if len(design.mounts) < 2:
+        lines.append("One laser draws one line: no posture; add a second.")
+    elif not told.valid.all():
+        seen = _interval(told.ranges, told.valid)
+        lines.append(f"There is a posture only at {seen} mm of the working range.")
+    for mount, visible in zip(design.mounts, told.visible, strict=True):
+        if not visible.all():
+            lines.append(_leaves(mount, told.ranges, visible))
+    names = [mount.name for mount in design.mounts]
+    pairs = [
+        f"{names[i]} and {names[j]} at {_interval(told.ranges, told.crossing[i, j])} mm"
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if told.crossing[i, j].any()
+    ]
+    if pairs:
+        lines.append(
+            f"Stripes cross in the picture: {'; '.join(pairs)}. The scanner leaves points near a "
+            "crossing out."
+        )
+    return lines
+
+
+def _leaves(mount: Mount, ranges: FloatArray, visible: BoolArray) -> str:
+    where = _interval(ranges, visible)
+    seen = f"is in the picture at {where} mm only" if visible.any() else "is never in the picture"
+    return f"Laser '{mount.name}' {seen}; where it is not, its points are missing."
+
+
+def _table(title: str, first: str = "", right: bool = False) -> Table:
+    table = Table(title=title, title_justify="left", box=None)
+    table.add_column(first, justify="right" if right else "left")
+    return table
+
+
+ERRORS_PNG, PICTURE_PNG = "errors.png", "picture.png"
+
+_DPI = 160
+_BLUE, _ORANGE, _DARK, _GREY = "#1f4fc8", "#d55e00", "#23272e", "#8a8f98"
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "grid.color": "#e4e6ea",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+}
+# What the camera's tolerances make changes little with range.
+_N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
+
+
+def draw_figures(design: Design, out: Path) -> list[Path]:
+    """Write `errors.png` and `picture.png`.
+
+    Parameters
+    ----------
+    design : Design
+        With its lasers tilted as they will be.
+    out : Path
+        Folder that exists.
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
+    """
+    from matplotlib import rc_context
+
+    written = []
+    with rc_context(_STYLE):
+        for name, draw in ((ERRORS_PNG, _errors), (PICTURE_PNG, _picture)):
+            draw(design).savefig(out / name, dpi=_DPI)
+            written.append(out / name)
+    return written
+
+
+def _errors(design: Design) -> "Figure":
+    """Range error in per cent, pitch and yaw in degrees, over range."""
+    ranges = np.geomspace(*design.rig.working_range, _N_RANGES)
+    told = predict(design, ranges)
+    few = np.geomspace(*design.rig.working_range, _N_CAMERA)
+    camera = together(camera_errors(design, few.tolist()))
+    camera = np.stack([np.interp(ranges, few, column) for column in camera.T], axis=-1)
+    systematic = np.hypot(told.systematic_total, camera)
+    figure = new_canvas(7.2, 2.9)
+    panels = figure.subplots(1, 3, sharex=True)
+    kinds = (
+        ("net, one frame", told.net, _ORANGE, "-"),
+        ("wall, one frame", told.wall, _BLUE, "-"),
+        ("tolerances", systematic, _DARK, "--"),
+    )
+    percent, degrees = 100.0 / ranges, np.full_like(ranges, 180.0 / np.pi)
+    goal = 100.0 * design.goals.range_share, np.degrees(design.goals.angle)
+    titles = ("range (%)", percent, goal[0]), ("pitch (deg)", degrees, goal[1])
+    for i, (axes, (title, unit, wanted)) in enumerate(
+        zip(panels, (*titles, ("yaw (deg)", degrees, goal[1])), strict=True)
+    ):
+        for name, sigma, colour, style in kinds:
+            axes.plot(ranges * 1e3, sigma[:, i] * unit, style, color=colour, label=name)
+        axes.axhline(wanted, color=_GREY, linewidth=0.8, linestyle=":", label="goal")
+        axes.set_yscale("log")
+        axes.set_title(f"one sigma of {title}", fontsize=9.0)
+        axes.set_xlabel("range (mm)")
+        axes.yaxis.set_major_formatter(_plain())
+        axes.grid(True, which="both")
+        axes.spines[["top", "right"]].set_visible(False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _plain() -> Any:
+    from matplotlib.ticker import FuncFormatter
+
+    return FuncFormatter(lambda value, _: f"{value:g}")
+
+
+def _picture(design: Design) -> "Figure":
+    """Draw the camera's picture with all stripes, coloured by range."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
+    width, height = design.rig.size_px
+    figure = new_canvas(7.2, 5.6 * height / width + 0.6)
+    axes = figure.subplots()
+    near, far = design.rig.working_range
+    norm, colours = LogNorm(near * 1e3, far * 1e3), colormaps["viridis_r"].resampled(256)
+    ranges = np.array(shown_ranges((near, far)))
+    for lines in _stripe_pixels(design, ranges):
+        for wall, pixels in zip(ranges, lines, strict=True):
+            axes.plot(*pixels.T, color=colours(norm(wall * 1e3)), linewidth=1.6)
+    _label_lasers(axes, design, ranges)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set_xlabel("x (px)")
+    axes.set_ylabel("y (px)")
+    axes.grid(False)
+    bar = figure.colorbar(ScalarMappable(norm, colours), ax=axes, aspect=30)
+    bar.set_ticks((ranges * 1e3).tolist(), labels=[f"{wall * 1e3:.0f}" for wall in ranges])
+    bar.minorticks_off()
+    bar.set_label("range of a wall square ahead (mm)")
+    return figure
+
+
+def _stripe_pixels(design: Design, ranges: FloatArray) -> FloatArray:
+    """Pixels (L, W, N, 2) along every laser's visible stripe; NaN where there is none."""
+    stripes = predict(design, ranges).stripes
+    share = np.linspace(0.0, 1.0, _N_ALONG)
+    begin, end = stripes.ends[..., :1], stripes.ends[..., 1:]
+    place = begin + share * (end - begin)
+    along = stripes.along[:, None, None, :]
+    points = stripes.centre[:, :, None, :] + place[..., None] * along
+    pixels, _ = design.rig.camera().project(points)
+    return pixels
+
+
+def _label_lasers(axes: "Axes", design: Design, ranges: FloatArray) -> None:
+    """Name every laser beside a place of its nearest stripe that is far from the others' labels."""
+    taken: list[FloatArray] = []
+    for mount, lines in zip(design.mounts, _stripe_pixels(design, ranges), strict=True):
+        seen = [line for line in lines if np.isfinite(line).all()]
+        if not seen:
+            continue
+        inner = seen[0][_N_ALONG // 5 : -_N_ALONG // 5]
+        room = [min((float(np.hypot(*(p - q))) for q in taken), default=0.0) for p in inner]
+        spot = inner[int(np.argmax(room))]
+        taken.append(spot)
+        axes.annotate(
+            mount.name,
+            spot,
+            ha="center",
+            va="center",
+            fontsize=8.0,
+            color=_DARK,
+            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": _GREY, "lw": 0.5},
+        )

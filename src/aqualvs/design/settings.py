@@ -1,0 +1,337 @@
+"""A design in SI units: the nominal rig, the lasers' mounts, and what may be off.
+
+A place for a line laser on the vehicle, and the sheet of light that leaves it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from aqualvs.errors import RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.camera import Camera, parameter_names
+from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.sheet import sheet_in
+from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, SharedError
+
+# A sheet this square to the forward axis draws no stripe on a wall ahead.
+_LEAST_ACROSS = 1e-3
+# Without a source of its own a laser of a rig is taken to sit this far before the dome's centre.
+_BESIDE_DOME = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mount:
+    """A line laser as it is screwed on.
+
+    Attributes
+    ----------
+    name : str
+        How tables call it.
+    position : (float, float, float)
+        Where the fan comes from, in `dome`, metres.
+    stripe : float
+        Direction of the stripe on a wall square ahead, in radians: 0 level, pi/2 upright,
+        counter-clockwise as the camera sees it.
+    tilt : float
+        How the sheet leans towards the forward axis through the dome's centre, in radians; negative
+        leans away.
+    fan : float
+        Full opening of the fan, in radians.
+    swing : float
+        Turn of the fan's middle within its sheet, along the stripe's direction, in radians.
+    free_tilt, free_stripe : bool
+        Whether the best angles are to be found, or these are given.
+    wavelength_nm : float or None
+        As `Laser.wavelength_nm`.
+    """
+
+    name: str
+    position: tuple[float, float, float]
+    stripe: float
+    tilt: float
+    fan: float
+    swing: float = 0.0
+    free_tilt: bool = True
+    free_stripe: bool = False
+    wavelength_nm: float | None = None
+
+    @property
+    def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Unit vectors in `dome`: along the stripe, across it away from the axis, along the beam.
+
+        A laser whose stripe would run through the axis has no side; upwards, or else to the left,
+        counts as away then.
+        """
+        along = np.array([math.cos(self.stripe), 0.0, math.sin(self.stripe)])
+        across = np.array([-along[2], 0.0, along[0]])
+        if float(across @ self.position) < 0.0:
+            across = -across
+        beam = math.cos(self.tilt) * np.array([0.0, 1.0, 0.0]) - math.sin(self.tilt) * across
+        return along, across, beam
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the dome's centre from the stripe's line through the mount, metres."""
+        return abs(float(self.axes[1] @ self.position))
+
+    @property
+    def plane(self) -> Plane:
+        """The sheet in `dome`."""
+        along, _, beam = self.axes
+        normal = np.array(
+            [-along[2] * beam[1], along[2] * beam[0] - along[0] * beam[2], along[0] * beam[1]]
+        )
+        return Plane(normal, float(normal @ self.position))
+
+    def laser(self) -> Laser:
+        """Return the laser as a rig has it."""
+        return Laser(self.name, self.plane, wavelength_nm=self.wavelength_nm)
+
+    def aimed_at(self, wall_range: float) -> "Mount":
+        """Return the mount with its fan swung so that its middle is abreast of the forward axis."""
+        along, _, beam = self.axes
+        way = (wall_range - self.position[1]) / float(beam[1])
+        return replace(self, swing=math.atan2(-float(along @ self.position), way))
+
+
+def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, ...]:
+    """Return mounts evenly round the forward axis, their stripes square to the way to it.
+
+    The first is below. Two are put below and beside, because opposite ones draw parallel stripes.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    baseline : float
+        Distance from the forward axis, metres.
+    back : float
+        How far they sit behind the dome's centre, metres.
+    fan : float
+        Full opening, radians.
+    """
+    step = math.tau / count if count > 2 else math.pi / 2
+    mounts = []
+    for i in range(count):
+        round_axis = -math.pi / 2 - i * step
+        place = (baseline * math.cos(round_axis), -back, baseline * math.sin(round_axis))
+        mounts.append(
+            Mount(
+                name=_place_name(round_axis, i),
+                position=place,
+                stripe=_half_turn(round_axis + math.pi / 2),
+                tilt=0.0,
+                fan=fan,
+            )
+        )
+    return tuple(mounts)
+
+
+def tangential(position: Sequence[float]) -> float:
+    """Return the direction of a stripe that is square to the way from the axis to a mount."""
+    if math.hypot(position[0], position[2]) == 0.0:
+        return 0.0
+    return _half_turn(math.atan2(position[2], position[0]) + math.pi / 2)
+
+
+def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
+    """Return where a laser of a rig would sit: what its plane leaves open is set to the usual.
+
+    Parameters
+    ----------
+    laser : Laser
+        Behind a window the plane that fits its light best counts.
+    rig : Rig
+        Its rig.
+    fan : float
+        Full opening, radians.
+
+    Raises
+    ------
+    RigError
+        If the laser's sheet is square to the view, so that it draws no stripe.
+    """
+    sheet = sheet_in(laser, rig.n_air, rig.n_water)
+    plane = sheet.best_plane(rig.camera(), rig.working_range)
+    normal = plane.normal
+    side = np.array([normal[0], 0.0, normal[2]])
+    length = float(np.linalg.norm(side))
+    if length < _LEAST_ACROSS:
+        raise RigError(
+            f"laser {laser.name}: its plane is square to the forward axis, so it draws no stripe "
+            "on a wall ahead; check its normal"
+        )
+    side /= length
+    # Beside the dome: the plane's point at this height ahead that is nearest to the axis.
+    if laser.window is None:
+        position = side * (plane.offset - normal[1] * _BESIDE_DOME) / length
+        position[1] = _BESIDE_DOME
+    else:
+        source = np.array(sheet.source)
+        position = source - float(plane.signed_distance(source)) * normal
+    stripe = _half_turn(math.atan2(-side[0], side[2]))
+    mount = Mount(
+        name=laser.name,
+        position=(float(position[0]), float(position[1]), float(position[2])),
+        stripe=stripe,
+        tilt=0.0,
+        fan=fan,
+        wavelength_nm=laser.wavelength_nm,
+    )
+    beam = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
+    lean = -float(beam @ mount.axes[1])
+    return replace(mount, tilt=math.atan2(lean, float(beam[1])))
+
+
+def _half_turn(angle: float) -> float:
+    """Return the same line's direction between 0 and pi; a rounding below pi is 0."""
+    turned = angle % math.pi
+    return 0.0 if math.pi - turned < 1e-12 else turned
+
+
+def _place_name(round_axis: float, i: int) -> str:
+    """Return a word for a place round the axis."""
+    x, z = math.cos(round_axis), math.sin(round_axis)
+    upright = "lower" if z < -0.4 else "upper" if z > 0.4 else ""
+    level = "left" if x < -0.4 else "right" if x > 0.4 else ""
+    return "_".join(word for word in (upright, level) if word) or f"laser_{i + 1}"
+
+
+N_WALLS = 9
+"""Ranges at which a design is judged, evenly spaced in their logarithm."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """Standard deviations of what the scanner finds in one frame, in pixels.
+
+    Attributes
+    ----------
+    point : float
+        Of a point of a stripe on a wall, on its search line.
+    strand : float
+        Of the light on one strand of a net.
+    wall, net : SharedError
+        Of what a whole stripe shares.
+    """
+
+    point: float = 0.3
+    strand: float = 0.15
+    wall: SharedError = SOLID_ERROR
+    net: SharedError = MESH_ERROR
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tolerances:
+    """One sigma of what calibration leaves open, in metres, radians and shares.
+
+    Attributes
+    ----------
+    lens : float
+        Of the lens's place, along each axis.
+    rotation : float
+        Of the camera's rotation, about each axis.
+    focal : float
+        Of the focal length, as a share of it.
+    dome : float
+        Of the dome's inner radius and of its thickness.
+    n_water : float
+        Of the water's index.
+    laser_angle, laser_offset : float
+        Of each laser's plane.
+    """
+
+    lens: float = 0.03e-3
+    rotation: float = math.radians(0.01)
+    focal: float = 1e-4
+    dome: float = 0.05e-3
+    n_water: float = 3e-4
+    laser_angle: float = math.radians(0.005)
+    laser_offset: float = 0.07e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetFacts:
+    """A net as its maker describes it: length of a bar and diameter of its twine, in metres."""
+
+    bar: float
+    twine: float
+
+    @property
+    def strands_per_metre(self) -> float:
+        """How often a stripe meets a strand: of two families, the mean over all directions."""
+        return 4.0 / math.pi / self.bar
+
+    @property
+    def lit_share(self) -> float:
+        """Share of a stripe that falls on twine: a square mesh's solidity."""
+        share = min(self.twine / self.bar, 1.0)
+        return 2.0 * share - share**2
+
+
+@dataclass(frozen=True, slots=True)
+class Goals:
+    """Errors that count as equally bad: a share of the range, and an angle in radians."""
+
+    range_share: float = 0.005
+    angle: float = math.radians(0.5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Design:
+    """What is to be judged.
+
+    Attributes
+    ----------
+    rig : Rig
+        Nominal camera, dome, water and working range. Its lasers do not count.
+    mounts : tuple of Mount
+    centring : float
+        How far the lens may be off its place before a calibration, metres.
+    noise : Noise
+    tolerances : Tolerances
+    net : NetFacts
+    goals : Goals
+    avoid_crossings : bool
+        Whether stripes that cross in the picture count against a design.
+    """
+
+    rig: Rig
+    mounts: tuple[Mount, ...]
+    centring: float = 1e-3
+    noise: Noise = field(default_factory=Noise)
+    tolerances: Tolerances = field(default_factory=Tolerances)
+    net: NetFacts = field(default_factory=lambda: NetFacts(bar=15e-3, twine=2.5e-3))
+    goals: Goals = field(default_factory=Goals)
+    avoid_crossings: bool = True
+
+    @property
+    def ranges(self) -> FloatArray:
+        """Walls at which the design is judged, metres, shape (N_WALLS,)."""
+        return np.geomspace(*self.rig.working_range, N_WALLS)
+
+    def with_mounts(self, mounts: Sequence[Mount]) -> "Design":
+        """Return the design with other mounts."""
+        return replace(self, mounts=tuple(mounts))
+
+    def nominal_rig(self) -> Rig:
+        """Return the rig with the lasers of the mounts."""
+        return replace(self.rig, lasers=tuple(mount.laser() for mount in self.mounts))
+
+
+def index_step(camera: Camera, tolerances: Tolerances) -> FloatArray:
+    """Return a step of one sigma of the water's index, in the camera's parameters (P, G).
+
+    Of all that stripes share only the water changes after the lasers have been calibrated. G is 1,
+    or 0 for a bare lens, to which the water does not matter.
+    """
+    names = parameter_names(camera)
+    if "n_water" not in names:
+        return np.zeros((len(names), 0))
+    step = np.zeros((len(names), 1))
+    step[names.index("n_water")] = tolerances.n_water
+    return step

@@ -1,0 +1,297 @@
+"""What a stripe on a wall ahead tells about the wall's plane, for many sheets and ranges at once.
+
+A wall square ahead is m·X = 1 with m = (0, 1/range, 0). The scanner fits m by least squares, each
+point weighed by what a pixel's error makes of m·X. Of a stripe this needs one matrix,
+sum w X X', and for every error that its points share a vector, sum w X d(m·X)/d(error). Both add
+up over lasers, so that any combination of sheets is told from the sums of their parts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.design.settings import Mount
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.optics.camera import Camera
+
+OWN_ERRORS = ("shift", "tilt", "laser_tilt_1", "laser_tilt_2", "laser_offset")
+"""Errors that all points of one stripe share: in pixels, radians, metres.
+
+The laser's tilts turn the sheet's normal towards the stripe and towards the beam.
+"""
+
+# Points that look for the ends of a stripe, and those at which it is then summed up (Gauss).
+_N_SEARCH, _N_PASSES, _N_SUM = 33, 2, 24
+# A fan wider than this to either side of the beam meets no wall nearby.
+_WIDEST = np.deg2rad(80.0)
+# As the scanner: wider pictures are read in lines of two pixels.
+_PIXELS_PER_LINE_FROM = 1280
+
+
+@dataclass(frozen=True, slots=True)
+class Stripes:
+    """Sums over the visible part of the stripes of K sheets on W walls.
+
+    Attributes
+    ----------
+    lines : array, shape (K, W)
+        Search lines that see the stripe, one point each; 0 where it is out of the picture.
+    length : array, shape (K, W)
+        Visible length on the wall, metres.
+    middle : array, shape (K, W, 2)
+        Pixel of the visible part's middle, in `image`; NaN where there is none.
+    matrix : array, shape (K, W, 3, 3)
+        sum w X X', each point weighed by its variance for an error of 1 px.
+    own : array, shape (K, W, 5, 3)
+        sum w X d(m·X)/d(error) for `OWN_ERRORS`.
+    common : array, shape (K, W, G, 3)
+        The same for errors that all stripes share.
+    centre, along : array, shapes (K, W, 3) and (K, 3)
+        The stripe's line on the wall, in `dome`.
+    ends : array, shape (K, W, 2)
+        Where along it the visible part begins and ends, in metres; NaN where there is none.
+    """
+
+    lines: FloatArray
+    length: FloatArray
+    middle: FloatArray
+    matrix: FloatArray
+    own: FloatArray
+    common: FloatArray
+    centre: FloatArray
+    along: FloatArray
+    ends: FloatArray
+
+    def take(self, rows: Sequence[int]) -> "Stripes":
+        """Return the named rows of K."""
+        picked = list(rows)
+        return Stripes(*(getattr(self, name)[picked] for name in self.__dataclass_fields__))
+
+    def joined(self, other: "Stripes") -> "Stripes":
+        """Return these rows followed by another's."""
+        names = self.__dataclass_fields__
+        return Stripes(*(np.concatenate([getattr(s, n) for s in (self, other)]) for n in names))
+
+
+def see_stripes(
+    camera: Camera,
+    mounts: Sequence[Mount],
+    ranges: FloatArray,
+    common: FloatArray,
+    margin: float = 0.0,
+) -> Stripes:
+    """Sum up what a camera sees of the stripes of K mounts on walls square ahead.
+
+    Parameters
+    ----------
+    camera : Camera
+    mounts : sequence of Mount
+    ranges : array, shape (W,)
+        Metres.
+    common : array, shape (P, G)
+        G errors of the camera as steps of its parameters, see `parameter_names`.
+    margin : float
+        Pixels at the picture's border that do not count.
+    """
+    axes = [mount.axes for mount in mounts]
+    along, beam = (np.array([one[i] for one in axes]).reshape(-1, 3) for i in (0, 2))
+    position = np.array([mount.position for mount in mounts]).reshape(-1, 3)
+    way = (ranges[None, :] - position[:, 1, None]) / beam[:, 1, None]
+    centre = position[:, None] + way[..., None] * beam[:, None]
+    reach = np.array([_reach(mount) for mount in mounts]).reshape(-1, 2)
+    fan = np.where((way > 0.0)[..., None], way[..., None] * reach[:, None], np.nan)
+    ends = _visible_ends(camera, centre, along, fan, margin)
+    return _summed(camera, _Lines(centre, along, beam, ends), ranges, common)
+
+
+@dataclass(frozen=True, slots=True)
+class _Lines:
+    """Stripes on walls: as in `Stripes`, and the beams (K, 3)."""
+
+    centre: FloatArray
+    along: FloatArray
+    beam: FloatArray
+    ends: FloatArray
+
+
+def line_pixels(camera: Camera) -> int:
+    """Return how many pixels wide the scanner's search lines are."""
+    return 2 if camera.size_px[0] >= _PIXELS_PER_LINE_FROM else 1
+
+
+def _reach(mount: Mount) -> tuple[float, float]:
+    low, high = mount.swing - 0.5 * mount.fan, mount.swing + 0.5 * mount.fan
+    return float(np.tan(max(low, -_WIDEST))), float(np.tan(min(high, _WIDEST)))
+
+
+def _visible_ends(
+    camera: Camera, centre: FloatArray, along: FloatArray, fan: FloatArray, margin: float
+) -> FloatArray:
+    """Where (K, W, 2) along the stripe its visible part begins and ends; NaN where none."""
+    share = np.linspace(0.0, 1.0, _N_SEARCH)
+    # Once over the whole fan, which may be much wider than the picture; then closer.
+    for _ in range(_N_PASSES):
+        place = fan[..., :1] + share * (fan[..., 1:] - fan[..., :1])
+        inside = _depth_in_picture(camera, _points(centre, along, place), margin)
+        seen = inside > 0.0
+        first = np.argmax(seen, axis=-1)
+        last = _N_SEARCH - 1 - np.argmax(seen[..., ::-1], axis=-1)
+        ends = np.stack([_at(place, first - 1), _at(place, last + 1)], axis=-1)
+        fan = np.where(seen.any(axis=-1, keepdims=True), ends, fan)
+    begin = _edge(place, inside, first, -1)
+    end = _edge(place, inside, last, 1)
+    some: BoolArray = np.asarray(seen.any(axis=-1) & (end > begin))
+    return np.where(some[..., None], np.stack([begin, end], axis=-1), np.nan)
+
+
+def _points(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatArray:
+    points: FloatArray = centre[..., None, :] + place[..., None] * along[:, None, None, :]
+    return points
+
+
+def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> FloatArray:
+    """Pixels from the picture's border, negative outside; NaN where nothing is seen."""
+    pixels, valid = camera.project(points)
+    width, height = camera.size_px
+    x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
+    free = 2.0 * margin
+    depth = np.minimum(np.minimum(x, width - free - x), np.minimum(y, height - free - y))
+    return np.where(valid, depth, np.nan)
+
+
+def _at(values: FloatArray, i: IntArray) -> FloatArray:
+    """Values (K, W, S) at places (K, W), those beyond an end being at the end."""
+    row = np.clip(i, 0, values.shape[-1] - 1)[..., None]
+    found: FloatArray = np.take_along_axis(values, row, -1)[..., 0]
+    return found
+
+
+def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> FloatArray:
+    """Where the border is crossed between the outermost point inside and the next."""
+    here, there = _at(inside, i), _at(inside, i + step)
+    at, to = _at(place, i), _at(place, i + step)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = here / (here - there)
+    # Where the lens model ends, or the fan, nothing tells how much farther the stripe reaches.
+    share = np.where((there <= 0.0) & np.isfinite(share), share, 0.0)
+    edge: FloatArray = at + share * (to - at)
+    return edge
+
+
+def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray) -> Stripes:
+    centre, along, ends = line.centre, line.along, line.ends
+    node, weight = np.polynomial.legendre.leggauss(_N_SUM)
+    half = 0.5 * (ends[..., 1:] - ends[..., :1])
+    points = _points(centre, along, 0.5 * ends.sum(axis=-1, keepdims=True) + half * node)
+    pixels, valid, by_point, by_parameter = camera.project_with_parameter_jacobian(points)
+    seen: BoolArray = np.asarray(valid.all(axis=-1))
+    path = np.einsum("kwsij,kj->kwsi", by_point, along)
+    is_row = _along_x(path)
+    lines = np.abs(np.where(is_row, path[..., 1], path[..., 0])) * (weight * half)
+    lines = lines / line_pixels(camera)
+    normal = np.cross(along, line.beam)
+    sensitivity = _Sensitivity.of(normal, ranges, by_point, by_parameter @ common)
+    per_px = np.where(is_row, sensitivity.by_x, sensitivity.by_y)
+    place = _place(camera, pixels, is_row)
+    # A stripe without depth (its sheet runs through the lens) tells nothing.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        voice = np.where(seen[..., None] & (per_px != 0.0), lines / per_px**2, 0.0)
+    heard = voice[..., None] * np.where(np.isfinite(points), points, 0.0)
+    by_error = _own(sensitivity, points, line, per_px, place)
+    safe = [np.where(np.isfinite(a), a, 0.0) for a in (points, by_error, sensitivity.by_common)]
+    middle = np.where(seen[..., None], pixels[..., _N_SUM // 2, :], np.nan)
+    return Stripes(
+        lines=np.where(seen, lines.sum(axis=-1), 0.0),
+        length=np.where(seen, 2.0 * half[..., 0], 0.0),
+        middle=middle,
+        matrix=np.einsum("kwsi,kwsj->kwij", heard, safe[0]),
+        own=np.einsum("kwsi,kwse->kwei", heard, safe[1]),
+        common=np.einsum("kwsi,kwsg->kwgi", heard, safe[2]),
+        centre=centre,
+        along=along,
+        ends=np.where(seen[..., None], ends, np.nan),
+    )
+
+
+def _along_x(path: FloatArray) -> BoolArray:
+    """Whether the scanner looks for the stripe along rows: it runs rather upright (K, W, 1)."""
+    x, y = np.abs(path[..., 0]).mean(axis=-1), np.abs(path[..., 1]).mean(axis=-1)
+    upright: BoolArray = (y > x)[..., None]
+    return upright
+
+
+def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
+    """Place along the stripe, from -1 at one border of the picture to 1 at the other."""
+    width, height = camera.size_px
+    x, y = 2.0 * pixels[..., 0] / (width - 1) - 1.0, 2.0 * pixels[..., 1] / (height - 1) - 1.0
+    place: FloatArray = np.where(is_row, y, x)
+    return place
+
+
+@dataclass(frozen=True, slots=True)
+class _Sensitivity:
+    """What moves m·X of the points (K, W, S) that fixed pixels triangulate to.
+
+    Attributes
+    ----------
+    by_x, by_y : array, shape (K, W, S)
+        By the pixel, in 1/px.
+    by_normal : array, shape (K, W, S)
+        By a step of the sheet along its normal, in 1/m.
+    by_common : array, shape (K, W, S, G)
+        By the camera's errors.
+    """
+
+    by_x: FloatArray
+    by_y: FloatArray
+    by_normal: FloatArray
+    by_common: FloatArray
+
+    @classmethod
+    def of(
+        cls, normals: FloatArray, ranges: FloatArray, by_point: FloatArray, steps: FloatArray
+    ) -> "_Sensitivity":
+        """Solve [J; n] dX = (du, dv, dn) for m·dX, the rows of the inverse by cross products."""
+        row_x, row_y = by_point[..., 0, :], by_point[..., 1, :]
+        normal = normals[:, None, None, :]
+        # Only the forward part of dX changes m·X = y / range.
+        x_n, n_y = _cross_y(row_y, normal), _cross_y(normal, row_x)
+        forward = _cross_y(row_x, row_y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            volume = _volume(normal, row_x, row_y) * ranges[None, :, None]
+            by_x, by_y, by_normal = x_n / volume, n_y / volume, forward / volume
+            # At a fixed pixel a step of the camera acts as the opposite step of the pixel.
+            by_common = -(by_x[..., None] * steps[..., 0, :] + by_y[..., None] * steps[..., 1, :])
+        return cls(by_x, by_y, by_normal, by_common)
+
+
+def _volume(n: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    volume: FloatArray = (
+        n[..., 0] * (a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1])
+        + n[..., 1] * _cross_y(a, b)
+        + n[..., 2] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+    )
+    return volume
+
+
+def _cross_y(a: FloatArray, b: FloatArray) -> FloatArray:
+    y: FloatArray = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    return y
+
+
+def _own(
+    sensitivity: _Sensitivity,
+    points: FloatArray,
+    line: _Lines,
+    per_px: FloatArray,
+    place: FloatArray,
+) -> FloatArray:
+    """d(m·X)/d(error) for `OWN_ERRORS`, shape (K, W, S, 5)."""
+    # A normal that turns towards t moves the sheet by -t·X along the old normal.
+    turned = -np.stack(
+        [np.einsum("kwsi,ki->kws", points, t) for t in (line.along, line.beam)], axis=-1
+    )
+    by_normal = sensitivity.by_normal[..., None]
+    pixel = np.stack([per_px, per_px * place], axis=-1)
+    return np.concatenate([pixel, turned * by_normal, by_normal], axis=-1)

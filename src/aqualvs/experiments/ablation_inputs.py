@@ -1,0 +1,307 @@
+"""What a wrong refractive index and a wrong place of the lens cost.
+
+What video coding costs: H.264 at several qualities against uncompressed pictures.
+
+What the refracted-sheet model is worth where a laser sits behind a tilted window.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.growth_and_sun import scene
+from aqualvs.experiments.laboratory import Dive, Laboratory, Variant, drawn, findings, series
+from aqualvs.experiments.tank import wall_dive
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.rig import Laser, Rig, Window
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, new_figure
+from aqualvs.simulation.lasers import LaserSource, default_sources
+from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.simulation.video import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+_CRFS = (20, 26, 32, 38)
+_DEFAULT = 20
+
+
+def _run_video(laboratory: Laboratory) -> Outcome:
+    # The clear net of the growth experiment, whose H.264 at the default quality is there already.
+    course = scene("clear")
+    raw = laboratory.dive(course, recording=Recording(codec="lossless"))
+    variants = [_variant(laboratory, raw, "uncompressed")]
+    for crf in _CRFS:
+        dive = laboratory.dive(course, recording=Recording(crf=crf))
+        variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == _DEFAULT))
+    first, last = variants[1], variants[-1]
+    return Outcome(
+        sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
+        f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} it is "
+        f"{last.rms[0]:.3f} %.",
+        findings=findings(variants),
+        pictures=(
+            Picture(
+                name="ablation_video",
+                caption="Root mean square errors on a clear net from the same pictures, "
+                "uncompressed and coded ever more coarsely.",
+                figure=drawn(variants),
+            ),
+        ),
+        series=(series("ablation_video", variants),),
+    )
+
+
+def _variant(laboratory: Laboratory, dive: Dive, name: str, ours: bool = False) -> Variant:
+    frames = dive.scenario.n_frames
+    rate = 8e-6 * dive.video.stat().st_size * dive.scenario.fps / frames
+    named = Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),))
+    return replace(named, ours=ours)
+
+
+VIDEO = Experiment(
+    name="video",
+    title="What H.264 costs",
+    paper="",
+    about="The same pictures of a clear net, uncompressed and as H.264 at four qualities.",
+    run=_run_video,
+)
+
+
+_TILTS_DEG = (-20.0, 12.0, 25.0)
+"""Of the windows of the three lasers, against square to the beam, across the sheet."""
+
+_BEFORE_SOURCE = 0.02
+_GRID_PX = 24
+
+
+def before_wall() -> Scenario:
+    """Return the dive: a wall from near to far, turned a little to and fro."""
+    facts = {
+        "duration_s": 0.8,
+        "motion": {
+            "range_mm": [380, 800],
+            "pitch_deg": [-6, 6],
+            "yaw_deg": {"values": [0], "sway": 8, "period_s": 0.6},
+        },
+        "walls": [{}],
+    }
+    return parse_scenario(facts, "sheets", "sheets")
+
+
+def _run_sheets(laboratory: Laboratory) -> Outcome:
+    bent = _behind_windows(laboratory.rig)
+    flat = _with_best_planes(bent)
+    dive = laboratory.dive(before_wall(), bent)
+    variants = [
+        Variant("refracted sheets", (laboratory.measure(dive),), ours=True),
+        Variant("planes that fit them best", (laboratory.measure(dive, rig=flat),)),
+    ]
+    off = _off_plane_mm(bent)
+    return Outcome(
+        sentence=f"Behind windows tilted by 12 to 25 degrees the light leaves its best plane by up "
+        f"to {max(off):.1f} mm; taking it for planes costs {variants[1].rms[0]:.2f} % of the "
+        f"range instead of {variants[0].rms[0]:.3f} %.",
+        findings=(
+            *findings(variants),
+            *(
+                Finding(
+                    what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its "
+                    "best plane in the working range (mm)",
+                    paper="",
+                    ours=f"{mm:.1f}",
+                )
+                for tilt, mm in zip(_TILTS_DEG, off, strict=True)
+            ),
+        ),
+        pictures=(
+            Picture(
+                name="ablation_sheets",
+                caption="Root mean square errors before a wall with lasers behind tilted windows.",
+                figure=drawn(variants),
+            ),
+        ),
+        series=(series("ablation_sheets", variants),),
+        notes=("The planes are the best that any calibration could find for such sheets.",),
+    )
+
+
+def _behind_windows(rig: Rig) -> Rig:
+    sources = default_sources(rig)
+    lasers = tuple(
+        _behind_window(laser, source, np.deg2rad(tilt))
+        for laser, source, tilt in zip(rig.lasers, sources, _TILTS_DEG, strict=True)
+    )
+    return replace(rig, name="windows", lasers=lasers)
+
+
+def _behind_window(laser: Laser, source: LaserSource, tilt: float) -> Laser:
+    normal = source.direction + np.tan(tilt) * laser.plane.normal
+    normal /= np.linalg.norm(normal)
+    face = Plane(normal, float(normal @ source.position) + _BEFORE_SOURCE)
+    return replace(laser, window=Window(face, source.position))
+
+
+def _with_best_planes(rig: Rig) -> Rig:
+    camera = rig.camera()
+    lasers = tuple(
+        replace(laser, plane=sheet.best_plane(camera, rig.working_range), window=None)
+        for laser, sheet in zip(rig.lasers, sheets_of(rig), strict=True)
+    )
+    return replace(rig, lasers=lasers)
+
+
+def _off_plane_mm(rig: Rig) -> list[float]:
+    """Return for each laser how far what the camera sees of its sheet leaves its best plane."""
+    camera, (near, far) = rig.camera(), rig.working_range
+    width, height = rig.size_px
+    x, y = np.meshgrid(np.arange(0.0, width, _GRID_PX), np.arange(0.0, height, _GRID_PX))
+    rays = camera.rays(np.stack([x, y], axis=-1))
+    found = []
+    for sheet in sheets_of(rig):
+        points, valid = sheet.intersect(rays)
+        distance = np.linalg.norm(points, axis=-1)
+        here = points[valid & (distance >= near) & (distance <= far)]
+        plane = sheet.best_plane(camera, rig.working_range)
+        found.append(1e3 * float(np.abs(plane.signed_distance(here)).max()))
+    return found
+
+
+SHEETS = Experiment(
+    name="sheets",
+    title="Why refracted laser sheets",
+    paper="",
+    about="The rig with each laser behind a flat window that is tilted against its beam; the wall "
+    "measured with the refracted-sheet model and with the planes of the paper's Eq. 19.",
+    run=_run_sheets,
+)
+
+
+_INDEX_STEPS = (-0.010, -0.005, 0.0, 0.005, 0.010)
+# Beyond this the stripes of this strongly decentred lens no longer share a plane.
+_LENS_STEPS_MM = (-0.5, -0.25, 0.0, 0.25, 0.5)
+_AXES = ("right", "forward", "up")
+_COLOURS = (ORANGE, BLUE, GREEN)
+_WATERS = 0.007
+"""From fresh to sea water (S = 35): what one who never measures the index may be off by."""
+
+
+def _run_beliefs(laboratory: Laboratory) -> Outcome:
+    dive = wall_dive(laboratory)
+    index = np.array([_worst(laboratory, dive, _with_index(dive.rig, d)) for d in _INDEX_STEPS])
+    lens = np.array(
+        [
+            [_worst(laboratory, dive, _with_lens(dive.rig, axis, mm)) for mm in _LENS_STEPS_MM]
+            for axis in range(3)
+        ]
+    )
+    per_index = _slope(_INDEX_STEPS, index) * _WATERS
+    per_mm = np.array([_slope(_LENS_STEPS_MM, row) for row in lens])
+    return Outcome(
+        sentence=f"Sea water taken for fresh costs {per_index:.2f} % of the range through this "
+        f"dome; a lens believed 1 mm from its place costs up to {per_mm.max():.1f} %.",
+        findings=(
+            Finding(
+                what=f"range error for an index wrong by {_WATERS} (%)",
+                paper="",
+                ours=f"{per_index:.2f}",
+            ),
+            *(
+                Finding(
+                    what=f"range error for each mm that the lens is believed too far {name} (%)",
+                    paper="",
+                    ours=f"{cost:.2f}",
+                )
+                for name, cost in zip(_AXES, per_mm, strict=True)
+            ),
+        ),
+        pictures=(
+            Picture(
+                name="ablation_beliefs",
+                caption="Largest range error before the wall at the paper's four distances when "
+                "the scanner believes another index of the water (left) or another place of the "
+                "lens in the dome (right).",
+                figure=_drawn(index, lens),
+            ),
+        ),
+        series=(
+            Series(
+                name="ablation_index",
+                columns={"index_error": np.array(_INDEX_STEPS), "range_error_percent": index},
+            ),
+            Series(
+                name="ablation_lens",
+                columns={
+                    "lens_error_mm": np.array(_LENS_STEPS_MM),
+                    **{
+                        f"{name}_range_error_percent": row
+                        for name, row in zip(_AXES, lens, strict=True)
+                    },
+                },
+            ),
+        ),
+        notes=(
+            "The laser planes stay those of the true rig. Lasers that were calibrated with the "
+            "wrong belief would take up a part of the error near the places of calibration.",
+            "Where a point is missing, the lasers' points no longer shared a plane: the posture "
+            "was refused.",
+        ),
+    )
+
+
+def _with_index(rig: Rig, step: float) -> Rig:
+    return rig.in_water(rig.n_water + step)
+
+
+def _with_lens(rig: Rig, axis: int, step_mm: float) -> Rig:
+    place = rig.dome_from_cam.translation.copy()
+    place[axis] += 1e-3 * step_mm
+    return replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, place))
+
+
+def _worst(laboratory: Laboratory, dive: Dive, rig: Rig) -> float:
+    """Return the range error of the place where it is largest, in percent, with its sign."""
+    percent = laboratory.measure(dive, rig=rig).range_percent
+    found = percent[np.isfinite(percent)]
+    return float(found[np.argmax(np.abs(found))]) if len(found) else np.nan
+
+
+def _slope(steps: Sequence[float], percent: FloatArray) -> float:
+    """Return the cost per step; where no plane was found any more there is none to be told."""
+    told = np.isfinite(percent)
+    return float(abs(np.polyfit(np.array(steps)[told], percent[told], 1)[0]))
+
+
+def _drawn(index: FloatArray, lens: FloatArray) -> "Figure":
+    from matplotlib import rc_context
+
+    with rc_context(dict(STYLE)):
+        figure = new_figure(2.7)
+        left, right = figure.subplots(1, 2)
+        left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
+        left.set_xlabel("error of the index believed")
+        left.set_ylabel("error of the range (%)")
+        for row, name, colour in zip(lens, _AXES, _COLOURS, strict=True):
+            right.plot(_LENS_STEPS_MM, row, ".-", color=colour, label=name)
+        right.set_xlabel("error of the lens's place believed (mm)")
+        right.legend(loc="best")
+        for axes in (left, right):
+            axes.axhline(0.0, color=GREY, linewidth=0.7)
+    return figure
+
+
+BELIEFS = Experiment(
+    name="beliefs",
+    title="What wrong beliefs cost",
+    paper="",
+    about="The wall at the paper's four distances, measured with the true rig but for one "
+    "parameter: the index of the water, or the place of the lens in the dome.",
+    run=_run_beliefs,
+)

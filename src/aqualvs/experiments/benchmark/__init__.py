@@ -1,0 +1,1 @@
+"""The public benchmark set and the scores of systems on it."""

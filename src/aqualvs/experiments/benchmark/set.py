@@ -1,0 +1,584 @@
+"""A benchmark set on disk: what its dives are, and the truth of their frames.
+
+What a benchmark set says to whoever opens its folder.
+
+`aqualvs benchmark`: render the public benchmark set, or a part of it.
+
+What a system answered: plain CSV, frame by frame.
+"""
+
+import csv
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from aqualvs import __version__
+from aqualvs.errors import OptionError, SourceError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.results.files import Claim, writing
+from aqualvs.simulation.benchmark import (
+    BENCHMARK_NAME,
+    CONTRAST_LIMIT,
+    LEVELS,
+    N_FRAMES,
+    VISIBLE_LIMIT,
+    BenchmarkDive,
+    benchmark_checksum,
+    benchmark_dives,
+    benchmark_rig,
+    render_benchmark_dive,
+)
+from aqualvs.simulation.render import Renderer
+from aqualvs.special_files import refuse_special
+from aqualvs.terminal import progress
+from aqualvs.yamlfile import read_yaml
+
+README = """\
+# Range and orientation from laser stripes under water: a benchmark
+
+A camera behind a small dome looks at a net or a wall; three green line lasers beside it draw
+stripes. For every frame: how far away is the target, and how is it turned? The pictures are
+rendered, so the truth is exact.
+
+## What is here
+
+- `benchmark.yaml`: name and checksum of the set, its dives and their levels of difficulty. `whole:
+  false` means that this is a part of the set, whose scores stand for themselves.
+- `DIVE/dive.mp4`: the video, H.264. Single pictures: `ffmpeg -i dive.mp4 frame_%04d.png` (ffmpeg
+  counts from 1; frames here count from 0).
+- `DIVE/rig.yaml`: camera, dome, water and lasers, the same for all dives. Nothing has to be
+  calibrated.
+- `DIVE/target.yaml`: what may be known of the target beforehand: net or wall, and the net's
+  mesh. Say if your system uses it; aqualvs itself does not.
+- `DIVE/truth.csv`: the truth, for scoring. A system must not read it.
+
+Levels: clear, turbid, sun, fouled, folded, crowded; and empty, where there is nothing to measure.
+The dives of a course (near, far, swing, wall) move alike on every level, and before the same
+target, but for what the level does to it.
+
+## Frames of reference and what is asked for
+
+`dome`: origin in the dome's centre, x right, y forward, z up; metres. The target is the plane
+n . X = d with |n| = 1 and d > 0.
+
+- range = d, the distance of the dome's centre from the plane
+- pitch = atan2(n_z, n_y), positive when the plane's far normal points up
+- yaw = atan2(n_x, n_y), positive when it points to the right
+
+The plane meant is the one through the stripe points on the target that the picture truly shows
+(least squares). On a net they lie on the front of its twine.
+
+## The rig: how a pixel becomes a ray
+
+`camera` is a pinhole with lens distortion k1 k2 p1 p2 as in OpenCV (`cv2.undistortPoints`); the
+centre of the top left pixel is (0, 0); camera axes x right, y down, z forward. A direction
+(x, y, z) of the camera is (x, z, -y) in `dome`, then turned by the rotation vector `rotation_deg`
+(axis times angle). `position_mm` is the lens in `dome`: it is NOT in the dome's centre, so rays
+bend.
+
+The dome is two spheres around the origin, of radius `inner_radius_mm` and `inner_radius_mm +
+thickness_mm`. Follow the ray from the lens to the inner sphere, refract it there from `n_air` to
+`n_acrylic`, go on to the outer sphere, and refract it from `n_acrylic` to the water's index
+(Snell's law in three dimensions). To leave this out costs several percent of the range.
+
+A laser lights the plane normal . X = offset_mm, in `dome` (normals there are made units first;
+offsets belong to the unit normal). Where a ray in the water meets a laser's plane is a point of the
+target.
+
+## What to write
+
+One CSV for every dive, `RESULTS/DIVE.csv` (or all in one file with a further column `dive`):
+
+    frame,range_m,pitch_deg,yaw_deg
+    0,0.3131,6.42,-9.87
+    1,0.3204,6.31,-9.02
+
+Frames without an answer are left out, or have `valid` 0. Columns that may be added, in any order:
+
+- `valid`: 1 or 0
+- `sigma_range_m`, `sigma_pitch_deg`, `sigma_yaw_deg`: the standard deviations that you claim
+- `range_mm` and `sigma_range_mm` in place of the metres
+
+## Scores
+
+    pip install aqualvs
+    aqualvs score mine=RESULTS other=OTHER_RESULTS --truth . -o scores
+
+- *available*: share of the frames with at least 40 visible stripe points that have an answer. A
+  point is visible where the stripe lifts a pixel by at least 10 of 255 grey levels; a stripe has
+  one point in every pixel along it.
+- *range*, *pitch*, *yaw*: errors of the answers in those frames: rms, median, 95th percentile,
+  maximum.
+- *wrong*: answers whose range is off by more than 5 %: to a fish, a wall behind, the water's glow.
+- *false*: answers in frames without any visible point.
+- *z*: rms of error over claimed sigma; 1 is honest, more is too sure.
+
+## Columns of truth.csv
+
+| column | meaning |
+|---|---|
+| frame, time_s | from 0 |
+| range_m, pitch_deg, yaw_deg | of the plane through the visible stripe points |
+| n_visible | visible stripe points on the target |
+| n_visible_lasers | lasers with at least five of them |
+| residual_mm | largest distance of a visible point from the plane: folds, growth, twine |
+| plane_range_m, plane_pitch_deg, plane_yaw_deg | of the target's own plane |
+
+The target's own plane holds the axes of a net's twine, without folds. Without a target all of these
+are empty.
+"""
+"""Written as `README.md` into every set."""
+
+
+SET_FILE = "benchmark.yaml"
+TRUTH_FILE = "truth.csv"
+TARGET_FILE = "target.yaml"
+
+_VERSION_KEY = "aqualvs_benchmark"
+_COLUMNS = ("frame", "range_m", "pitch_deg", "yaw_deg", "n_visible")
+
+
+@dataclass(frozen=True, slots=True)
+class DiveTruth:
+    """Truth of one dive, N frames.
+
+    Attributes
+    ----------
+    name, level : str
+    frames : int array, shape (N,)
+        Numbers from 0.
+    posture : array, shape (N, 3)
+        Range (m), pitch and yaw (deg); NaN where there is no target.
+    n_visible : int array, shape (N,)
+        Stripe points on the target that the picture truly shows.
+    """
+
+    name: str
+    level: str
+    frames: IntArray
+    posture: FloatArray
+    n_visible: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkSet:
+    """A set of dives with truth.
+
+    Attributes
+    ----------
+    name, checksum : str
+        Of the set's definition.
+    whole : bool
+        False for a part of the set, or one in fewer frames: its scores stand for themselves.
+    folder : Path
+    dives : tuple of DiveTruth
+    """
+
+    name: str
+    checksum: str
+    whole: bool
+    folder: Path
+    dives: tuple[DiveTruth, ...]
+
+    @property
+    def title(self) -> str:
+        """What scores say they were made with."""
+        frames = sum(len(dive.frames) for dive in self.dives)
+        part = "" if self.whole else ", a PART of the set: not to be compared with the whole"
+        size = f"{len(self.dives)} dives, {frames} frames"
+        return f"{self.name} (checksum {self.checksum}): {size}{part}"
+
+    @property
+    def levels(self) -> list[str]:
+        """Levels in the order of the dives."""
+        return list(dict.fromkeys(dive.level for dive in self.dives))
+
+
+def load_set(folder: Path) -> BenchmarkSet:
+    """Read a set that `aqualvs benchmark` wrote.
+
+    Raises
+    ------
+    SourceError
+        If the folder holds none, or a file of it cannot be read.
+    """
+    path = folder / SET_FILE
+    content = _read_yaml(path)
+    try:
+        name, checksum = str(content["name"]), str(content["checksum"])
+        whole = bool(content["whole"])
+        levels = {str(dive): str(facts["level"]) for dive, facts in content["dives"].items()}
+    except (KeyError, TypeError, AttributeError) as fault:
+        raise SourceError(f"{path}: {fault} is missing; make the set again") from fault
+    dives = tuple(
+        read_dive(folder / dive / TRUTH_FILE, dive, level) for dive, level in levels.items()
+    )
+    if not dives:
+        raise SourceError(f"{path}: names no dive; make the set again")
+    return BenchmarkSet(name, checksum, whole, folder, dives)
+
+
+def read_dive(path: Path, name: str, level: str) -> DiveTruth:
+    """Read the truth of one dive.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read, lacks a column, or holds what is no number.
+    """
+    rows = read_rows(path, _COLUMNS)
+    cells = [[cell(path, i, row, column) for column in _COLUMNS] for i, row in enumerate(rows)]
+    table = np.array(cells, dtype=np.float64)
+    if not np.isfinite(table[:, [0, 4]]).all():
+        raise SourceError(f"{path}: a row lacks its frame or n_visible; make the set again")
+    return DiveTruth(
+        name, level, table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4].astype(np.int64)
+    )
+
+
+def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]]:
+    """Return the rows of a CSV file with a header, its names without space around them.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read, holds no row, or lacks a column.
+    """
+    refuse_special(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            table = csv.DictReader(file)
+            table.fieldnames = [name.strip() for name in table.fieldnames or ()]
+            rows = list(table)
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise SourceError(f"{path}: not a CSV file in UTF-8; save it as one") from fault
+    for name in needed:
+        if name not in table.fieldnames:
+            have = ", ".join(table.fieldnames) or "none"
+            raise SourceError(
+                f"{path}: no column {name} (its first line names {have}); name the columns "
+                f"{','.join(needed)}"
+            )
+    if not rows:
+        raise SourceError(f"{path}: holds no rows; write one for every frame")
+    return rows
+
+
+def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> float:
+    """Return the number in a cell; NaN where it is empty.
+
+    Raises
+    ------
+    SourceError
+        If it holds something else.
+    """
+    text = (row.get(column) or "").strip()
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        raise SourceError(
+            f"{path}: line {i_row + 2}: {column} is {text!r}; write a number or leave it empty"
+        ) from None
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    content = read_yaml(path, "a set that 'aqualvs benchmark -o DIR' wrote", SourceError)
+    if not isinstance(content, dict) or content.get(_VERSION_KEY) != 1:
+        raise SourceError(f"{path}: not a benchmark set of version 1; make the set again")
+    return content
+
+
+_README_MD = "README.md"
+
+
+def make_set(
+    out: Path,
+    names: Sequence[str],
+    tell: Callable[[str], object],
+    *,
+    n_frames: int | None,
+    overwrite: bool,
+) -> None:
+    """Render dives of the set, with truth and a README, into a folder.
+
+    Parameters
+    ----------
+    out : Path
+        Folder to write.
+    names : sequence of str
+        Levels or dives; none for all.
+    tell : callable
+        Takes one line of text.
+    n_frames : int or None
+        Frames of every dive; None for all.
+    overwrite : bool
+        Whether a set that is there may be replaced.
+
+    Raises
+    ------
+    OptionError
+        If a name is not known or the number of frames makes no sense.
+    OutputError
+        If the folder holds a set already or cannot be written.
+    """
+    dives = chosen_dives(names, n_frames)
+    files = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
+    claim = Claim("benchmark", files, overwrite=overwrite)
+    renderer = Renderer(benchmark_rig(), threads=os.cpu_count() or 1)
+    total = sum(dive.scenario.n_frames for dive in dives)
+    with claim, writing(out), progress(BENCHMARK_NAME, total) as tick:
+        # Written last: a set that was interrupted is none.
+        (out / SET_FILE).unlink(missing_ok=True)
+        for dive in dives:
+            render_benchmark_dive(dive, renderer, out / dive.name, tick=tick)
+            (out / dive.name / TARGET_FILE).write_text(target_text(dive), encoding="utf-8")
+        (out / _README_MD).write_text(README, encoding="utf-8")
+        content = yaml.safe_dump(set_facts(dives), sort_keys=False, width=100)
+        (out / SET_FILE).write_text(content, encoding="utf-8")
+    tell(f"{len(dives)} dives, {total} frames: {out}")
+    tell(f"what is in it, and what to write: {out / _README_MD}")
+    tell(f"next: aqualvs score mine=RESULTS --truth {out}")
+
+
+def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDive]:
+    """Return the dives of some levels or names, in the set's order, shortened if wished.
+
+    Raises
+    ------
+    OptionError
+        If a name is not known or the number of frames makes no sense.
+    """
+    dives = benchmark_dives()
+    known = [*LEVELS, *(dive.name for dive in dives)]
+    for name in names:
+        if name not in known:
+            raise OptionError(f"{name}: no such level or dive; choose from {', '.join(known)}")
+    if n_frames is not None and not 2 <= n_frames <= N_FRAMES:
+        raise OptionError(f"--frames {n_frames}: give 2 to {N_FRAMES}")
+    chosen = [dive for dive in dives if not names or dive.level in names or dive.name in names]
+    if n_frames is None:
+        return chosen
+    return [dive.shortened(n_frames) for dive in chosen]
+
+
+def target_text(dive: BenchmarkDive) -> str:
+    """Return what may be known of a target beforehand, as `aqualvs run --target` takes it."""
+    if dive.level == "empty":
+        return "kind: auto\n"
+    if not dive.scenario.nets:
+        return "kind: solid\n"
+    net = dive.scenario.nets[0]
+    bar, twine = 1e3 * net.bar, 1e3 * net.twine
+    return f"kind: net\nnet: {{mesh: {net.mesh}, bar_mm: {bar:g}, twine_mm: {twine:g}}}\n"
+
+
+def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
+    """Return the content of the set's file."""
+    whole = len(dives) == len(benchmark_dives())
+    whole &= all(dive.scenario.n_frames == N_FRAMES for dive in dives)
+    return {
+        "aqualvs_benchmark": 1,
+        "name": BENCHMARK_NAME,
+        "checksum": benchmark_checksum(),
+        "whole": whole,
+        "rendered_with": f"aqualvs {__version__}",
+        "visible_contrast_grey_levels": CONTRAST_LIMIT,
+        "measurable_from_visible_points": VISIBLE_LIMIT,
+        "levels": dict(LEVELS),
+        "dives": {
+            dive.name: {
+                "level": dive.level,
+                "n_frames": dive.scenario.n_frames,
+                "fps": dive.scenario.fps,
+                "seed": dive.scenario.seed,
+            }
+            for dive in dives
+        },
+    }
+
+
+def tell_dives(tell: Callable[[str], object]) -> None:
+    """Tell the levels and their dives, one line each."""
+    for level, about in LEVELS.items():
+        names = (dive.name for dive in benchmark_dives() if dive.level == level)
+        tell(f"{level:8} {about}: {', '.join(names)}")
+
+
+_ANSWER = ("pitch_deg", "yaw_deg")
+_SIGMAS = ("sigma_pitch_deg", "sigma_yaw_deg")
+# What our own runs claim in all, next to what a frame's noise makes of it.
+_TOTALS = ("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg")
+# Names and units of the range, and of its sigma.
+_RANGES = {"range_m": 1.0, "range_mm": 1e-3}
+_YES, _NO = {"1", "true", "yes"}, {"0", "false", "no"}
+_RUN_FILE = "posture.csv"
+
+Row = dict[str, str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """Answers of a system to the N frames of one dive, in the order of the truth.
+
+    Attributes
+    ----------
+    valid : bool array, shape (N,)
+    posture : array, shape (N, 3)
+        Range (m), pitch and yaw (deg); NaN where a frame has none.
+    sigma : array, shape (N, 3)
+        Standard deviations that the system claims, same units; NaN where it claims none.
+    """
+
+    valid: BoolArray
+    posture: FloatArray
+    sigma: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """A system under test.
+
+    Attributes
+    ----------
+    name : str
+    answers : dict of str to Answers
+        By dive; every dive of the set is there.
+    missing : tuple of str
+        Dives for which it brought no file; it has no valid answer in them.
+    """
+
+    name: str
+    answers: dict[str, Answers]
+    missing: tuple[str, ...]
+
+
+def read_system(argument: str, benchmark: BenchmarkSet) -> System:
+    """Read the results of a system.
+
+    Parameters
+    ----------
+    argument : str
+        NAME=PATH, or a path, which is then called as its last part. The path is a folder with
+        DIVE.csv or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
+    benchmark : BenchmarkSet
+        The set whose dives they are.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be read or makes no sense.
+    OptionError
+        If there is nothing for any dive.
+    """
+    given, equals, rest = argument.partition("=")
+    path = Path(rest if equals else argument)
+    name = given if equals else path.stem
+    if not name or not path.exists():
+        raise OptionError(f"{argument}: no such results; give NAME=PATH of a folder or a CSV file")
+    found = _from_folder(path, benchmark) if path.is_dir() else _from_file(path, benchmark)
+    missing = tuple(dive.name for dive in benchmark.dives if dive.name not in found)
+    if not found:
+        first = benchmark.dives[0].name
+        raise OptionError(
+            f"{path}: nothing for any dive of {benchmark.name}; name the files {first}.csv or "
+            f"{first}/{_RUN_FILE} and so on"
+        )
+    for dive in benchmark.dives:
+        found.setdefault(dive.name, _nothing(len(dive.frames)))
+    return System(name, found, missing)
+
+
+def _nothing(n: int) -> Answers:
+    return Answers(np.zeros(n, dtype=np.bool_), np.full((n, 3), np.nan), np.full((n, 3), np.nan))
+
+
+def _from_folder(folder: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
+    found = {}
+    for dive in benchmark.dives:
+        for path in (folder / f"{dive.name}.csv", folder / dive.name / _RUN_FILE):
+            if path.is_file():
+                rows = read_rows(path, ("frame", *_ANSWER))
+                found[dive.name] = _answers(path, list(enumerate(rows)), dive)
+                break
+    return found
+
+
+def _from_file(path: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
+    rows = read_rows(path, ("dive", "frame", *_ANSWER))
+    of_dive: dict[str, list[tuple[int, Row]]] = {dive.name: [] for dive in benchmark.dives}
+    for i, row in enumerate(rows):
+        name = (row["dive"] or "").strip()
+        if name not in of_dive:
+            raise SourceError(
+                f"{path}: line {i + 2}: dive {name!r} is not in {benchmark.name}; use the names of "
+                "its folders"
+            )
+        of_dive[name].append((i, row))
+    dives = (dive for dive in benchmark.dives if of_dive[dive.name])
+    return {dive.name: _answers(path, of_dive[dive.name], dive) for dive in dives}
+
+
+def _answers(path: Path, rows: list[tuple[int, Row]], dive: DiveTruth) -> Answers:
+    """Put the rows of a dive into the order of its truth; frames without a row have no answer."""
+    range_column = _range_column(path, rows[0][1])
+    places = {int(frame): k for k, frame in enumerate(dive.frames)}
+    found = _nothing(len(places))
+    answered: set[int] = set()
+    for i, row in rows:
+        place = _place(path, i, row, places, dive.name)
+        if place in answered:
+            raise SourceError(
+                f"{path}: line {i + 2}: frame {row['frame']} is there twice; give one row a frame"
+            )
+        answered.add(place)
+        unit = _RANGES[range_column]
+        numbers = [cell(path, i, row, column) for column in (range_column, *_ANSWER)]
+        own = (f"sigma_{range_column}", *_SIGMAS)
+        claimed = _TOTALS if set(_TOTALS) <= row.keys() and unit == 1.0 else own
+        sigmas = [cell(path, i, row, column) for column in claimed]
+        found.valid[place] = _valid(path, i, row, numbers[0])
+        found.posture[place] = [numbers[0] * unit, *numbers[1:]]
+        found.sigma[place] = [sigmas[0] * unit, *sigmas[1:]]
+    return found
+
+
+def _range_column(path: Path, row: Row) -> str:
+    for name in _RANGES:
+        if name in row:
+            return name
+    raise SourceError(f"{path}: no column range_m or range_mm; name it in the first line")
+
+
+def _place(path: Path, i: int, row: Row, places: dict[int, int], dive: str) -> int:
+    number = cell(path, i, row, "frame")
+    if not math.isfinite(number) or number not in places:
+        raise SourceError(
+            f"{path}: line {i + 2}: frame {row['frame']!r} is not in {dive}; its frames are "
+            f"{min(places)} to {max(places)}"
+        )
+    return places[int(number)]
+
+
+def _valid(path: Path, i: int, row: Row, distance: float) -> bool:
+    """Return whether a row holds an answer: as it says, or else if it has a range."""
+    said = (row.get("valid") or "").strip().lower()
+    if said in _NO:
+        return False
+    if said and said not in _YES:
+        raise SourceError(f"{path}: line {i + 2}: valid is {said!r}; write 1 or 0")
+    if math.isfinite(distance) and distance > 0.0:
+        return True
+    if said or not math.isnan(distance):
+        raise SourceError(
+            f"{path}: line {i + 2}: a valid row with the range {distance:g}; give a positive range "
+            "or valid 0"
+        )
+    return False

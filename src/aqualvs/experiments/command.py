@@ -1,0 +1,348 @@
+"""`aqualvs reproduce`: run the experiments one after the other and put them on one page.
+
+How far `aqualvs reproduce` is, on standard error: experiment, frames, and time left.
+"""
+
+import contextlib
+import statistics
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.text import Text
+
+from aqualvs.errors import OutputError
+from aqualvs.experiments import experiment as catalogue
+from aqualvs.experiments.experiment import Experiment
+from aqualvs.experiments.laboratory import Laboratory
+from aqualvs.experiments.page import (
+    FIGURES,
+    FRAME,
+    PAGE,
+    RESULTS,
+    SERIES,
+    TIMES,
+    WORK,
+    Record,
+    is_reproduced,
+    read_results,
+    save_outcome,
+    work_folder,
+    write_page,
+    write_results,
+)
+from aqualvs.results.files import Claim, writing
+from aqualvs.terminal import hidden_progress
+
+TYPICAL_S: Mapping[str, float] = {
+    "rig": 2.0,
+    "dome": 9.0,
+    "index": 14.0,
+    "box": 10.0,
+    "mesh": 45.0,
+    "distance": 31.0,
+    "angles": 47.0,
+    "dome-or-not": 14.0,
+    "sea": 32.0,
+    "control": 2.0,
+    "failures": 58.0,
+    "stripes": 1.0,
+    "filters": 1.0,
+    "fits": 1.0,
+    "sheets": 11.0,
+    "beliefs": 2.0,
+    "video": 17.0,
+}
+"""Seconds, to guess what is left; only their ratios matter once some are done."""
+
+_UNKNOWN_S = 25.0
+# As if so many typical seconds had gone by before: the first, short experiments say little.
+_TRUST_S = 20.0
+
+
+class TimeLeft:
+    """Guess of the time that is left, from what the experiments so far took.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Experiments to come.
+    now : callable
+        Clock in seconds.
+    """
+
+    def __init__(self, names: Sequence[str], now: Callable[[], float] = time.monotonic) -> None:
+        self._to_come = {name: TYPICAL_S.get(name, _UNKNOWN_S) for name in names}
+        self._now = now
+        self._running = 0.0
+        self._done = 0.0
+        self._started = self._began = now()
+
+    def start(self, name: str) -> None:
+        """Note that an experiment begins."""
+        self._running = self._to_come.pop(name)
+        self._began = self._now()
+
+    def end(self) -> None:
+        """Note that the running experiment is done."""
+        self._done += self._running
+        self._running = 0.0
+        self._began = self._now()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds left."""
+        return self._ahead() * self._pace()
+
+    @property
+    def share(self) -> float:
+        """Share of the work that is behind, 0 to 1."""
+        total = self._done + self._running + sum(self._to_come.values())
+        return 1.0 - self._ahead() / total if total > 0.0 else 1.0
+
+    def _pace(self) -> float:
+        """Return seconds per typical second."""
+        return (_TRUST_S + self._began - self._started) / (_TRUST_S + self._done)
+
+    def _ahead(self) -> float:
+        """Return typical seconds ahead; one that takes too long is held at nine tenths."""
+        within = (self._now() - self._began) / self._pace()
+        return sum(self._to_come.values()) + max(self._running - within, 0.1 * self._running)
+
+
+class ExperimentBar:
+    """A progress bar over experiments.
+
+    Parameters
+    ----------
+    bar : rich.progress.Progress
+    names : sequence of str
+    """
+
+    def __init__(self, bar: Progress, names: Sequence[str]) -> None:
+        self._bar = bar
+        self._n = len(names)
+        self._i = self._frames = 0
+        self._left = TimeLeft(names)
+        self._task = bar.add_task("", total=1.0, left=self._left, frames="")
+
+    def start(self, name: str) -> None:
+        """Show that an experiment begins."""
+        self._i += 1
+        self._left.start(name)
+        self._bar.update(
+            self._task,
+            description=f"{self._i}/{self._n} {name}",
+            completed=self._left.share,
+        )
+
+    def tick(self, n_frames: int) -> None:
+        """Count rendered frames."""
+        self._frames += n_frames
+        self._bar.update(
+            self._task, frames=f"{self._frames} frames rendered", completed=self._left.share
+        )
+
+    def end(self) -> None:
+        """Show that the running experiment is done."""
+        self._left.end()
+        self._bar.update(self._task, completed=self._left.share)
+
+
+@contextlib.contextmanager
+def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
+    """Show how far the experiments are; nothing where standard error is not a terminal.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Experiments to come, in their order.
+    """
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[frames]}"),
+        _LeftColumn(),
+    )
+    disable = not console.is_terminal
+    with (
+        hidden_progress(),
+        Progress(*columns, console=console, transient=True, disable=disable) as bar,
+    ):
+        yield ExperimentBar(bar, names)
+
+
+class _LeftColumn(ProgressColumn):
+    """The time left in words."""
+
+    def render(self, task: Task) -> Text:
+        """Return the time left as text."""
+        left: TimeLeft = task.fields["left"]
+        return Text(left_in_words(left.seconds))
+
+
+def left_in_words(seconds: float) -> str:
+    """Return a guessed time as one would say it."""
+    if seconds < 60.0:
+        return f"about {max(5, 5 * round(seconds / 5.0))} s left"
+    return f"about {round(seconds / 60.0)} min left"
+
+
+Tell: TypeAlias = Callable[[str], object]
+Load: TypeAlias = Callable[[str], Experiment]
+
+_FAILURES = "failures"
+_EXIT_FAILED = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReproduceRequest:
+    """What is asked for; see `aqualvs reproduce --help`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Experiments; all of them if empty.
+    out : Path
+        Folder to write.
+    """
+
+    names: tuple[str, ...]
+    out: Path
+
+
+def tell_experiments(tell: Tell) -> None:
+    """Tell every experiment's name, title and place in the paper."""
+    width = max(map(len, catalogue.MODULES))
+    for name in catalogue.MODULES:
+        found = catalogue.experiment(name)
+        tell(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation of ours'})")
+
+
+def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.experiment) -> int:
+    """Run experiments, write the page after each of them, and return the exit code.
+
+    Results of other experiments that the same version left in the folder stay on the page.
+
+    Parameters
+    ----------
+    request : ReproduceRequest
+    tell : callable
+        Takes one line of text.
+    load : callable
+        From a name to its experiment.
+
+    Returns
+    -------
+    exit_code : int
+        0, or 1 if an experiment failed.
+
+    Raises
+    ------
+    OptionError
+        If there is no experiment of some name.
+    OutputError
+        If the folder cannot be written.
+    """
+    names = catalogue.ordered(request.names)
+    # Results of other experiments in the folder stay; those of the same are brought up to date.
+    written = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, _FAILURES)
+    files = [request.out / name for name in written]
+    known = files if is_reproduced(request.out) else []
+    claim = Claim("reproduce", files, overwrite=True, known=known)
+    with experiment_bar(names) as bar:
+        laboratory = Laboratory(work_folder(request.out), bar.tick)
+        book = _Book(request.out)
+        for number, name in enumerate(names, 1):
+            bar.start(name)
+            book.run(name, load, laboratory)
+            tell(f"[{number}/{len(names)}] {_line(book.records[name], book.seconds[name])}")
+            bar.end()
+            write_page(book.in_order(), book.seconds, request.out)
+    claim.close()
+    for line in _closing(book, names, request.out):
+        tell(line)
+    return _EXIT_FAILED if any(book.records[name].failure for name in names) else 0
+
+
+class _Book:
+    """The records of a folder, on disk after every experiment."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.records, self.seconds = read_results(folder)
+
+    def run(self, name: str, load: Load, laboratory: Laboratory) -> None:
+        """Run one experiment and keep what comes of it, whatever that is."""
+        started = time.perf_counter()
+        self.records[name] = self._record(name, load, laboratory)
+        self.seconds[name] = time.perf_counter() - started
+        if laboratory.frame_s:
+            self.seconds[FRAME] = statistics.median(laboratory.frame_s)
+        write_results(self.in_order(), self.seconds, self.folder)
+
+    def in_order(self) -> list[Record]:
+        return [self.records[name] for name in catalogue.MODULES if name in self.records]
+
+    def _record(self, name: str, load: Load, laboratory: Laboratory) -> Record:
+        found: Experiment | None = None
+        try:
+            found = load(name)
+            record = save_outcome(found, found.run(laboratory), self.folder)
+        except OutputError:
+            raise
+        except Exception as fault:
+            # Sixteen other experiments are still worth having.
+            self._keep_traceback(name, fault)
+            return _failed(name, found, fault)
+        (self.folder / _FAILURES / f"{name}.txt").unlink(missing_ok=True)
+        return record
+
+    def _keep_traceback(self, name: str, fault: Exception) -> None:
+        path = self.folder / _FAILURES / f"{name}.txt"
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("".join(traceback.format_exception(fault)), encoding="utf-8")
+
+
+def _failed(name: str, found: Experiment | None, fault: Exception) -> Record:
+    said = " ".join(str(fault).split())
+    return Record(
+        name=name,
+        title=found.title if found else name,
+        paper=found.paper if found else "",
+        about=found.about if found else "",
+        failure=f"{type(fault).__name__}: {said}" if said else type(fault).__name__,
+    )
+
+
+def _line(record: Record, seconds: float) -> str:
+    if record.failure:
+        return (
+            f"{record.name}: failed: {record.failure}; the whole story is in "
+            f"{_FAILURES}/{record.name}.txt"
+        )
+    missed = [finding.what for finding in record.findings if finding.met is False]
+    more = f" MISSED: {'; '.join(missed)}." if missed else ""
+    return f"{record.name}: {record.sentence}{more} ({seconds:.0f} s)"
+
+
+def _closing(book: _Book, names: Sequence[str], out: Path) -> list[str]:
+    bars = [
+        finding.met
+        for name in names
+        for finding in book.records[name].findings
+        if finding.met is not None
+    ]
+    took = sum(book.seconds[name] for name in names)
+    failed = [name for name in names if book.records[name].failure]
+    lines = [f"{sum(bars)} of {len(bars)} bars met, {took:.0f} s", f"page: {out / PAGE}"]
+    if failed:
+        lines.insert(0, f"{len(failed)} of {len(names)} experiments failed: {', '.join(failed)}")
+    return lines

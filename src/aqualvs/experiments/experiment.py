@@ -1,0 +1,190 @@
+"""What an experiment is, and what comes out of one.
+
+A figure in the style of all experiments, from what draws it.
+
+The experiments by name, in the paper's order; each is imported when it is run.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from types import MappingProxyType
+from typing import TYPE_CHECKING, TypeAlias
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.report.figure_style import STYLE, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from aqualvs.experiments.laboratory import Laboratory
+
+
+Column: TypeAlias = FloatArray | IntArray | list[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One row of an experiment's table.
+
+    Attributes
+    ----------
+    what : str
+        The quantity, with its unit.
+    paper : str
+        As the paper prints it; empty where it says nothing.
+    ours : str
+        As measured here.
+    bar : str
+        What we hold ourselves to; empty where there is no such thing.
+    met : bool or None
+        Whether it is reached; None without a bar.
+    """
+
+    what: str
+    paper: str
+    ours: str
+    bar: str = ""
+    met: bool | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """A figure to print.
+
+    Attributes
+    ----------
+    name : str
+        Stem of its files, such as `figure_15`.
+    caption : str
+        What it shows and which figure of the paper it stands beside.
+    figure : matplotlib.figure.Figure
+        From `style.new_figure`.
+    """
+
+    name: str
+    caption: str
+    figure: "Figure"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Series:
+    """The numbers behind a picture, for a CSV: columns of one length with units in their names."""
+
+    name: str
+    columns: Mapping[str, Column]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What an experiment found.
+
+    Attributes
+    ----------
+    sentence : str
+        The result in one sentence, with its numbers.
+    findings : tuple of Finding
+    pictures : tuple of Picture
+    series : tuple of Series
+    notes : tuple of str
+        What a reader must know to judge it: where it differs from the paper's setting, and why.
+    """
+
+    sentence: str
+    findings: tuple[Finding, ...]
+    pictures: tuple[Picture, ...] = ()
+    series: tuple[Series, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Experiment:
+    """One experiment of the paper, or one that explains a choice of ours.
+
+    Attributes
+    ----------
+    name : str
+        What is typed to run it alone.
+    title : str
+    paper : str
+        Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
+    about : str
+        The setting, in one or two sentences.
+    run : callable
+        Takes the laboratory, gives the outcome. It must depend on nothing else, so that the same
+        version gives the same numbers on every machine.
+    """
+
+    name: str
+    title: str
+    paper: str
+    about: str
+    run: "Callable[[Laboratory], Outcome]"
+
+
+def drawn(name: str, caption: str, height_in: float, draw: "Callable[[Figure], None]") -> Picture:
+    """Return a picture of a page's width.
+
+    Parameters
+    ----------
+    name, caption : str
+        As in `Picture`.
+    height_in : float
+        Height in inches.
+    draw : callable
+        Fills the figure.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(dict(STYLE)):
+        figure = new_figure(height_in)
+        draw(figure)
+    return Picture(name=name, caption=caption, figure=figure)
+
+
+_PACKAGE = "aqualvs.experiments"
+
+MODULES: Mapping[str, str] = MappingProxyType(
+    {
+        "rig": "rig_table:EXPERIMENT",
+        "dome": "dome_boards:EXPERIMENT",
+        "index": "water_index:EXPERIMENT",
+        "box": "laser_box:EXPERIMENT",
+        "mesh": "mesh_filter:EXPERIMENT",
+        "distance": "tank:DISTANCE",
+        "angles": "tank:ANGLES",
+        "dome-or-not": "dome_or_not:EXPERIMENT",
+        "sea": "sea:SEA",
+        "control": "sea:CONTROL",
+        "failures": "growth_and_sun:EXPERIMENT",
+        "stripes": "ablation_stages:STRIPES",
+        "filters": "ablation_stages:FILTERS",
+        "fits": "ablation_stages:FITS",
+        "sheets": "ablation_inputs:SHEETS",
+        "beliefs": "ablation_inputs:BELIEFS",
+        "video": "ablation_inputs:VIDEO",
+    }
+)
+"""Module and constant of each; `beliefs` are a wrong index and a wrong place of the lens."""
+
+
+def ordered(names: Sequence[str]) -> list[str]:
+    """Return these names in the catalogue's order, each once; all of them for none.
+
+    Raises
+    ------
+    OptionError
+        If a name is not in the catalogue.
+    """
+    for name in names:
+        if name not in MODULES:
+            raise OptionError(f"{name}: no such experiment; choose from {', '.join(MODULES)}")
+    return [name for name in MODULES if not names or name in names]
+
+
+def experiment(name: str) -> Experiment:
+    """Return an experiment of the catalogue."""
+    module, constant = MODULES[name].split(":")
+    found: Experiment = getattr(import_module(f"{_PACKAGE}.{module}"), constant)
+    return found

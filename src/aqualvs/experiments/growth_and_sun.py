@@ -1,0 +1,274 @@
+"""Growth on the net and sunlight, on which the paper's system failed (figure 24).
+
+How much stripe each frame of a dive truly shows.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.laboratory import Dive, Laboratory, Measured, frames_of
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.report.figure_style import BLUE, GREEN, ORANGE, STYLE, new_figure
+from aqualvs.scanner import ScannerOptions
+from aqualvs.scanning.paper.detector import ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+from aqualvs.scanning.posture_estimator import FitMethod
+from aqualvs.scanning.scan import Frame
+from aqualvs.simulation.benchmark import CONTRAST_LIMIT, VISIBLE_LIMIT, render_with_visible
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import Scenario, parse_scenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+_FILE = "visible.csv"
+ENOUGH = VISIBLE_LIMIT
+"""Visible stripe points from which on a posture can be asked for."""
+
+
+def visible_points(laboratory: Laboratory, dive: Dive) -> FloatArray:
+    """Return the number of stripe points on the target that stand out, for each frame.
+
+    See `aqualvs.simulation.benchmark` for what stands out. The numbers are kept beside the dive.
+
+    Parameters
+    ----------
+    laboratory : Laboratory
+        Counts the frames, which are rendered once more for this.
+    dive : Dive
+    """
+    path = dive.folder / _FILE
+    if not path.exists():
+        scenario = dive.scenario
+        renderer = Renderer(dive.rig, threads=os.cpu_count() or 1)
+        counts = []
+        for i, t in enumerate(scenario.times()):
+            rng = np.random.default_rng([scenario.seed, i])
+            counts.append(len(render_with_visible(renderer, scenario.scene_at(t), t, rng)[1]))
+            laboratory.rendered(i + 1, scenario.n_frames)
+        path.write_text("".join(f"{count}\n" for count in counts), encoding="utf-8")
+    return np.loadtxt(path, ndmin=1)
+
+
+PAPERS_WAY = ScannerOptions(
+    detector=ThresholdOptions(), mesh_filter=MeshFilterOptions(), fit=FitMethod.PSEUDO_INVERSE
+)
+"""Threshold, mesh filter with the parameters of section 5.2, and pseudo-inverse."""
+
+_MOTION: Mapping[str, Any] = {
+    "range_mm": {"values": [450, 620, 520], "sway": 4, "period_s": 0.7},
+    "pitch_deg": [5, -4],
+    "yaw_deg": [-8, 10],
+    "slide_x_mm": [0, 120],
+}
+_NET: Mapping[str, Any] = {"bar_mm": 25, "twine_mm": 2}
+_SCENES: Mapping[str, Mapping[str, Any]] = {
+    "clear": {"net": dict(_NET)},
+    "growth": {
+        "net": {**_NET, "fouling": 0.6, "growth": 2.5},
+        "water": {
+            "attenuation_per_m": [1.2, 0.55, 0.75],
+            "veil": [0.06, 0.13, 0.09],
+            "sheet_scatter_per_m": 0.7,
+            "snow": 700,
+        },
+    },
+    "sun": {
+        "net": dict(_NET),
+        "water": {"caustics": 0.65, "glare": 0.5, "ambient": [0.50, 0.82, 0.78]},
+    },
+}
+_COLOURS = {"clear": BLUE, "growth": GREEN, "sun": ORANGE}
+_SECONDS, _SHOWN = 0.8, 10
+_BAR_VALID = 90.0
+# Of the clear scene: range in percent, pitch and yaw in degrees; twice that for the others.
+_CLEAR_LIMITS = (0.5, 0.5, 0.5)
+_NAMES = ("range", "pitch", "yaw")
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One scene: its dive, what we and the paper's way made of it, and who could have."""
+
+    dive: Dive
+    ours: Measured
+    papers: Measured
+    visible: FloatArray
+
+    @property
+    def asked(self) -> BoolArray:
+        """Frames in which stripe enough can be seen, shape (N,)."""
+        return np.asarray(self.visible >= ENOUGH)
+
+    def valid_percent(self, measured: Measured) -> float:
+        """Return the share of those frames that have a posture."""
+        return 100.0 * float(np.mean(measured.valid[self.asked])) if self.asked.any() else np.nan
+
+    @property
+    def errors(self) -> FloatArray:
+        """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
+        return self.ours.errors_told
+
+    @property
+    def rms(self) -> FloatArray:
+        """Root mean square of the errors, shape (3,)."""
+        return np.asarray(np.sqrt(np.nanmean(self.errors**2, axis=0)))
+
+    @property
+    def largest(self) -> FloatArray:
+        """Largest errors by amount, shape (3,)."""
+        return np.asarray(np.nanmax(np.abs(self.errors), axis=0))
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Median stated sigmas in the same units."""
+        percent = 100.0 * self.ours.sigmas[:, 0] / self.ours.truth[:, 0]
+        degrees = np.degrees(self.ours.sigmas[:, 1:])
+        return np.asarray(np.nanmedian(np.column_stack([percent, degrees]), axis=0))
+
+
+def scene(name: str) -> Scenario:
+    """Return the dive before a "clear" net, one with "growth" in turbid water, or in the "sun"."""
+    facts = {"duration_s": _SECONDS, "motion": dict(_MOTION), **_SCENES[name]}
+    return parse_scenario(facts, f"failures_{name}", f"failures_{name}")
+
+
+def _run(laboratory: Laboratory) -> Outcome:
+    seen = {name: _seen(laboratory, name) for name in _SCENES}
+    valid = {name: one.valid_percent(one.ours) for name, one in seen.items()}
+    papers = {name: one.valid_percent(one.papers) for name, one in seen.items()}
+    return Outcome(
+        sentence=f"With growth on 60 % of the net {valid['growth']:.0f} %, in sunlight "
+        f"{valid['sun']:.0f} % of the frames have a posture, where the paper's filter gives "
+        f"{papers['growth']:.0f} and {papers['sun']:.0f} %; range within "
+        f"{seen['growth'].rms[0]:.2f} and {seen['sun'].rms[0]:.2f} % root mean square.",
+        findings=tuple(row for name in _SCENES for row in _findings(name, seen)),
+        pictures=(
+            Picture(
+                name="figure_24",
+                caption="A frame of each scene and the errors of every frame, with two stated "
+                "standard deviations, beside figure 24.",
+                figure=_drawn(seen),
+            ),
+        ),
+        series=tuple(_series(name, one) for name, one in seen.items()),
+        notes=(
+            f"Counted are frames in which {ENOUGH} stripe points or more of the net stand out by "
+            f"{CONTRAST_LIMIT:g} grey levels in the picture before noise and coding.",
+            "Errors count against the plane through the lit points: growth stands out of the "
+            "net, and the lasers measure to it.",
+        ),
+    )
+
+
+def _seen(laboratory: Laboratory, name: str) -> Seen:
+    dive = laboratory.dive(scene(name))
+    return Seen(
+        dive,
+        laboratory.measure(dive),
+        laboratory.measure(dive, PAPERS_WAY),
+        visible_points(laboratory, dive),
+    )
+
+
+def _findings(name: str, seen: Mapping[str, Seen]) -> list[Finding]:
+    one, clear = seen[name], seen["clear"]
+    valid, judged = one.valid_percent(one.ours), name != "clear"
+    limits = np.array(_CLEAR_LIMITS) * (2.0 if judged else 1.0)
+    return [
+        Finding(
+            what=f"{name}: frames with a posture (%)",
+            paper="not applicable" if judged else "",
+            ours=f"{valid:.0f} (of {int(one.asked.sum())}; the paper's way "
+            f"{one.valid_percent(one.papers):.0f})",
+            bar=f">= {_BAR_VALID:g}" if judged else "",
+            met=valid >= _BAR_VALID if judged else None,
+        ),
+        Finding(
+            what=f"{name}: largest error of range (%), pitch, yaw (degrees)",
+            paper="",
+            ours=_told(one.largest),
+            bar="<= " + ", ".join(f"{limit:g}" for limit in limits),
+            met=bool(np.all(one.largest <= limits)),
+        ),
+        Finding(
+            what=f"{name}: root mean square error, and as many times the clear scene's",
+            paper="",
+            ours=_told(one.rms)
+            + (f"; {', '.join(f'{x:.1f}' for x in one.rms / clear.rms)}" if judged else ""),
+        ),
+        Finding(
+            what=f"{name}: stated sigma (median)",
+            paper="",
+            ours=_told(one.sigmas),
+        ),
+    ]
+
+
+def _told(values: FloatArray) -> str:
+    return ", ".join(f"{value:.3f}" for value in values)
+
+
+def _series(name: str, one: Seen) -> Series:
+    columns: dict[str, FloatArray] = {"time_s": one.ours.time_s, "visible_points": one.visible}
+    for k, what in enumerate(_NAMES):
+        unit, scale = ("m", 1.0) if k == 0 else ("deg", 180.0 / np.pi)
+        columns[f"true_{what}_{unit}"] = scale * one.ours.truth[:, k]
+        columns[f"{what}_{unit}"] = scale * one.ours.values[:, k]
+        columns[f"sigma_{what}_{unit}"] = scale * one.ours.sigmas[:, k]
+    return Series(name=f"failures_{name}", columns=columns)
+
+
+def _drawn(seen: Mapping[str, Seen]) -> "Figure":
+    from matplotlib import rc_context
+
+    with rc_context(dict(STYLE)):
+        figure = new_figure(5.6)
+        grid = figure.subplots(3, 3, height_ratios=(1.6, 1.0, 1.0), sharey="row")
+        for column, (name, one) in enumerate(seen.items()):
+            picture, *errors = grid[:, column]
+            picture.imshow(_colours(frames_of(one.dive)[_SHOWN]), interpolation="nearest")
+            picture.set_title(name, loc="left")
+            picture.set_axis_off()
+            degrees = np.degrees(one.ours.errors[:, 2])
+            percent_bar = 200.0 * one.ours.sigmas[:, 0] / one.ours.truth[:, 0]
+            bars = (percent_bar, 2.0 * np.degrees(one.ours.sigmas[:, 2]))
+            values = (one.ours.range_percent, degrees)
+            for axes, value, bar in zip(errors, values, bars, strict=True):
+                axes.axhline(0.0, color="#8a8f98", linewidth=0.7)
+                axes.errorbar(
+                    one.ours.time_s,
+                    value,
+                    yerr=bar,
+                    fmt=".",
+                    color=_COLOURS[name],
+                    markersize=3.5,
+                    elinewidth=0.6,
+                )
+            errors[-1].set_xlabel("time (s)")
+        grid[1, 0].set_ylabel("range error (%)")
+        grid[2, 0].set_ylabel("yaw error (degrees)")
+        figure.align_ylabels(grid[1:, 0])
+    return figure
+
+
+def _colours(frame: Frame) -> Any:
+    from aqualvs.sources.base import bgr_of
+
+    return bgr_of(frame)[..., ::-1]
+
+
+EXPERIMENT = Experiment(
+    name="failures",
+    title="Growth and sunlight",
+    paper="section 5.5, figure 24",
+    about="The same way along a clear net, a net with growth on most of it in turbid water, and a "
+    "net close below the surface in the sun: the two cases in which the paper's system failed.",
+    run=_run,
+)

@@ -1,0 +1,495 @@
+"""The water tank of the experiments: dives with truth, rendered once, and measured at will.
+
+The same dive measured in several ways, side by side.
+
+The rig as a user gets it: calibrated from pictures, as the commands do it.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs.calibrate.camera import CameraRequest, calibrate_camera
+from aqualvs.calibrate.dome import DomeRequest, calibrate_dome
+from aqualvs.calibrate.lasers import LasersRequest, calibrate_lasers
+from aqualvs.experiments.experiment import Finding, Series
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import load_rig, rig_to_mapping, save_rig
+from aqualvs.report.figure_style import GREY, OURS, STYLE, new_figure
+from aqualvs.results.summary import read_truth
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
+from aqualvs.simulation.dive import simulate_dive
+from aqualvs.simulation.scenario import Scenario
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.video import Recording
+from aqualvs.sources import open_source
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Dive:
+    """A rendered dive on disk.
+
+    Attributes
+    ----------
+    name : str
+    folder : Path
+        Holds `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the frames asked for.
+    rig : Rig
+        The true one.
+    scenario : Scenario
+    """
+
+    name: str
+    folder: Path
+    rig: Rig
+    scenario: Scenario
+
+    @property
+    def video(self) -> Path:
+        """The video."""
+        return self.folder / _VIDEO
+
+    @property
+    def truth(self) -> Path:
+        """The truth, as `read_truth` takes it."""
+        return self.folder / _TRUTH
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A dive as one scanner saw it, frame by frame, N of them, beside the truth.
+
+    Attributes
+    ----------
+    scans : list of Scan
+    truth : float array, shape (N, 3)
+        Range in m, pitch and yaw in radians; NaN where there is none.
+    """
+
+    scans: list[Scan]
+    truth: FloatArray
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Time of each frame, shape (N,)."""
+        return np.array([scan.time_s for scan in self.scans])
+
+    @property
+    def postures(self) -> list[Posture | None]:
+        """Posture of each frame, None where it was refused."""
+        return [s.posture if isinstance(s.posture, Posture) else None for s in self.scans]
+
+    @property
+    def valid(self) -> BoolArray:
+        """Whether each frame has a posture, shape (N,)."""
+        return np.array([posture is not None for posture in self.postures], np.bool_)
+
+    @property
+    def values(self) -> FloatArray:
+        """Range (m), pitch and yaw (rad) of each frame, NaN where refused; shape (N, 3)."""
+        nothing = (np.nan,) * 3
+        return np.array(
+            [nothing if p is None else (p.range, p.pitch, p.yaw) for p in self.postures]
+        ).reshape(-1, 3)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """One standard deviation of `values`, shape (N, 3)."""
+        variances = [
+            np.full(3, np.nan) if p is None else np.diag(p.covariance) for p in self.postures
+        ]
+        return np.asarray(np.sqrt(np.array(variances).reshape(-1, 3)))
+
+    @property
+    def errors(self) -> FloatArray:
+        """`values` less `truth`, shape (N, 3)."""
+        return self.values - self.truth
+
+    @property
+    def range_percent(self) -> FloatArray:
+        """Error of the range in percent of the true range, shape (N,)."""
+        return np.asarray(100.0 * self.errors[:, 0] / self.truth[:, 0])
+
+    @property
+    def errors_told(self) -> FloatArray:
+        """Errors for people, shape (N, 3): range in percent, pitch and yaw in degrees."""
+        return np.column_stack([self.range_percent, np.degrees(self.errors[:, 1:])])
+
+
+class Laboratory:
+    """Renders dives and measures in them; the same call twice costs once.
+
+    Parameters
+    ----------
+    work : Path
+        Folder for the dives; kept, so that another run finds them.
+    tick : callable, optional
+        Called with the number of frames rendered since the last call.
+
+    Attributes
+    ----------
+    frame_s : list of float
+        How long the scanner took for each frame that it measured with its own options, in seconds.
+    """
+
+    def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
+        self._work = work
+        self._tick = tick or (lambda _n: None)
+        self._measured: dict[tuple[str, str], Measured] = {}
+        self.frame_s: list[float] = []
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The rig of the experiments, after the paper's Table 1."""
+        return example_rig()
+
+    def rendered(self, _done: int, _all: int) -> None:
+        """Count a rendered picture; what renderers take as `progress`."""
+        self._tick(1)
+
+    def folder(self, name: str) -> Path:
+        """Return a folder for the files of an experiment, made if it is not there."""
+        folder = self._work / name
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def dive(
+        self,
+        scenario: Scenario,
+        rig: Rig | None = None,
+        *,
+        recording: Recording | None = None,
+        point_frames: tuple[int, ...] = (),
+    ) -> Dive:
+        """Return a dive with its truth, rendered where it has not been yet.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            Its name, with a digest of everything that shapes the pictures, names the folder.
+        rig : Rig, optional
+            `self.rig` by default.
+        recording, point_frames
+            As in `simulate_dive`.
+        """
+        rig = rig or self.rig
+        facts = {
+            "scenario": repr(scenario),
+            "rig": rig_to_mapping(rig),
+            "video": [repr(recording or Recording()), list(point_frames)],
+        }
+        digest = _digest(facts)
+        folder = self._work / "dives" / f"{scenario.name}-{digest}"
+        if not (folder / _READY).exists():
+            simulate_dive(
+                scenario,
+                rig,
+                folder,
+                progress=self.rendered,
+                point_frames=point_frames,
+                recording=recording,
+            )
+            save_rig(rig, folder / _RIG)
+            (folder / _READY).write_text(json.dumps(facts, default=str), encoding="utf-8")
+        return Dive(folder.name, folder, rig, scenario)
+
+    def measure(
+        self,
+        dive: Dive,
+        options: ScannerOptions | None = None,
+        *,
+        rig: Rig | None = None,
+        no_dome: bool = False,
+    ) -> Measured:
+        """Measure every frame of a dive.
+
+        Parameters
+        ----------
+        dive : Dive
+        options : ScannerOptions, optional
+        rig : Rig, optional
+            What the scanner believes; the true rig by default.
+        no_dome : bool
+            Leave refraction out, as `aqualvs run --no-dome` does.
+        """
+        believed = rig or dive.rig
+        options = options or ScannerOptions()
+        key = (dive.name, _digest([repr(options), rig_to_mapping(believed), no_dome]))
+        if key not in self._measured:
+            camera = believed.bare_camera() if no_dome else None
+            own = options == ScannerOptions() and camera is None
+            scanner = Scanner(believed, options, camera)
+            self._measured[key] = _measured(dive, scanner, self.frame_s if own else [])
+        return self._measured[key]
+
+
+def frames_of(dive: Dive) -> list[Frame]:
+    """Return the decoded frames of a dive."""
+    with open_source(str(dive.video)) as source:
+        return list(source)
+
+
+def _measured(dive: Dive, scanner: Scanner, frame_s: list[float]) -> Measured:
+    scans = []
+    with open_source(str(dive.video)) as source:
+        for frame in source:
+            start = time.perf_counter()
+            scans.append(scanner.process(frame))
+            frame_s.append(time.perf_counter() - start)
+    truth = read_truth(dive.truth)
+    rows = np.full((len(scans), 3), np.nan)
+    for i, scan in enumerate(scans):
+        if scan.index in truth:
+            metres, pitch_deg, yaw_deg = truth[scan.index]
+            rows[i] = metres, np.deg2rad(pitch_deg), np.deg2rad(yaw_deg)
+    return Measured(scans, rows)
+
+
+def _digest(facts: Mapping[str, Any] | list[Any]) -> str:
+    text = json.dumps(facts, sort_keys=True, default=repr)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+QUANTITIES = ("range (%)", "pitch (degrees)", "yaw (degrees)")
+_LEAST = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One way to measure, over one dive or several.
+
+    Attributes
+    ----------
+    name : str
+    measured : tuple of Measured
+    ours : bool
+        Whether this is what `aqualvs` does by default.
+    """
+
+    name: str
+    measured: tuple[Measured, ...]
+    ours: bool = False
+
+    @property
+    def valid_percent(self) -> float:
+        """Share of the frames that have a posture."""
+        return 100.0 * float(np.mean(np.concatenate([m.valid for m in self.measured])))
+
+    @property
+    def errors(self) -> FloatArray:
+        """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
+        return np.concatenate([m.errors_told for m in self.measured])
+
+    @property
+    def rms(self) -> FloatArray:
+        """Root mean square of the errors, shape (3,); NaN where no frame has a posture."""
+        found = self.errors[np.isfinite(self.errors[:, 0])]
+        return np.asarray(np.sqrt(np.mean(found**2, axis=0))) if len(found) else np.full(3, np.nan)
+
+
+def findings(variants: Sequence[Variant]) -> tuple[Finding, ...]:
+    """Return a row for each variant: root mean square errors, and frames with a posture."""
+    return tuple(
+        Finding(
+            what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
+            paper="",
+            ours=f"{told(one.rms)}; {one.valid_percent:.0f} %",
+        )
+        for one in variants
+    )
+
+
+def told(values: Sequence[float] | FloatArray) -> str:
+    """Return numbers for a table, a dash for those that are not."""
+    return ", ".join("-" if not np.isfinite(x) else f"{x:.3g}" for x in values)
+
+
+def series(name: str, variants: Sequence[Variant]) -> Series:
+    """Return what `drawn` shows as columns."""
+    rms = np.array([one.rms for one in variants])
+    columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
+    for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
+        columns[what] = rms[:, k]
+    columns["valid_percent"] = np.array([one.valid_percent for one in variants])
+    return Series(name=name, columns=columns)
+
+
+def drawn(variants: Sequence[Variant]) -> "Figure":
+    """Draw rms errors as bars on a logarithmic scale, and the share of frames with a posture."""
+    from matplotlib import rc_context
+
+    names = [one.name for one in variants]
+    rms = np.array([one.rms for one in variants])
+    valid = np.array([one.valid_percent for one in variants])
+    with rc_context(dict(STYLE)):
+        figure = new_figure(0.9 + 0.3 * len(variants))
+        panels = figure.subplots(1, 4, sharey=True)
+        for k, axes in enumerate(panels[:3]):
+            _bars(axes, variants, rms[:, k], QUANTITIES[k])
+            axes.set_xscale("log")
+            low = np.nanmin(np.where(rms > 0.0, rms, np.nan)) if np.isfinite(rms).any() else _LEAST
+            axes.set_xlim(0.5 * max(low, _LEAST), 4.0 * max(np.nanmax(rms), 2.0 * _LEAST))
+        _bars(panels[3], variants, valid, "valid frames (%)")
+        panels[3].set_xlim(0.0, 125.0)
+        panels[0].set_yticks(range(len(names)), names)
+        panels[0].invert_yaxis()
+        panels[0].set_title("rms error", loc="left")
+    return figure
+
+
+def _bars(axes: "Axes", variants: Sequence[Variant], values: FloatArray, name: str) -> None:
+    colours = [OURS if one.ours else GREY for one in variants]
+    shown = np.where(np.isfinite(values), values, 0.0)
+    axes.barh(range(len(values)), shown, height=0.6, color=colours)
+    for k, value in enumerate(values):
+        words = f" {value:.2g}" if value < 1.0 else f" {value:.3g}"
+        if np.isfinite(value):
+            axes.text(value, k, words, va="center", fontsize=7.0)
+        else:
+            axes.text(
+                0.5, k, "none", va="center", fontsize=7.0, transform=axes.get_yaxis_transform()
+            )
+    axes.set_xlabel(name)
+    axes.grid(visible=False, axis="y")
+
+
+_SIZE = SetSize(camera=12, dome=10, box=4, index=1, dive=0)
+_CALIBRATED_RIG, _DRAFT, _RIG_READY = "rig.yaml", "draft.yaml", "pictures.json"
+
+
+def calibration_pictures(laboratory: Laboratory) -> CalibrationFiles:
+    """Return rendered pictures for a whole calibration of the laboratory's rig.
+
+    12 boards in air for the lens, 10 at known places in air for the dome, 4 of the box, in
+    air too, for the lasers. Rendered once.
+    """
+    folder = laboratory.folder("calibration")
+    if not (folder / _RIG_READY).exists():
+        files = simulate_calibration(
+            laboratory.rig, folder, size=_SIZE, progress=laboratory.rendered
+        )
+        _note_files(files, folder)
+    return _noted_files(folder)
+
+
+def calibrated_rig(laboratory: Laboratory) -> Rig:
+    """Return the laboratory's rig as calibrated from those pictures, in the tank's own water.
+
+    It carries its covariance, and the working range that `aqualvs calibrate` gives.
+    """
+    folder = laboratory.folder("calibration")
+    if not (folder / _CALIBRATED_RIG).exists():
+        _calibrate(
+            calibration_pictures(laboratory), folder / _CALIBRATED_RIG, len(laboratory.rig.lasers)
+        )
+    return load_rig(folder / _CALIBRATED_RIG).in_water(laboratory.rig.n_water)
+
+
+def rig_without_lasers(laboratory: Laboratory) -> Rig:
+    """Return what `calibrated_rig` came from: camera and dome solved, with their covariance."""
+    calibrated_rig(laboratory)
+    draft = laboratory.folder("calibration") / _DRAFT
+    return load_rig(draft, need_lasers=False).in_water(laboratory.rig.n_water)
+
+
+def _note_files(files: CalibrationFiles, folder: Path) -> None:
+    noted = {
+        name: str(value.relative_to(folder)) if isinstance(value, Path) else value
+        for name, value in asdict(files).items()
+    }
+    (folder / _RIG_READY).write_text(json.dumps(noted), encoding="utf-8")
+
+
+def _noted_files(folder: Path) -> CalibrationFiles:
+    noted: dict[str, Any] = json.loads((folder / _RIG_READY).read_text(encoding="utf-8"))
+    files: dict[str, Any] = {
+        name: folder / value if isinstance(value, str) else value for name, value in noted.items()
+    }
+    return CalibrationFiles(**files)
+
+
+def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:
+    # The last step writes the file that tells that all is done.
+    draft = rig.with_name(_DRAFT)
+    for step in (_camera, _dome):
+        step(files, draft)
+    _lasers(files, draft, rig, n_lasers)
+
+
+def _camera(files: CalibrationFiles, rig: Path) -> None:
+    calibrate_camera(
+        CameraRequest(
+            images=(str(files.camera),),
+            board=files.board,
+            out=rig,
+            nominal=files.nominal,
+            model="opencv",
+            n_coefficients=None,
+        ),
+        _say_nothing,
+    )
+
+
+def _dome(files: CalibrationFiles, rig: Path) -> None:
+    calibrate_dome(
+        DomeRequest(
+            images=(str(files.dome),),
+            board=files.rail_board,
+            rig=rig,
+            out=rig,
+            poses=files.poses,
+            medium="air",
+            water_images=(),
+            water_board=None,
+            water_poses=None,
+            inner_radius_mm=None,
+            thickness_mm=None,
+            n_acrylic=None,
+            radius_tolerance_mm=0.1,
+            thickness_tolerance_mm=0.1,
+            acrylic_tolerance=0.003,
+            distance_sigma_mm=0.2,
+            refine_intrinsics=True,
+        ),
+        _say_nothing,
+    )
+
+
+def _lasers(files: CalibrationFiles, draft: Path, rig: Path, n_lasers: int) -> None:
+    calibrate_lasers(
+        LasersRequest(
+            images=(str(files.box),),
+            rig=draft,
+            out=rig,
+            box=files.box_file,
+            board=None,
+            medium=None,
+            n_lasers=n_lasers,
+            names=None,
+            board_offset_mm=0.0,
+            refine=False,
+        ),
+        _say_nothing,
+    )
+
+
+def _say_nothing(_line: str) -> None:
+    """Take a line for the user, whom the experiment's own result interests more."""

@@ -1,0 +1,465 @@
+"""The mesh filter before a net, a box and a wall, where the paper has figures 12 to 14.
+
+Points as the paper's filter takes them, and reflections that either filter keeps.
+
+Points and reflections that are said to lie on the net, against those that do.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from aqualvs.experiments.dome_or_not import level_laser
+from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture
+from aqualvs.experiments.laboratory import Dive, Laboratory, Measured, frames_of, told
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.optics.rig import Rig
+from aqualvs.report.figure_style import OURS, PINK, STYLE, new_figure
+from aqualvs.report.mesh_figures import Reflections, drawn_figures
+from aqualvs.scanner import ScannerOptions
+from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
+from aqualvs.scanning.scan import Frame, Label, Scan, ScanPoints
+from aqualvs.simulation.scenario import Scenario, parse_scenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def papers_pixels(
+    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions, level: int | None = None
+) -> list[FilteredPoints]:
+    """Return the bright pixels of every frame, and what the paper's filter keeps of them.
+
+    The paper divides its picture by hand into one area for each laser; here our own classification
+    does it, which is better than such areas.
+
+    Parameters
+    ----------
+    laboratory : Laboratory
+    dive : Dive
+    options : MeshFilterOptions
+        Of the filter; by default those of section 5.2.
+    level : int, optional
+        Of the threshold, in grey levels.
+    """
+    detector = ThresholdOptions() if level is None else ThresholdOptions(level=level)
+    scans = laboratory.measure(dive, ScannerOptions(detector=detector)).scans
+    return filtered_points(scans, dive.rig, options, every_pixel=True)
+
+
+def papers_centres(
+    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions
+) -> list[FilteredPoints]:
+    """Return the pixels of every frame, on the mesh where the paper's filter keeps their return.
+
+    The filter is given one point for each sub-pixel return, as the paper does not do it.
+    """
+    scans = laboratory.measure(dive).scans
+    centres = filtered_points(scans, dive.rig, options, every_pixel=False)
+    return _pixels(scans, dive.rig, [one.on_mesh for one in centres])
+
+
+def adaptive_pixels(scans: Sequence[Scan], rig: Rig) -> list[FilteredPoints]:
+    """Return the pixels of scans, on the mesh where their return is labelled net."""
+    return _pixels(scans, rig, [np.asarray(scan.points.label == Label.NET) for scan in scans])
+
+
+def filtered_points(
+    scans: Sequence[Scan], rig: Rig, options: MeshFilterOptions, *, every_pixel: bool
+) -> list[FilteredPoints]:
+    """Return the points of scans, and what the paper's filter keeps of them."""
+    camera = rig.camera()
+    searches = plan_searches(rig, camera)
+    papers = PaperFilter(rig, camera, searches, options, every_pixel=every_pixel)
+    return [
+        papers.apply(scan.points.pixels, scan.points.width, scan.points.laser.astype(np.int64))
+        for scan in scans
+    ]
+
+
+def _pixels(scans: Sequence[Scan], rig: Rig, kept: Sequence[BoolArray]) -> list[FilteredPoints]:
+    found = filtered_points(scans, rig, MeshFilterOptions(), every_pixel=True)
+    return [replace(one, on_mesh=mine[one.source]) for one, mine in zip(found, kept, strict=True)]
+
+
+# The true points are a sample along the stripe, some 4 px apart.
+_SAME_PX, _FOUND_PX = 9.0, 3.0
+# True points of one reflection lie no farther apart.
+_NEXT_PX = 6.0
+
+
+class Judged(NamedTuple):
+    """Shares between 0 and 1: of what was said to be net, and of what is net."""
+
+    precision: float
+    recall: float
+
+
+@dataclass(frozen=True, slots=True)
+class LitTruth:
+    """Points that the lasers light and the camera sees, N of them.
+
+    Attributes
+    ----------
+    pixels : array, shape (N, 2)
+    laser : int array, shape (N,)
+    on_net : bool array, shape (N,)
+    """
+
+    pixels: FloatArray
+    laser: IntArray
+    on_net: BoolArray
+
+    @classmethod
+    def read(cls, path: Path) -> "LitTruth":
+        """Read a `points_FFFF.npz` of `simulate_dive`."""
+        with np.load(path) as stored:
+            net = stored["labels"].tolist().index("net")
+            return cls(
+                stored["px"], stored["laser"].astype(np.int64), np.asarray(stored["label"] == net)
+            )
+
+
+def judge(points: ScanPoints, truth: LitTruth) -> Judged:
+    """Compare the points labelled net with the true points; see `judge_pixels`."""
+    said = points.label == Label.NET
+    return judge_pixels(points.pixels[said], points.laser[said].astype(np.int64), truth)
+
+
+def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged:
+    """Compare points that are said to lie on the net with the true points of the same laser.
+
+    A point counts as what the nearest true point within 9 px is; a true point of the net is found
+    where such a point lies within 3 px.
+
+    Parameters
+    ----------
+    pixels : array, shape (N, 2)
+    laser : int array, shape (N,)
+    truth : LitTruth
+
+    Returns
+    -------
+    Judged
+        Precision is NaN where nothing can be judged, recall where there is no net.
+    """
+    right = judged = found = true = 0
+    for one in np.unique(truth.laser):
+        there = truth.laser == one
+        said, net = pixels[laser == one], truth.pixels[there & truth.on_net]
+        true += len(net)
+        if not len(said):
+            continue
+        distance, nearest = map(np.asarray, cKDTree(truth.pixels[there]).query(said))
+        near = distance < _SAME_PX
+        judged += int(np.count_nonzero(near))
+        right += int(np.count_nonzero(truth.on_net[there][nearest[near]]))
+        if len(net):
+            gap, _ = cKDTree(said).query(net)
+            found += int(np.count_nonzero(gap < _FOUND_PX))
+    return Judged(right / judged if judged else np.nan, found / true if true else np.nan)
+
+
+def judge_reflections(found: FilteredPoints, truth: LitTruth) -> Judged:
+    """Compare the reflections that are said to lie on the net with the true ones.
+
+    A reflection is a group of pixels of one laser that touch by sides or corners, and said to lie
+    on the net if more than half of its pixels are. It counts as what most of its pixels are, each
+    judged by the nearest true point within 9 px. A true reflection is a group of true points of
+    one laser and the net, no more than 6 px from one to the next; it is found if pixels of
+    reflections that are said to lie on the net lie within 3 px of more than half of its points.
+
+    Parameters
+    ----------
+    found : FilteredPoints
+        All pixels of the frame, and which of them are said to lie on the net.
+    truth : LitTruth
+
+    Returns
+    -------
+    Judged
+        As `judge_pixels`.
+    """
+    right = judged = n_found = n_true = 0
+    for one in np.unique(truth.laser):
+        there, mine = truth.laser == one, found.laser == one
+        net, pixels = truth.pixels[there & truth.on_net], found.pixels[mine]
+        group = _groups(net)
+        n_true += int(group.max(initial=-1)) + 1
+        if not found.on_mesh[mine].any():
+            continue
+        blob = _blobs(pixels)
+        kept = _mostly(found.on_mesh[mine], blob)
+        said = kept[blob]
+        if not said.any():
+            continue
+        distance, nearest = map(np.asarray, cKDTree(truth.pixels[there]).query(pixels))
+        near = distance < _SAME_PX
+        true = _mostly(truth.on_net[there][nearest[near]], blob[near], len(kept))
+        known = kept & (np.bincount(blob[near], minlength=len(kept)) > 0)
+        judged += int(np.count_nonzero(known))
+        right += int(np.count_nonzero(known & true))
+        if len(net):
+            gap, _ = cKDTree(pixels[said]).query(net)
+            n_found += int(np.count_nonzero(_mostly(np.asarray(gap) < _FOUND_PX, group)))
+    return Judged(right / judged if judged else np.nan, n_found / n_true if n_true else np.nan)
+
+
+def _blobs(pixels: FloatArray) -> IntArray:
+    """Return the group of each pixel; those of one group touch by sides or corners."""
+    if not len(pixels):
+        return np.empty(0, np.int64)
+    x, y = (np.floor(pixels) - np.floor(pixels).min(axis=0)).astype(np.int64).T
+    picture = np.zeros((y.max() + 1, x.max() + 1), np.uint8)
+    picture[y, x] = 1
+    return np.asarray(cv2.connectedComponents(picture, connectivity=8)[1][y, x] - 1, np.int64)
+
+
+def _groups(places: FloatArray) -> IntArray:
+    """Return the group of each true point; those of one group follow one another."""
+    n = len(places)
+    if not n:
+        return np.empty(0, np.int64)
+    first, second = cKDTree(places).query_pairs(_NEXT_PX, output_type="ndarray").T
+    graph = coo_array((np.ones(len(first), np.bool_), (first, second)), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def _mostly(holds: BoolArray, group: IntArray, n: int = 0) -> BoolArray:
+    """Return for each group whether something holds for more than half of its members."""
+    total = np.bincount(group, minlength=n)
+    return np.asarray(2 * np.bincount(group[holds], minlength=len(total)) > total)
+
+
+def mean_judged(found: Sequence[Judged]) -> Judged:
+    """Return the mean over frames; NaN where no frame says anything."""
+    columns = np.array(found, np.float64).reshape(-1, 2)
+    said = np.isfinite(columns)
+    means = [
+        float(column[here].mean()) if here.any() else np.nan
+        for column, here in zip(columns.T, said.T, strict=True)
+    ]
+    return Judged(*means)
+
+
+_JUDGED = (2, 8, 14, 20)
+_SHOWN = 8
+_BAR_PRECISION, _BAR_RECALL, _BAR_RANGE = 0.98, 0.95, 0.5
+
+
+def net_before_wall() -> Scenario:
+    """Return the dive: a net, a box beside it, and the tank's wall behind.
+
+    A diamond of 25 mm has half a diagonal and a diagonal of 18 and 35 mm: r_min and r_max of
+    section 5.2.
+    """
+    facts = {
+        "duration_s": 0.96,
+        "motion": {
+            "range_mm": [560, 640],
+            "pitch_deg": [2, -2],
+            "yaw_deg": [-4, 3],
+            "slide_x_mm": [0, 60],
+        },
+        "net": {"mesh": "diamond", "bar_mm": 25, "twine_mm": 2},
+        "walls": [{"behind_mm": 700, "yaw_deg": 3, "tile_mm": 150}],
+        "boxes": [{"centre_mm": [330, 120, -60], "heading_deg": 12}],
+    }
+    return parse_scenario(facts, "mesh", "mesh")
+
+
+def net_dive(laboratory: Laboratory) -> Dive:
+    """Return the dive before the net, shared with those who compare filters."""
+    return laboratory.dive(net_before_wall(), point_frames=_JUDGED)
+
+
+def truth_of(dive: Dive) -> list[tuple[int, LitTruth]]:
+    """Return the frames whose true points are known, with these."""
+    return [(i, LitTruth.read(dive.folder / f"points_{i:04d}.npz")) for i in _JUDGED]
+
+
+def _run(laboratory: Laboratory) -> Outcome:
+    dive = net_dive(laboratory)
+    measured, frames, truth = laboratory.measure(dive), frames_of(dive), truth_of(dive)
+    papers = papers_pixels(laboratory, dive, MeshFilterOptions())
+    adaptive = adaptive_pixels(measured.scans, dive.rig)
+    mine = mean_judged([judge(measured.scans[i].points, lit) for i, lit in truth])
+    whole = mean_judged([judge_reflections(adaptive[i], lit) for i, lit in truth])
+    theirs = mean_judged([_judge_each(papers[i], lit) for i, lit in truth])
+    their_whole = mean_judged([judge_reflections(papers[i], lit) for i, lit in truth])
+    return Outcome(
+        sentence=f"Of what the adaptive filter calls net {100 * mine.precision:.1f} % is net, and "
+        f"it keeps {100 * whole.recall:.0f} % of the net's reflections, with no parameter given; "
+        "a threshold and the paper's filter with its own parameters, given every bright pixel, "
+        f"keep {100 * their_whole.recall:.0f} %.",
+        findings=_findings(mine, whole, theirs, their_whole, measured),
+        pictures=_pictures(frames[_SHOWN], measured.scans[_SHOWN], papers[_SHOWN], dive.rig),
+        notes=(
+            "Truth: the points that the simulator lit, every fourth pixel of stripe. A reflection "
+            "is a group of connected bright pixels of one laser, and kept if more than half of "
+            "them are.",
+            "The paper's text leaves choices open; docs/mesh-filter.md tells which were made, and "
+            "why so little of a diamond net passes.",
+        ),
+    )
+
+
+def _judge_each(found: FilteredPoints, lit: LitTruth) -> Judged:
+    return judge_pixels(found.pixels[found.on_mesh], found.laser[found.on_mesh], lit)
+
+
+def _findings(
+    mine: Judged, whole: Judged, theirs: Judged, their_whole: Judged, measured: Measured
+) -> tuple[Finding, ...]:
+    worst = float(np.nanmax(np.abs(measured.range_percent)))
+    return (
+        Finding(
+            what="precision of net points",
+            paper="all other reflections rejected",
+            ours=f"{mine.precision:.3f}",
+            bar=f">= {_BAR_PRECISION}",
+            met=mine.precision >= _BAR_PRECISION,
+        ),
+        Finding(
+            what="recall of net points",
+            paper="",
+            ours=f"{mine.recall:.3f}",
+            bar=f">= {_BAR_RECALL}",
+            met=mine.recall >= _BAR_RECALL,
+        ),
+        Finding(what="precision and recall of net reflections", paper="", ours=told(whole)),
+        Finding(
+            what="threshold and paper's filter, section 5.2's parameters: of net pixels",
+            paper="",
+            ours=told(theirs),
+        ),
+        Finding(what="the same of net reflections", paper="", ours=told(their_whole)),
+        Finding(
+            what="largest error of the range to the net (%)",
+            paper="",
+            ours=f"{worst:.3f}",
+            bar=f"<= {_BAR_RANGE}",
+            met=bool(measured.valid.all()) and worst <= _BAR_RANGE,
+        ),
+    )
+
+
+def _pictures(frame: Frame, scan: Scan, papers: FilteredPoints, rig: Rig) -> tuple[Picture, ...]:
+    laser = level_laser(rig)
+    reflections = _reflections(papers, scan, rig, laser)
+    drawn = drawn_figures(reflections, MeshFilterOptions())
+    return (
+        Picture(
+            name="figure_12",
+            caption="The net as the camera sees it, and the picture above a threshold, beside "
+            "figure 12.",
+            figure=_seen(frame),
+        ),
+        Picture(
+            name="figure_13",
+            caption="All reflections of the level laser in its plane, beside figure 13.",
+            figure=drawn["figure_13"],
+        ),
+        Picture(
+            name="figure_14",
+            caption="What is taken for net, beside figure 14: sub-pixel returns and the adaptive "
+            "filter (left), a threshold and the paper's filter (right).",
+            figure=_filtered(papers, scan, rig, laser),
+        ),
+        Picture(
+            name="laser_plane_image",
+            caption="The paper's laser-plane image with its structuring elements, beside figure 9.",
+            figure=drawn["laser_plane_image"],
+        ),
+    )
+
+
+def _reflections(papers: FilteredPoints, scan: Scan, rig: Rig, laser: int) -> Reflections:
+    mine = papers.laser == laser
+    near, far = rig.working_range
+    distance = np.linalg.norm(papers.points_in_dome[mine], axis=1)
+    return Reflections(
+        frame=scan.index,
+        laser=rig.lasers[laser].name,
+        in_laser=_in_laser(papers.points_in_dome[mine], rig, laser),
+        offset=rig.lasers[laser].plane.offset,
+        working_range=rig.working_range,
+        usable=(distance >= near) & (distance <= far),
+        adaptive=np.zeros(int(mine.sum()), np.bool_),
+        paper=papers.on_mesh[mine],
+        every_pixel=True,
+    )
+
+
+def _in_laser(points_in_dome: FloatArray, rig: Rig, laser: int) -> FloatArray:
+    frame = laser_frame(rig.lasers[laser].plane)
+    return np.ascontiguousarray(frame.apply(points_in_dome)[:, :2])
+
+
+def _seen(frame: Frame) -> "Figure":
+    from matplotlib import rc_context
+
+    from aqualvs.sources.base import bgr_of
+
+    with rc_context(dict(STYLE)):
+        figure = new_figure(2.9)
+        left, right = figure.subplots(1, 2)
+        left.imshow(bgr_of(frame)[..., ::-1], interpolation="nearest")
+        level = ThresholdOptions().level
+        right.imshow(frame.luma >= level, cmap="gray", interpolation="nearest")
+        left.set_title("(a) as seen", loc="left")
+        right.set_title(f"(b) above {level} grey levels", loc="left")
+        for axes in (left, right):
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.grid(visible=False)
+    return figure
+
+
+def _filtered(papers: FilteredPoints, scan: Scan, rig: Rig, laser: int) -> "Figure":
+    from matplotlib import rc_context
+
+    own, bright = scan.points.laser == laser, papers.laser == laser
+    columns = (
+        (scan.points.points_in_dome[own], np.asarray(scan.points.label[own] == Label.NET)),
+        (papers.points_in_dome[bright], papers.on_mesh[bright]),
+    )
+    with rc_context(dict(STYLE)):
+        figure = new_figure(2.6)
+        names = ("(a) sub-pixel, adaptive filter", "(b) threshold, paper's filter")
+        for axes, (points, net), name in zip(
+            figure.subplots(1, 2, sharex=True, sharey=True), columns, names, strict=True
+        ):
+            near, far = rig.working_range
+            distance = np.linalg.norm(points, axis=1)
+            usable = (distance >= near) & (distance <= far)
+            xy, net = 1e3 * _in_laser(points[usable], rig, laser), net[usable]
+            axes.plot(*xy.T, ".", color=PINK, markersize=2.0, label=f"all ({len(xy)})")
+            kept = xy[net]
+            axes.plot(*kept.T, ".", color=OURS, markersize=2.0, label=f"net ({len(kept)})")
+            axes.set_title(name, loc="left")
+            axes.set_xlabel("x in the laser's plane (mm)")
+            axes.set_aspect("equal")
+            axes.legend(loc="upper left", markerscale=3.0)
+            axes.margins(x=0.06, y=0.5)
+        figure.axes[0].set_ylabel("y, forward (mm)")
+    return figure
+
+
+EXPERIMENT = Experiment(
+    name="mesh",
+    title="The mesh filter",
+    paper="section 5.2, figures 12 to 14",
+    about="A net with a box beside it and the wall of the tank behind. The paper's filter has its "
+    "parameters from section 5.2; the adaptive one finds the net by itself.",
+    run=_run,
+)

@@ -1,0 +1,462 @@
+"""The page of `aqualvs reproduce`: the paper's figures beside ours, in one file that prints well.
+
+There are no scripts, and nothing is asked of a network; figures are embedded, and link to the files
+beside the page.
+
+The folder that `aqualvs reproduce` writes: results, pictures, numbers, and times.
+
+==================  ========================================================================
+`reproduce.html`    everything, on one page
+`results.json`      all findings; the same version of aqualvs writes the same file
+`figures/`          every figure as PNG, PDF and SVG
+`series/`           the numbers behind the figures, as CSV
+`times.json`        how long each experiment took
+`failures/`         the traceback of an experiment that failed
+`work/`             rendered dives and what was solved from them, kept so that the same version is
+                    faster the next time; can be deleted
+==================  ========================================================================
+"""
+
+import base64
+import csv
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from html import escape
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aqualvs import __version__
+from aqualvs.experiments.experiment import Column, Experiment, Finding, Outcome, Picture, Series
+from aqualvs.report import html
+from aqualvs.report.figure_style import STYLE
+from aqualvs.report.findings import Card
+from aqualvs.results.files import writing
+
+RESULTS, TIMES, FIGURES, SERIES, WORK = "results.json", "times.json", "figures", "series", "work"
+DOI = "10.3390/robotics10040126"
+
+_FORMATS: Mapping[str, Mapping[str, str | None]] = {
+    "png": {"Software": None},
+    "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
+    "svg": {"Date": None, "Creator": None},
+}
+_MADE_BY = "made_by.txt"
+# What rounding differs by from run to run stays hidden.
+_DIGITS = 7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """A figure on disk: stem of its files in `figures/`, its caption, and its width in inches."""
+
+    file: str
+    caption: str
+    width_in: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """An experiment that was run, as `results.json` keeps it.
+
+    Attributes
+    ----------
+    name, title, paper, about : str
+        As in `Experiment`.
+    sentence : str
+    findings : tuple of Finding
+    pictures : tuple of Shown
+    series : tuple of str
+        Files in `series/`.
+    notes : tuple of str
+    failure : str
+        Why there is no outcome; empty if there is one.
+    """
+
+    name: str
+    title: str
+    paper: str
+    about: str
+    sentence: str = ""
+    findings: tuple[Finding, ...] = ()
+    pictures: tuple[Shown, ...] = ()
+    series: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    failure: str = ""
+
+
+def save_outcome(experiment: Experiment, outcome: Outcome, folder: Path) -> Record:
+    """Write the figures and series of an outcome and return its record.
+
+    Raises
+    ------
+    OutputError
+        If something cannot be written.
+    ValueError
+        If the columns of a series differ in length.
+    """
+    return Record(
+        name=experiment.name,
+        title=experiment.title,
+        paper=experiment.paper,
+        about=experiment.about,
+        sentence=outcome.sentence,
+        findings=outcome.findings,
+        pictures=tuple(_save_picture(experiment.name, one, folder) for one in outcome.pictures),
+        series=tuple(_save_series(experiment.name, one, folder) for one in outcome.series),
+        notes=outcome.notes,
+    )
+
+
+def write_results(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> None:
+    """Write `results.json` and `times.json`.
+
+    Raises
+    ------
+    OutputError
+        If one of them cannot be written.
+    """
+    content = {
+        "aqualvs": __version__,
+        "sources": sources_digest(),
+        "paper": f"https://doi.org/{DOI}",
+        "experiments": [asdict(record) for record in records],
+    }
+    _write_json(folder / RESULTS, content)
+    _write_json(folder / TIMES, {name: round(value, 1) for name, value in seconds.items()})
+
+
+def read_results(folder: Path) -> tuple[dict[str, Record], dict[str, float]]:
+    """Return what this version left in a folder, and how long it took; nothing of other versions.
+
+    Files that cannot be read count as missing: they are about to be written again.
+    """
+    try:
+        content = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
+        if content["sources"] != sources_digest():
+            return {}, {}
+        records = {one["name"]: _record(one) for one in content["experiments"]}
+        times = json.loads((folder / TIMES).read_text(encoding="utf-8"))
+        return records, {str(name): float(value) for name, value in times.items()}
+    except (OSError, ValueError, TypeError, KeyError):
+        return {}, {}
+
+
+def is_reproduced(folder: Path) -> bool:
+    """Return whether the experiments have been run in a folder before, by whichever version."""
+    return (folder / WORK / _MADE_BY).is_file()
+
+
+def work_folder(folder: Path) -> Path:
+    """Return the folder for rendered dives, emptied of what another version left in it.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    work = folder / WORK
+    mark = work / _MADE_BY
+    with writing(work):
+        if mark.is_file() and mark.read_text(encoding="utf-8") != sources_digest():
+            shutil.rmtree(work)
+        work.mkdir(parents=True, exist_ok=True)
+        mark.write_text(sources_digest(), encoding="utf-8")
+    return work
+
+
+@cache
+def sources_digest() -> str:
+    """Return a digest of the package's sources: what makes one version differ from another."""
+    digest = hashlib.sha256(__version__.encode())
+    for name, source in sorted(_sources(files("aqualvs"), ""), key=lambda one: one[0]):
+        digest.update(name.encode())
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _sources(folder: Traversable, above: str) -> list[tuple[str, Traversable]]:
+    found = []
+    for entry in folder.iterdir():
+        name = f"{above}/{entry.name}"
+        if entry.is_dir():
+            found.extend(_sources(entry, name))
+        elif name.endswith(".py"):
+            found.append((name, entry))
+    return found
+
+
+def _record(content: Mapping[str, Any]) -> Record:
+    texts = {key: str(content[key]) for key in ("name", "title", "paper", "about", "sentence")}
+    return Record(
+        **texts,
+        findings=tuple(Finding(**one) for one in content["findings"]),
+        pictures=tuple(Shown(**one) for one in content["pictures"]),
+        series=tuple(content["series"]),
+        notes=tuple(content["notes"]),
+        failure=str(content["failure"]),
+    )
+
+
+def _save_picture(name: str, picture: Picture, folder: Path) -> Shown:
+    import matplotlib as mpl
+
+    stem = f"{name}_{picture.name}"
+    place = folder / FIGURES
+    # The salt keeps the identifiers inside an SVG the same from run to run.
+    with writing(place), mpl.rc_context({**STYLE, "svg.hashsalt": stem}):
+        place.mkdir(parents=True, exist_ok=True)
+        for kind, metadata in _FORMATS.items():
+            picture.figure.savefig(place / f"{stem}.{kind}", metadata=dict(metadata))
+    width = round(float(picture.figure.get_figwidth()), 2)
+    return Shown(file=stem, caption=picture.caption, width_in=width)
+
+
+def _save_series(name: str, series: Series, folder: Path) -> str:
+    file = f"{name}_{series.name}.csv"
+    columns = [[_cell(value) for value in _plain(column)] for column in series.columns.values()]
+    rows = list(zip(*columns, strict=True))
+    path = folder / SERIES / file
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as out:
+            table = csv.writer(out, lineterminator="\n")
+            table.writerow(series.columns)
+            table.writerows(rows)
+    return file
+
+
+def _plain(column: Column) -> list[Any]:
+    return column if isinstance(column, list) else np.asarray(column).tolist()
+
+
+def _cell(value: str | int | float) -> str:
+    """Return a value as text; nothing where there is no number."""
+    if isinstance(value, float):
+        return f"{value:.{_DIGITS}g}" if math.isfinite(value) else ""
+    return str(value)
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    with writing(path):
+        path.write_text(text, encoding="utf-8", errors="replace")
+
+
+PAGE = "reproduce.html"
+FRAME = "a frame"
+"""Among the times: what the scanner takes for one frame (median); no experiment has this name."""
+
+_PAPERS_FPS = 25
+
+_DASH = "–"
+# A drawing with more marks than this weighs more than its picture, and opens slower.
+_LARGEST_SVG = 250_000
+_PX_PER_INCH = 125
+_HEAD = ("quantity", "paper", "ours", "bar", "met")
+
+
+def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> Path:
+    """Write the page from records, and from the figures that are in the folder.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        In the order in which they shall stand.
+    seconds : mapping
+        How long experiments took, as far as it is known.
+    folder : Path
+
+    Returns
+    -------
+    path : Path
+        The page; `reproduce.html` in the folder.
+
+    Raises
+    ------
+    OutputError
+        If a figure cannot be read or the page cannot be written.
+    """
+    path = folder / PAGE
+    with writing(path):
+        text = page_html(records, seconds, folder)
+        path.write_text(text, encoding="utf-8", errors="replace")
+    return path
+
+
+def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> str:
+    """Return the page as HTML; see `write_page`.
+
+    Raises
+    ------
+    OSError
+        If a figure cannot be read.
+    """
+    return html.page(
+        {
+            "version": html.text(__version__),
+            "doi": DOI,
+            "cards": html.cards(_cards(records, seconds)),
+            "notice": _notice(records),
+            "bars": _bars(records),
+            "contents": _contents(records),
+            "sections": "\n".join(
+                _section(record, seconds.get(record.name), folder) for record in records
+            ),
+            "results": RESULTS,
+            "css": html.asset("report.css") + html.asset("reproduce.css"),
+        },
+        "reproduce.html",
+    )
+
+
+def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[Card]:
+    bars = [finding.met for _, finding in _with_bar(records)]
+    done = sum(not record.failure for record in records)
+    took = sum(seconds.get(record.name, 0.0) for record in records)
+    yield Card("bars met", f"{sum(map(bool, bars))} of {len(bars)}", "what we hold ourselves to")
+    yield Card("experiments", f"{done} of {len(records)}", "done; each can be run alone")
+    yield Card("time", duration(took), f"on {os.cpu_count() or 1} cores")
+    if FRAME in seconds:
+        rate = 1.0 / seconds[FRAME]
+        yield Card("speed", f"{rate:.0f} fps", f"scanning, median frame; the paper: {_PAPERS_FPS}")
+
+
+def _notice(records: Sequence[Record]) -> str:
+    said = [f"{record.name} failed: {record.failure}" for record in records if record.failure]
+    said += [
+        f"{record.name}: {finding.what}: {finding.ours}, bar {_said(finding.bar)}"
+        for record, finding in _with_bar(records)
+        if not finding.met
+    ]
+    return html.notice(said) if said else ""
+
+
+def _with_bar(records: Sequence[Record]) -> list[tuple[Record, Finding]]:
+    return [
+        (record, finding)
+        for record in records
+        for finding in record.findings
+        if finding.met is not None
+    ]
+
+
+def _bars(records: Sequence[Record]) -> str:
+    rows = [(html.Raw(_link(record)), *_cells(finding)) for record, finding in _with_bar(records)]
+    if not rows:
+        return '<p class="note">None of these experiments has a bar to meet.</p>'
+    return html.table(("experiment", *_HEAD), rows, tail=len(_HEAD))
+
+
+def _contents(records: Sequence[Record]) -> str:
+    rows = [
+        (
+            html.Raw(_link(record)),
+            record.paper or "ours",
+            record.sentence or f"failed: {record.failure}",
+        )
+        for record in records
+    ]
+    return html.table(("experiment", "paper", "result"), rows, texts=3)
+
+
+def _link(record: Record) -> str:
+    return f'<a href="#{escape(record.name)}">{escape(record.title)}</a>'
+
+
+def _section(record: Record, seconds: float | None, folder: Path) -> str:
+    parts = [f'<p class="sub">{" · ".join(_origin(record, seconds))}</p>']
+    if record.about:
+        parts.append(f'<p class="lead">{escape(record.about)}</p>')
+    if record.failure:
+        parts.append(
+            f'<div class="notice warn"><p><b>Failed.</b> {escape(record.failure)}</p></div>'
+        )
+    if record.sentence:
+        parts.append(f'<p class="sentence">{escape(record.sentence)}</p>')
+    parts += [_figure(picture, folder) for picture in record.pictures]
+    if record.findings:
+        rows = map(_cells, record.findings)
+        parts.append(html.table(_HEAD, rows, tail=len(_HEAD) - 1))
+    if record.notes:
+        notes = "".join(f"<li>{escape(note)}</li>" for note in record.notes)
+        parts.append(f'<ul class="notes">{notes}</ul>')
+    if record.series:
+        files = ", ".join(_file_link(f"{SERIES}/{name}", name) for name in record.series)
+        parts.append(f'<p class="note files">Numbers: {files}</p>')
+    body = "\n".join(parts)
+    return (
+        f'<section id="{escape(record.name)}">\n<h2>{escape(record.title)}</h2>\n{body}\n</section>'
+    )
+
+
+def _origin(record: Record, seconds: float | None) -> Iterator[str]:
+    yield f"Paper: {escape(record.paper)}" if record.paper else "An ablation of ours"
+    if seconds is not None:
+        yield duration(seconds)
+    yield f"<code>aqualvs reproduce {escape(record.name)}</code>"
+
+
+def _cells(finding: Finding) -> tuple[str, ...]:
+    return (
+        finding.what,
+        finding.paper or _DASH,
+        html.Raw(f"<b>{escape(finding.ours)}</b>"),
+        _said(finding.bar) or _DASH,
+        _mark(finding.met),
+    )
+
+
+def _said(bar: str) -> str:
+    # The number stays on the line of its sign.
+    return bar.replace("<= ", "≤\u00a0").replace(">= ", "≥\u00a0")
+
+
+def _mark(met: bool | None) -> str:
+    if met is None:
+        return _DASH
+    words, kind = ("✓ yes", "met") if met else ("✗ no", "missed")
+    return html.Raw(f'<span class="{kind}">{words}</span>')
+
+
+def _figure(picture: Shown, folder: Path) -> str:
+    stem = folder / FIGURES / picture.file
+    drawing = stem.with_name(f"{stem.name}.svg")
+    if drawing.stat().st_size <= _LARGEST_SVG:
+        kind, data = "svg+xml", drawing.read_bytes()
+    else:
+        kind, data = "png", stem.with_name(f"{stem.name}.png").read_bytes()
+    files = " ".join(
+        _file_link(f"{FIGURES}/{picture.file}.{suffix}", suffix.upper())
+        for suffix in ("pdf", "png", "svg")
+    )
+    caption = escape(picture.caption)
+    width = f'style="max-width: {_PX_PER_INCH * picture.width_in:.0f}px"'
+    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    return (
+        f'<figure><img {width} src="{source}" alt="{caption}"><figcaption>{caption} '
+        f'<span class="files">{files}</span></figcaption></figure>'
+    )
+
+
+def _file_link(path: str, words: str) -> str:
+    return f'<a href="{escape(path)}">{escape(words)}</a>'
+
+
+def duration(seconds: float) -> str:
+    """Return a time as one would say it."""
+    if seconds < 10.0:
+        return f"{seconds:.1f} s"
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s"

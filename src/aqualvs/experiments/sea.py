@@ -1,0 +1,358 @@
+"""Down along a net at sea, distance and heading kept, where the paper has figure 22.
+
+Distance and yaw under control before a net, where the paper has figure 23.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aqualvs.control.gains_file import load_gains
+from aqualvs.control.missions import Guidance, Stage
+from aqualvs.control.vehicle import Setpoint, VehicleState
+from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.laboratory import Laboratory
+from aqualvs.follow.case import SimCase, Trials, sea, vehicle_model
+from aqualvs.follow.log import HoldMeasures, LoopLog, StepMeasures
+from aqualvs.follow.report import drawn_follow_figures
+from aqualvs.follow.sensor_model import RenderedEye, SampledEye
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_figure
+from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.simulation.net_motion import NetPosture, NetWall
+from aqualvs.simulation.scene import Net, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+_VEHICLES = {"bluerov2": "BlueROV2", "bluerov2-heavy": "BlueROV2 Heavy"}
+_SEED = 1
+_BAR_RANGE_MM, _BAR_YAW_DEG, _BAR_SETTLING_S, _BAR_OVERSHOOT = 15.0, 1.5, 4.0, 0.15
+_BAR_FOLLOW_MM, _BAR_FOLLOW_DEG = 30.0, 3.0
+_COLUMNS = ("range", "measured_range", "wanted_range", "forward")
+_ANGLES = ("yaw", "measured_yaw", "wanted_yaw")
+
+
+def _run_control(laboratory: Laboratory) -> Outcome:  # noqa: ARG001
+    held = {name: _trials(name).hold_and_step() for name in _VEHICLES}
+    followed = {name: _trials(name).follow() for name in _VEHICLES}
+    worst = max(1e3 * hold.range_rms for _, hold, _ in held.values())
+    yaw = max(math.degrees(hold.yaw_rms) for _, hold, _ in held.values())
+    return Outcome(
+        sentence=f"In a current of 0.3 m/s and waves both BlueROV2 keep their distance within "
+        f"{worst:.0f} mm and their yaw within {yaw:.1f} degrees (rms).",
+        findings=tuple(
+            row
+            for name in _VEHICLES
+            for row in (
+                *_hold_rows(_VEHICLES[name], *held[name][1:]),
+                *_follow_rows(_VEHICLES[name], *followed[name]),
+            )
+        ),
+        pictures=(
+            Picture(
+                name="figure_23",
+                caption="Setpoint, measurement and command of both controllers (BlueROV2): hold, "
+                "then a step of the range, beside figure 23.",
+                figure=drawn_follow_figures(held["bluerov2"][0])["figure_23"],
+            ),
+        ),
+        series=tuple(_series(name, log) for name, (log, _, _) in held.items()),
+        notes=(
+            "Simulated vehicles (Fossen's model with the published parameters of both) with the "
+            "packaged gains, steered by postures with sampled noise and a delay of 60 ms. "
+            "`aqualvs follow --sim --rendered` closes the loop through rendered pictures.",
+            "The paper prints curves without figures for this experiment.",
+        ),
+    )
+
+
+def _trials(name: str) -> Trials:
+    model = vehicle_model(name)
+    return Trials(model, load_gains(model.name), rendered=False, fps=25.0, seed=_SEED)
+
+
+def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[Finding, ...]:
+    range_mm, yaw_deg = 1e3 * hold.range_rms, math.degrees(hold.yaw_rms)
+    return (
+        Finding(
+            what=f"{vehicle}, hold: rms of range (mm), yaw (degrees)",
+            paper="",
+            ours=f"{range_mm:.1f}, {yaw_deg:.2f}",
+            bar=f"<= {_BAR_RANGE_MM:g}, {_BAR_YAW_DEG:g}",
+            met=range_mm <= _BAR_RANGE_MM and yaw_deg <= _BAR_YAW_DEG,
+        ),
+        Finding(
+            what=f"{vehicle}, step of 0.2 m: settling (s), overshoot (%)",
+            paper="",
+            ours=f"{step.settling:.1f}, {100.0 * step.overshoot:.0f}",
+            bar=f"<= {_BAR_SETTLING_S:g}, {100.0 * _BAR_OVERSHOOT:g}",
+            met=step.settling <= _BAR_SETTLING_S and step.overshoot <= _BAR_OVERSHOOT,
+        ),
+    )
+
+
+def _follow_rows(vehicle: str, log: LoopLog, follow: HoldMeasures) -> tuple[Finding, ...]:
+    range_mm, yaw_deg = 1e3 * follow.range_rms, math.degrees(follow.yaw_rms)
+    free = follow.least_clearance > 0.0 and follow.n_lost == 0
+    along = log.column("along")
+    return (
+        Finding(
+            what=f"{vehicle}, following a curved, moving net over {along[-1] - along[0]:.0f} m: "
+            "rms of range (mm), yaw (degrees)",
+            paper="",
+            ours=f"{range_mm:.1f}, {yaw_deg:.2f}" + ("" if free else "; touched or lost the net"),
+            bar=f"<= {_BAR_FOLLOW_MM:g}, {_BAR_FOLLOW_DEG:g}",
+            met=free and range_mm <= _BAR_FOLLOW_MM and yaw_deg <= _BAR_FOLLOW_DEG,
+        ),
+    )
+
+
+def _series(name: str, log: LoopLog) -> Series:
+    columns = {"time_s": log.column("time_s")}
+    for column in _COLUMNS:
+        columns[column if column == "forward" else f"{column}_m"] = log.column(column)
+    for column in _ANGLES:
+        columns[f"{column}_deg"] = np.degrees(log.column(column))
+    columns["turn"] = log.column("turn")
+    return Series(name=f"control_{name.replace('-', '_')}", columns=columns)
+
+
+CONTROL = Experiment(
+    name="control",
+    title="Distance and yaw under control",
+    paper="section 5.5, figure 23",
+    about="The vehicle holds 0.6 m and stays square to a net in a current of 0.3 m/s and waves, "
+    "then goes 0.2 m back; after that it follows a curved, moving net for a minute.",
+    run=_run_control,
+)
+
+
+_SECONDS, _EVERY = 40.0, 10
+_RANGE, _DESCENT = 0.6, 0.08
+_SEA_SEED = 22
+_BAR_PERCENT, _BAR_DEG, _BAR_VALID = 0.5, 0.5, 90.0
+
+
+class _Descent:
+    """A mission: sink at a constant speed, holding range and yaw."""
+
+    sways = False
+
+    def __init__(self, setpoint: Setpoint) -> None:
+        self._setpoint = setpoint
+
+    def update(
+        self,
+        now_s: float,  # noqa: ARG002
+        posture: Posture | None,
+        state: VehicleState,  # noqa: ARG002
+    ) -> Guidance:
+        """Return range, yaw and descent; nothing without the net."""
+        if posture is None:
+            return Guidance(setpoint=None, stage=Stage.WAITING)
+        return Guidance(setpoint=self._setpoint, down=_DESCENT, stage=Stage.CHANGING_DEPTH)
+
+    def restart(self) -> None:
+        """Nothing is kept."""
+
+
+@dataclass(slots=True)
+class _Watched:
+    """Steers by sampled postures, and looks at rendered pictures now and then.
+
+    A picture takes longer to render than all the rest of a second together; what the scanner makes
+    of every tenth of them is written down.
+    """
+
+    net: NetWall
+    steering: SampledEye
+    rendered: RenderedEye
+    laboratory: Laboratory
+    n_looks: int = 0
+    seen: list[tuple[float, Posture | Refusal, NetPosture]] = field(default_factory=list)
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
+        """Return the sampled posture."""
+        if self.n_looks % _EVERY == 0:
+            posture = self.rendered.look(world_from_dome, time_s)
+            truth = self.net.posture_at(world_from_dome, time_s)
+            self.seen.append((time_s, posture, truth))
+            self.laboratory.rendered(0, 0)
+        self.n_looks += 1
+        return self.steering.look(world_from_dome, time_s)
+
+
+def _run_sea(laboratory: Laboratory) -> Outcome:
+    eye, log = _dive(laboratory)
+    time_s = np.array([t for t, _, _ in eye.seen])
+    valid = np.array([bool(posture) for _, posture, _ in eye.seen])
+    errors = _errors(eye)
+    found = errors[valid]
+    rms = np.sqrt(np.mean(found**2, axis=0))
+    share = 100.0 * float(valid.mean())
+    depth = log.column("depth")
+    return Outcome(
+        sentence=f"Sinking from {depth[0]:.1f} to {depth[-1]:.1f} m along a net that moves, range "
+        f"is told within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in {share:.0f} % "
+        "of the pictures.",
+        findings=(
+            Finding(
+                what="pictures with a posture (%)",
+                paper="",
+                ours=f"{share:.0f} of {len(valid)}",
+                bar=f">= {_BAR_VALID:g}",
+                met=share >= _BAR_VALID,
+            ),
+            Finding(
+                what="rms error of the range (%)",
+                paper="",
+                ours=f"{rms[0]:.3f}",
+                bar=f"<= {_BAR_PERCENT}",
+                met=bool(rms[0] <= _BAR_PERCENT),
+            ),
+            Finding(
+                what="rms error of pitch, yaw (degrees)",
+                paper="",
+                ours=f"{rms[1]:.3f}, {rms[2]:.3f}",
+                bar=f"<= {_BAR_DEG}",
+                met=bool(rms[1:].max() <= _BAR_DEG),
+            ),
+            Finding(
+                what="correlation of heading and target yaw",
+                paper="some",
+                ours=f"{_correlation(log):+.2f}",
+            ),
+        ),
+        pictures=(
+            Picture(
+                name="figure_22",
+                caption="Depth, range, heading and yaw of the net over the dive, beside figure "
+                "22. Dots: measured in rendered pictures; lines: truth.",
+                figure=_drawn(eye, log, valid),
+            ),
+        ),
+        series=(_sea_series(eye, time_s),),
+        notes=(
+            "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m before a net of a "
+            "cage of 20 m radius that sways and rocks. It is steered by postures with sampled "
+            "noise at 25 Hz, and every tenth picture is rendered and measured; `aqualvs follow "
+            "--sim --rendered` renders all of them.",
+            "A vehicle that turns to the right sees a net that turns to the left: heading and yaw "
+            "go against each other here, where yaw is positive to the right. What the net itself "
+            "does weakens that, at sea as here.",
+            "Range and angles count against the tangent plane of the net at the nearest point, a "
+            "twine's radius behind the light.",
+        ),
+    )
+
+
+def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
+    net = NetWall(curvature=-1.0 / 20.0, sway=0.04, sway_period=9.0, rock=math.radians(3.0))
+    model = vehicle_model("bluerov2")
+    case = SimCase(
+        model=model,
+        gains=load_gains(model.name),
+        water=sea(current=0.15, waves=0.1, seed=_SEA_SEED),
+        net=net,
+        start_range=_RANGE,
+        seed=_SEA_SEED,
+    )
+    scene = Scene(
+        dome_from_scene=SE3.identity(),
+        nets=(Net(bar=0.025, twine=0.0022, fouling=0.2, seed=_SEA_SEED),),
+        target="net",
+    )
+    eye = _Watched(
+        net,
+        SampledEye(net, np.random.default_rng([_SEA_SEED, 1])),
+        RenderedEye(net, laboratory.rig, np.random.default_rng([_SEA_SEED, 2]), scene),
+        laboratory,
+    )
+    loop = case.loop(eye, _Descent(Setpoint(_RANGE)))
+    return eye, loop.run(_SECONDS)
+
+
+def _errors(eye: _Watched) -> FloatArray:
+    """Return errors of range in percent, pitch and yaw in degrees; NaN where refused."""
+    rows = np.full((len(eye.seen), 3), np.nan)
+    for i, (_, posture, truth) in enumerate(eye.seen):
+        if isinstance(posture, Posture):
+            rows[i] = (
+                100.0 * (posture.range / truth.range - 1.0),
+                math.degrees(posture.pitch - truth.pitch),
+                math.degrees(posture.yaw - truth.yaw),
+            )
+    return rows
+
+
+def _correlation(log: LoopLog) -> float:
+    heading = np.unwrap(log.column("heading"))
+    return float(np.corrcoef(heading, log.column("yaw"))[0, 1])
+
+
+def _measured(eye: _Watched) -> FloatArray:
+    """Return range (m), pitch and yaw (deg) measured, NaN where refused; shape (N, 3)."""
+    return np.array(
+        [
+            (p.range, math.degrees(p.pitch), math.degrees(p.yaw))
+            if isinstance(p, Posture)
+            else (math.nan,) * 3
+            for _, p, _ in eye.seen
+        ]
+    )
+
+
+def _sea_series(eye: _Watched, time_s: FloatArray) -> Series:
+    measured = _measured(eye)
+    truth = [(t.range, math.degrees(t.pitch), math.degrees(t.yaw)) for _, _, t in eye.seen]
+    names = ("range_m", "pitch_deg", "yaw_deg")
+    columns: dict[str, FloatArray] = {"time_s": time_s}
+    for k, name in enumerate(names):
+        columns[f"true_{name}"] = np.array(truth)[:, k]
+        columns[name] = measured[:, k]
+    return Series(name="sea", columns=columns)
+
+
+def _drawn(eye: _Watched, log: LoopLog, valid: FloatArray) -> "Figure":
+    from matplotlib import rc_context
+
+    time_s, seen_s = log.column("time_s"), np.array([t for t, _, _ in eye.seen])
+    measured = _measured(eye)
+    with rc_context(dict(STYLE)):
+        figure = new_figure(5.0)
+        depth, ranges, angles = figure.subplots(3, 1, sharex=True)
+        depth.plot(time_s, log.column("depth"), color=BLUE)
+        depth.invert_yaxis()
+        depth.set_ylabel("depth (m)")
+        ranges.plot(time_s, log.column("range"), color=DARK, alpha=0.5, label="true")
+        ranges.plot(seen_s[valid], measured[valid, 0], ".", color=BLUE, label="measured")
+        ranges.set_ylabel("range (m)")
+        ranges.legend(loc="upper right", ncols=2)
+        heading = np.degrees(np.unwrap(log.column("heading")))
+        angles.plot(time_s, heading - heading[0], color=ORANGE, label="heading, from its start")
+        angles.plot(time_s, np.degrees(log.column("yaw")), color=DARK, alpha=0.5, label="true yaw")
+        angles.plot(seen_s[valid], measured[valid, 2], ".", color=BLUE, label="measured yaw")
+        angles.axhline(0.0, color=GREY, linewidth=0.6)
+        angles.set_ylabel("angle (degrees)")
+        angles.set_xlabel("time (s)")
+        angles.legend(loc="upper right", ncols=3)
+        for axes in (ranges, angles):
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high + 0.25 * (high - low))
+        figure.align_ylabels((depth, ranges, angles))
+    return figure
+
+
+SEA = Experiment(
+    name="sea",
+    title="Down along a net at sea",
+    paper="section 5.5, figure 22",
+    about="The vehicle sinks along the net of a cage in current and waves, keeping its distance; "
+    "the net sways and rocks. Depth and heading come from the vehicle's own sensors.",
+    run=_run_sea,
+)

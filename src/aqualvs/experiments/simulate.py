@@ -1,0 +1,143 @@
+"""`aqualvs simulate`: a dive with known truth, or pictures for a calibration."""
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+from aqualvs.errors import OptionError
+from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.solved import with_exact_numbers
+from aqualvs.results.files import Claim, writing
+from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
+from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
+from aqualvs.simulation.dive import LEAD_S, simulate_dive, write_hole_truth, write_vehicle_log
+from aqualvs.simulation.scenario import Scenario
+from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
+from aqualvs.terminal import progress
+
+CALIBRATION = "calibration"
+"""What is given in a scenario's place to render pictures for a calibration."""
+
+_ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
+_LOG, _HOLES = "vehicle.csv", "truth_holes.csv"
+_FILES = ("dive.mp4", "truth.csv", "rig.yaml", _LOG, _HOLES)
+_CALIBRATION_FILES = ("camera_air", "dome_air", "box", "index", "dive", "truth", "nominal.yaml")
+
+
+def simulate(
+    scenario: str | None,
+    rig_file: Path | None,
+    out: Path | None,
+    tell: Callable[[str], object],
+    *,
+    camera: str,
+    overwrite: bool,
+) -> None:
+    """Render a scenario into a folder and tell how to run it.
+
+    Parameters
+    ----------
+    scenario : str or None
+        Built-in name or path of a YAML file; `CALIBRATION` for pictures to calibrate from.
+    rig_file : Path or None
+        None takes the example rig.
+    out : Path or None
+        Folder to write.
+    tell : callable
+        Takes one line of text.
+    camera : str
+        Name of the camera that takes the pictures.
+    overwrite : bool
+        Whether what is already there may be replaced.
+
+    Raises
+    ------
+    AqualvsError
+        If scenario, camera, rig or folder cannot be used.
+    """
+    if scenario is None:
+        raise OptionError("SCENARIO: missing; choose one from aqualvs simulate --list")
+    if out is None:
+        raise OptionError("--out: missing; give the folder to write")
+    eye = simulated_camera(camera)
+    if scenario == CALIBRATION:
+        _simulate_calibration(rig_file, out, tell, camera=eye, overwrite=overwrite)
+        return
+    course = load_scenario(scenario)
+    rig = example_rig() if rig_file is None else load_rig(rig_file)
+    claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
+    with claim, writing(out), progress(scenario, course.n_frames) as tick:
+        _write_net_truth(course, out)
+        dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1), camera=eye)
+        save_rig(with_exact_numbers(rig), out / "rig.yaml")
+    tell(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
+    tell(
+        f"next: aqualvs run {dive.video} --rig {out / 'rig.yaml'} --truth {dive.truth} "
+        f"-o {out / 'run'}"
+    )
+    if course.nets:
+        tell(
+            f"then: aqualvs net {out / 'run'} --log {out / _LOG} --log-offset-s {LEAD_S:g}; "
+            f"true holes: {out / _HOLES}"
+        )
+
+
+def _write_net_truth(course: Scenario, out: Path) -> None:
+    """Write the vehicle's log and the true holes beside a dive along a net."""
+    if course.nets:
+        out.mkdir(parents=True, exist_ok=True)
+        write_vehicle_log(course, out / _LOG)
+        write_hole_truth(course, out / _HOLES)
+
+
+def _simulate_calibration(
+    rig_file: Path | None,
+    out: Path,
+    tell: Callable[[str], object],
+    *,
+    camera: SimulatedCamera,
+    overwrite: bool,
+) -> None:
+    rig = example_rig() if rig_file is None else load_rig(rig_file)
+    claim = Claim("simulate", [out / name for name in _CALIBRATION_FILES], overwrite=overwrite)
+    with claim, writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
+        files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1), camera=camera)
+    tell(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
+    tell("next:")
+    for command in calibration_commands(files, out, len(rig.lasers)):
+        tell(f"  aqualvs {shlex.join(command)}")
+
+
+def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
+    """Return the arguments of `aqualvs` that calibrate from a simulated set, in turn.
+
+    Parameters
+    ----------
+    files : CalibrationFiles
+        The set.
+    out : Path
+        Folder in which `rig.yaml` and `run` are to be written.
+    n_lasers : int
+        Lasers of the rig.
+    """
+    rig = str(out / "rig.yaml")
+    update = ["--rig", rig, "-o", rig]
+    camera = [str(files.camera), f"--board={files.board}", f"--nominal={files.nominal}", "-o", rig]
+    dome = [str(files.dome), f"--board={files.rail_board}", f"--poses={files.poses}", *update]
+    lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={n_lasers}", *update]
+    water = [str(files.index), f"--target={files.target}", *update]
+    steps = {"camera": camera, "dome": dome, "lasers": lasers, "water": water}
+    commands = [["calibrate", step, *arguments] for step, arguments in steps.items()]
+    commands.append(["check", rig, "--against", str(files.rig)])
+    if files.dive is not None:
+        dive = [str(files.dive), "--rig", rig, "--truth", str(files.dive_truth)]
+        commands.append(["run", *dive, "-o", str(out / "run")])
+    return commands
+
+
+def tell_scenarios(tell: Callable[[str], object]) -> None:
+    """Tell the built-in scenarios, one line each."""
+    scenarios = {**list_scenarios(), CALIBRATION: _ABOUT_CALIBRATION}
+    width = max(map(len, scenarios))
+    for name, about in scenarios.items():
+        tell(f"{name:{width}}  {about}")

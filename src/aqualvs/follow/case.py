@@ -1,0 +1,234 @@
+"""What is simulated in one run: vehicle, sea, net, delays; and how it becomes a loop.
+
+The three trials that a loop is judged by: hold, step, follow; in one sea before one net.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from aqualvs.control.autopilot import NetPilot
+from aqualvs.control.controller import RangeYawController
+from aqualvs.control.gains import ControlGains
+from aqualvs.control.missions import FollowMission, HoldMission, Mission
+from aqualvs.control.safety import SafetyGate, SafetyLimits
+from aqualvs.control.tune import tune
+from aqualvs.control.vehicle import Setpoint
+from aqualvs.errors import OptionError
+from aqualvs.follow.log import HoldMeasures, LoopLog, StepMeasures, hold_measures, step_measures
+from aqualvs.follow.loop import Eye, SimulatedLink, SimulatedLoop, Timing
+from aqualvs.follow.sensor_model import RenderedEye, SampledEye
+from aqualvs.simulation.net_motion import NetWall
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.vehicle.models import BLUEROV2, BLUEROV2_HEAVY, VIDEORAY, VehicleModel
+from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
+from aqualvs.simulation.vehicle.water_motion import Tether, WaterMotion, Waves
+
+VEHICLE_NAMES = ("bluerov2", "bluerov2-heavy", "videoray")
+_MODELS = dict(zip(VEHICLE_NAMES, (BLUEROV2, BLUEROV2_HEAVY, VIDEORAY), strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimCase:
+    """One simulated run.
+
+    Attributes
+    ----------
+    model : VehicleModel
+        The true vehicle.
+    gains : ControlGains
+        Of the controller, for what it believes the vehicle to be.
+    water : WaterMotion
+    net : NetWall
+    start_range, start_yaw : float
+        Posture at the start, at rest, in metres and radians.
+    timing : Timing
+        Of the frames.
+    wire : float
+        Time from an effort to its arrival at the vehicle, in seconds.
+    limits : SafetyLimits
+        Of the safety gate.
+    seed : int
+        Of the noise of sensors and pictures.
+    """
+
+    model: VehicleModel
+    gains: ControlGains
+    water: WaterMotion = field(default_factory=WaterMotion)
+    net: NetWall = field(default_factory=NetWall)
+    start_range: float = 0.6
+    start_yaw: float = 0.0
+    timing: Timing = field(default_factory=Timing)
+    wire: float = 0.02
+    limits: SafetyLimits = field(default_factory=SafetyLimits)
+    seed: int = 0
+
+    def loop(self, eye: Eye, mission: Mission) -> SimulatedLoop:
+        """Return the loop, ready to run."""
+        dome = self.net.station(self.start_range, yaw=self.start_yaw)
+        vehicle = SimulatedVehicle(
+            self.model,
+            self.water,
+            np.random.default_rng([self.seed, 41]),
+            dome @ self.model.body_from_dome.inverse(),
+            latency=self.wire,
+        )
+        controller = RangeYawController(self.gains)
+        steering = NetPilot(mission, controller, SafetyGate(self.limits))
+        return SimulatedLoop(SimulatedLink(vehicle), self.net, eye, steering, self.timing)
+
+
+def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
+    """Return a vehicle by the name that the command line knows.
+
+    Parameters
+    ----------
+    name : str
+    pilot_gain : float
+        ArduSub's: the share of the thrust that a full effort asks for.
+
+    Raises
+    ------
+    OptionError
+        If there is no such vehicle, or the gain is none.
+    """
+    model = _MODELS.get(name.replace("_", "-"))
+    if model is None:
+        raise OptionError(f"--vehicle {name}: not known; choose one of {', '.join(VEHICLE_NAMES)}")
+    return replace(model, sticks=replace(model.sticks, gain=pilot_gain))
+
+
+def tuned_gains(model: VehicleModel) -> ControlGains:
+    """Return the gains that `aqualvs tune` gives for a vehicle."""
+    return tune(model).gains
+
+
+def sea(
+    *,
+    current: float = 0.3,
+    current_to: float = math.radians(60.0),
+    wander: float = 0.0,
+    waves: float = 0.1,
+    period: float = 5.0,
+    waves_to: float = math.radians(20.0),
+    tether: float = 15.0,
+    seed: int = 0,
+) -> WaterMotion:
+    """Return a sea with a current, irregular waves and a tether.
+
+    Parameters
+    ----------
+    current : float
+        Speed in m/s.
+    current_to : float
+        Direction it flows to, in radians clockwise from the direction in which one looks at the
+        net (north): 0 presses the vehicle against the net.
+    wander : float
+        Standard deviation of slow changes of the current, in m/s.
+    waves : float
+        Amplitude in metres at the surface; 0 is a calm. The net hangs 5 m deep.
+    period : float
+        Of the waves, in seconds.
+    waves_to : float
+        Direction they go, as of the current.
+    tether : float
+        Its length in the water, in metres.
+    seed : int
+        Of the phases.
+    """
+    flow = (current * math.cos(current_to), current * math.sin(current_to), 0.0)
+    swell = Waves(amplitude=waves, period=period, direction=waves_to, n=6) if waves else None
+    return WaterMotion(
+        current=flow,
+        wander=wander,
+        waves=swell,
+        tether=Tether(length=tether),
+        seed=seed,
+    )
+
+
+RANGE, STEP, SWAY = 0.6, 0.2, 0.2
+"""Held, by how much it is stepped, in metres; speed along the net, in m/s."""
+FROM_REST_S = 10.0
+"""A run begins at rest in the current; so long it may take to settle."""
+STEP_S, HOLD_END_S, FOLLOW_END_S = 40.0, 52.0, 70.0
+"""When the step comes, and when the two runs end."""
+CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1.0))
+"""The inside of a cage of 10 m radius, that sways and rocks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """Runs of one vehicle.
+
+    Parameters
+    ----------
+    model : VehicleModel
+    gains : ControlGains
+    rendered : bool
+        Pictures through the scanner, else postures with its noise.
+    fps : float
+        Frames a second.
+    seed : int
+        Of waves and noise.
+    waves : float
+        Amplitude in metres.
+    """
+
+    model: VehicleModel
+    gains: ControlGains
+    rendered: bool = False
+    fps: float = 25.0
+    seed: int = 0
+    waves: float = 0.1
+
+    def begin(self, seconds: float) -> LoopLog:
+        """Take hold before a flat net, from rest in the current."""
+        case = self._case(NetWall())
+        return case.loop(self._eye(case), HoldMission(Setpoint(RANGE))).run(seconds)
+
+    def hold_and_step(
+        self, seconds: float = HOLD_END_S, step_s: float = STEP_S
+    ) -> tuple[LoopLog, HoldMeasures, StepMeasures]:
+        """Hold before a flat net, then step away from it."""
+        case = self._case(NetWall())
+        mission = HoldMission(Setpoint(RANGE))
+
+        def step(now_s: float) -> None:
+            if now_s >= step_s:
+                mission.setpoint = Setpoint(RANGE + STEP)
+
+        log = case.loop(self._eye(case), mission).run(seconds, step)
+        answer = step_measures(
+            log.column("time_s"), log.column("range"), step_s, RANGE, RANGE + STEP
+        )
+        # The setpoint in force lags the frame by its delay.
+        return log, hold_measures(log, FROM_REST_S, step_s), answer
+
+    def follow(
+        self, seconds: float = FOLLOW_END_S, every_frame: Callable[[float], object] | None = None
+    ) -> tuple[LoopLog, HoldMeasures]:
+        """Go along a curved net that moves."""
+        case = self._case(CURVED)
+        mission = FollowMission(Setpoint(RANGE), SWAY)
+        log = case.loop(self._eye(case), mission).run(seconds, every_frame)
+        return log, hold_measures(log, FROM_REST_S)
+
+    def _case(self, net: NetWall) -> SimCase:
+        return SimCase(
+            model=self.model,
+            gains=self.gains,
+            water=sea(waves=self.waves, seed=self.seed),
+            net=net,
+            start_range=RANGE,
+            timing=Timing(fps=self.fps),
+            seed=self.seed,
+        )
+
+    def _eye(self, case: SimCase) -> Eye:
+        rng = np.random.default_rng([self.seed, 53])
+        if self.rendered:
+            return RenderedEye(case.net, example_rig(), rng)
+        return SampledEye(case.net, rng)

@@ -1,0 +1,432 @@
+"""`aqualvs follow --sim`: the loop in simulation, as a log, figures and a summary.
+
+A simulated loop on the pilot's page, in real time.
+
+What is told while a loop is simulated, and when it ends.
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aqualvs.control.autopilot import Decision
+from aqualvs.control.follow_log import FollowLog
+from aqualvs.control.missions import HoldMission, Mission, Stage
+from aqualvs.control.plan import load_plan
+from aqualvs.control.safety import Reason, SafetyLimits
+from aqualvs.control.tune import usable_gains
+from aqualvs.control.vehicle import Setpoint, SetpointHolder, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
+from aqualvs.follow.log import write_log
+from aqualvs.follow.loop import Eye, SimulatedLoop, Timing
+from aqualvs.follow.report import FIGURE_FILES, PAGE, RunFacts, summary_lines, write_report
+from aqualvs.follow.sensor_model import Blind, Loss, RenderedEye, SampledEye
+from aqualvs.live.options import serve_page
+from aqualvs.live.outputs.base import Output
+from aqualvs.live.pilot import PilotReport
+from aqualvs.optics.rig import Rig
+from aqualvs.recording.sample import Instants, LiveSample
+from aqualvs.results.files import Claim
+from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.scan import Frame, Scan, ScanPoints
+from aqualvs.simulation.cameras import simulated_camera
+from aqualvs.simulation.net_motion import NetWall
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.sources.base import Health, PartHealth, State
+from aqualvs.terminal import StopSignals
+
+# So far behind the clock, a run does not try to catch up.
+_LATE_S = 0.2
+# Frames that the share of valid ones counts.
+_N_SHARE = 50
+
+
+class LoopPage:
+    """Shows a loop step by step, and lets it run no faster than the clock.
+
+    Parameters
+    ----------
+    page : Output
+        Closed with this.
+    rig : Rig
+    loop : SimulatedLoop
+    holder : SetpointHolder
+        Where the page puts the setpoint; a mission that holds follows it.
+    """
+
+    def __init__(self, page: Output, rig: Rig, loop: SimulatedLoop, holder: SetpointHolder) -> None:
+        self._page, self._rig, self._loop, self._holder = page, rig, loop, holder
+        self._began_s = time.monotonic()
+        self._valid: deque[bool] = deque(maxlen=_N_SHARE)
+
+    def keep_pace(self, now_s: float) -> None:
+        """Take over the page's setpoint, and wait for the clock to reach a simulated time."""
+        mission = self._loop.steering.mission
+        if isinstance(mission, HoldMission):
+            mission.setpoint = self._holder.setpoint
+        ahead_s = self._began_s + now_s - time.monotonic()
+        if ahead_s > 0.0:
+            time.sleep(ahead_s)
+        elif ahead_s < -_LATE_S:
+            self._began_s -= ahead_s
+
+    def take(
+        self,
+        _now_s: float,
+        frame_s: float,
+        posture: Posture | Refusal,
+        decision: Decision,
+        state: VehicleState,
+    ) -> None:
+        """Show one step of the pilot."""
+        frame, scan = self._seen(frame_s, posture)
+        self._valid.append(bool(posture))
+        now_ns = time.monotonic_ns()
+        report = PilotReport(
+            at_ns=now_ns,
+            frame=scan.index,
+            engaged=decision.engaged,
+            effort=decision.effort,
+            reason=decision.reason,
+            guidance=decision.guidance,
+            state=state,
+        )
+        sample = LiveSample(
+            rig=self._rig,
+            scan=scan,
+            returns={},
+            frame=frame,
+            utc_ns=time.time_ns(),
+            instants=Instants(now_ns, now_ns, now_ns),
+            filtered=self._loop.filtered,
+            health=self._health(report),
+        )
+        self._page.send(sample)
+
+    def close(self) -> None:
+        """End the page."""
+        self._page.close()
+
+    def _seen(self, frame_s: float, posture: Posture | Refusal) -> tuple[Frame | None, Scan]:
+        """Return the picture of a step with its points, where pictures are rendered."""
+        eye = self._loop.eye
+        if isinstance(eye, RenderedEye):
+            for frame, scan in eye.shots:
+                if scan.posture is posture:
+                    return frame, scan
+        index = round(frame_s * self._loop.timing.fps)
+        return None, Scan(index, frame_s, posture, ScanPoints.none(), self._rig.n_water)
+
+    def _health(self, report: PilotReport) -> Health:
+        link = self._loop.link
+        eye = "rendered pictures" if isinstance(self._loop.eye, RenderedEye) else "no pictures"
+        vehicle = f"{report.state.mode_name}, effort forward {report.effort.forward:+.2f}"
+        return Health(
+            rate_hz=self._loop.timing.fps,
+            valid_share=sum(self._valid) / len(self._valid),
+            n_frames=report.frame + 1,
+            source=PartHealth("simulation", State.OK, eye),
+            outputs=(
+                PartHealth("pilot", report.colour, report.words),
+                PartHealth(link.name, State.OK, vehicle),
+            ),
+        )
+
+
+_TELL_EVERY_S = 10.0
+# A plan that is over goes on to hold: long enough to see that it does.
+_HOLDS_ON_S = 5.0
+# A report needs some rows.
+_LEAST_S = 1.0
+
+
+class RunWatch:
+    """Called before each frame; returns whether to go on.
+
+    Parameters
+    ----------
+    loop : SimulatedLoop
+    seconds : float
+        Of the whole run.
+    tell : callable
+        Takes one line.
+    stop : StopSignals
+    slow : bool
+        Whether a second takes seconds, so that the way is told.
+    """
+
+    def __init__(
+        self,
+        loop: SimulatedLoop,
+        seconds: float,
+        tell: Callable[[str], object],
+        stop: StopSignals,
+        *,
+        slow: bool,
+    ) -> None:
+        self._loop, self._seconds, self._tell, self._stop = loop, seconds, tell, stop
+        self._told_s = 0.0 if slow else math.inf
+        self._over_s = math.inf
+
+    def __call__(self, now_s: float) -> bool:
+        """Tell what has changed; False ends the run."""
+        if now_s - self._told_s >= _TELL_EVERY_S:
+            self._told_s = now_s
+            self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
+        if not self._loop.steering.engaged:
+            self._tell(f"at {now_s:.1f} s: {self._last_words()}; here a pilot takes over")
+            return False
+        if self._over_s == math.inf and self._is_over():
+            self._over_s = now_s
+            self._tell(f"at {now_s:.1f} s: {Reason.MISSION_OVER.words}")
+        stopped = self._stop.caught is not None and now_s >= _LEAST_S
+        return not stopped and now_s < self._over_s + _HOLDS_ON_S
+
+    def _is_over(self) -> bool:
+        rows = self._loop.log.rows
+        return bool(rows) and rows[-1].stage == Stage.OVER.value
+
+    def _last_words(self) -> str:
+        reason = self._loop.steering.gate.latched
+        return "disengaged" if reason is None else reason.words
+
+
+FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Aim:
+    """What the loop shall do: a plan file, or a range and yaw to hold.
+
+    Attributes
+    ----------
+    plan : Path or None
+    range : float or None
+        Metres; 0.6 if neither it nor a plan is given.
+    yaw : float
+        Radians.
+    """
+
+    plan: Path | None = None
+    range: float | None = None
+    yaw: float = 0.0
+
+    def mission(self, working_range: tuple[float, float]) -> tuple[Mission, SafetyLimits, Setpoint]:
+        """Return the mission, the limits of the safety gate, and the first setpoint.
+
+        Raises
+        ------
+        OptionError
+            If both are given, the plan cannot be used, or the range cannot be measured.
+        """
+        holder = SetpointHolder(working_range)
+        if self.plan is not None:
+            if self.range is not None or self.yaw:
+                raise OptionError("--plan: brings its own range and yaw; leave --range, --yaw out")
+            plan = load_plan(self.plan)
+            holder.put(plan.setpoint)
+            return plan.mission(), plan.limits, plan.setpoint
+        setpoint = Setpoint(_DEFAULT_RANGE if self.range is None else self.range, self.yaw)
+        holder.put(setpoint)
+        return HoldMission(setpoint), SafetyLimits(), setpoint
+
+
+_DEFAULT_RANGE = 0.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimRequest:
+    """What to simulate.
+
+    Attributes
+    ----------
+    out : Path
+        Folder to write.
+    aim : Aim
+    vehicle : str
+        A name of `VEHICLE_NAMES`.
+    gains : str or None
+        Gains file, or a vehicle's name; tuned for the vehicle if left out.
+    pilot_gain : float
+        ArduSub's.
+    current, current_to : float
+        Speed in m/s, and where it flows, in radians clockwise from the way one looks at the net.
+    waves : float
+        Amplitude in metres.
+    cage_radius : float
+        Of a round net seen from inside, in metres; 0 is a flat one.
+    net_sway : float
+        Amplitude of the net's own motion to and fro, in metres.
+    seconds : float
+    fps : float
+        Frames a second.
+    rendered : bool
+        Render every frame and measure in it, instead of sampling the scanner's noise.
+    camera : str or None
+        Simulated camera that takes the rendered frames; the ideal one if left out.
+    seed : int
+    freeze : float or None
+        When the picture begins to stand still, in seconds; never if left out.
+    dashboard : str or None
+        Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
+    token : str or None
+        Its password.
+    overwrite : bool
+        Whether to replace what this command wrote to `out` before.
+    """
+
+    out: Path
+    aim: Aim
+    vehicle: str = "bluerov2"
+    gains: str | None = None
+    pilot_gain: float = 0.5
+    current: float = 0.3
+    current_to: float = math.radians(60.0)
+    waves: float = 0.1
+    cage_radius: float = 0.0
+    net_sway: float = 0.0
+    seconds: float = 60.0
+    fps: float = 25.0
+    rendered: bool = False
+    camera: str | None = None
+    seed: int = 0
+    freeze: float | None = None
+    dashboard: str | None = None
+    token: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated.
+
+        Raises
+        ------
+        OptionError
+            Naming the value.
+        """
+        if not _FOLLOW_LEAST_S <= self.seconds <= _MOST_S:
+            raise OptionError(
+                f"--seconds {self.seconds:g}: choose at least {_FOLLOW_LEAST_S:g}, "
+                f"at most {_MOST_S:g}"
+            )
+        if not _LEAST_FPS <= self.fps <= _MOST_FPS:
+            raise OptionError(f"--fps {self.fps:g}: choose {_LEAST_FPS:g} to {_MOST_FPS:g}")
+        if self.camera is not None and not self.rendered:
+            raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
+        if self.cage_radius and not self.cage_radius >= _LEAST_RADIUS:
+            raise OptionError(
+                f"--cage-radius {self.cage_radius:g}: choose at least {_LEAST_RADIUS:g} m, or 0 "
+                "for a flat net"
+            )
+        if not (0.0 <= self.current <= 2.0 and 0.0 <= self.net_sway <= 1.0):
+            raise OptionError(
+                f"--current {self.current:g} m/s, --net-sway {self.net_sway:g} m: choose 0 to 2, "
+                "and 0 to 1"
+            )
+        if self.freeze is not None and not self.freeze >= 0.0:
+            raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
+
+
+_FOLLOW_LEAST_S, _LEAST_RADIUS = 1.0, 2.0
+# A day; the slowest and fastest that cameras are.
+_MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
+
+
+def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:
+    """Run the loop, write log, figures and page, and tell the summary; returns 0.
+
+    Raises
+    ------
+    AqualvsError
+        If an input cannot be used, or the folder cannot be written.
+    """
+    rig = example_rig()
+    mission, limits, setpoint = request.aim.mission(rig.working_range)
+    case = _case(request, limits, setpoint)
+    files = [request.out / name for name in (FOLLOW_CSV, TRUTH_CSV, PAGE, *FIGURE_FILES)]
+    with Claim("follow", files, overwrite=request.overwrite):
+        rng = np.random.default_rng([request.seed, 53])
+        freeze_s = math.inf if request.freeze is None else request.freeze
+        frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
+        eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
+        if request.rendered:
+            camera = simulated_camera(request.camera or "ideal")
+            eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
+        loop = case.loop(eye, mission)
+        with ExitStack() as undo:
+            page = None
+            if request.dashboard is not None:
+                holder = SetpointHolder(rig.working_range)
+                holder.put(setpoint)
+                served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
+                page = LoopPage(served, rig, loop, holder)
+                undo.callback(page.close)
+            _run(loop, request, page, tell)
+        write_log(loop.log, request.out / TRUTH_CSV)
+        facts = RunFacts(
+            vehicle=case.model.name,
+            current=request.current,
+            waves=request.waves,
+            rendered=request.rendered,
+            fps=request.fps,
+        )
+        report = write_report(loop.log, facts, request.out)
+    for line in summary_lines(loop.log, facts):
+        tell(line)
+    tell(f"written: {report}")
+    return 0
+
+
+def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimCase:
+    model = vehicle_model(request.vehicle, request.pilot_gain)
+    return SimCase(
+        model=model,
+        gains=tuned_gains(model) if request.gains is None else usable_gains(request.gains),
+        water=sea(
+            current=request.current,
+            current_to=request.current_to,
+            waves=request.waves,
+            seed=request.seed,
+        ),
+        net=NetWall(
+            curvature=-1.0 / request.cage_radius if request.cage_radius else 0.0,
+            sway=request.net_sway,
+            sway_period=8.0,
+        ),
+        start_range=setpoint.range,
+        start_yaw=setpoint.yaw,
+        timing=Timing(fps=request.fps),
+        limits=limits,
+        seed=request.seed,
+    )
+
+
+def _run(
+    loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, tell: Callable[[str], object]
+) -> None:
+    """Run with the log beside it; Ctrl-C ends it early."""
+    with StopSignals() as stop, FollowLog(request.out / FOLLOW_CSV) as follow_log:
+        watch = RunWatch(loop, request.seconds, tell, stop, slow=request.rendered)
+        if page is None:
+            loop.on_step = follow_log.write
+            loop.run(request.seconds, watch)
+            return
+
+        def show(*step: Any) -> None:
+            follow_log.write(*step)
+            page.take(*step)
+
+        def every_frame(now_s: float) -> bool:
+            page.keep_pace(now_s)
+            return watch(now_s)
+
+        loop.on_step = show
+        tell("in real time; Ctrl-C ends it")
+        loop.run(request.seconds, every_frame)

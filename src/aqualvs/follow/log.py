@@ -1,0 +1,383 @@
+"""What a simulated loop did, frame by frame, with the truth beside it.
+
+How well a simulated loop did, from its log.
+"""
+
+import csv
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.results.files import writing
+
+NEUTRAL_WITHIN_S = 0.2
+"""Without a valid posture for so long there must be no thrust."""
+
+
+class LoopRow(NamedTuple):
+    """The state at one frame's exposure; SI units and radians, NaN where nothing is known.
+
+    Attributes
+    ----------
+    time_s : float
+    range, pitch, yaw, along, up : float
+        In truth, as `NetPosture`.
+    clearance : float
+        Least distance between hull and net.
+    tilt : float
+        Angle between the vehicle's upright and the plumb line.
+    measured_range, measured_pitch, measured_yaw : float
+        By the lasers in this frame.
+    filtered_range, filtered_yaw : float
+        From the time filter, as known by now.
+    wanted_range, wanted_yaw, sway : float
+        What the mission asks for.
+    forward, right, down, turn : float
+        The last effort sent.
+    depth, heading : float
+        As the vehicle tells.
+    engaged : bool
+    stage, reason, refusal : str
+        Of the mission; why the effort was changed; why there is no posture.
+    """
+
+    time_s: float
+    range: float
+    pitch: float
+    yaw: float
+    along: float
+    up: float
+    clearance: float
+    tilt: float
+    measured_range: float
+    measured_pitch: float
+    measured_yaw: float
+    filtered_range: float
+    filtered_yaw: float
+    wanted_range: float
+    wanted_yaw: float
+    sway: float
+    forward: float
+    right: float
+    down: float
+    turn: float
+    depth: float
+    heading: float
+    engaged: bool
+    stage: str
+    reason: str
+    refusal: str
+
+
+@dataclass(slots=True)
+class LoopLog:
+    """All rows, and how long thrust outlived the sight of the net.
+
+    Attributes
+    ----------
+    rows : list of LoopRow
+    blind_thrust_s : list of float
+        For each stretch of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
+        reached: time from the last valid posture to neutral.
+    n_blind : int
+        Such stretches, with or without thrust.
+    """
+
+    rows: list[LoopRow] = field(default_factory=list)
+    blind_thrust_s: list[float] = field(default_factory=list)
+    n_blind: int = 0
+    _neutral_s: float = math.inf
+
+    def column(self, name: str) -> FloatArray:
+        """Return one column of numbers, shape (n,)."""
+        return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
+
+    def note_neutral(self, seen_s: float, now_s: float) -> None:
+        """Take in that thrust ended, at a time after the last valid posture."""
+        self._neutral_s = now_s - seen_s
+
+    def note_sight(self, seen_s: float, now_s: float, thrusts: bool) -> None:
+        """Take in that a valid posture came, when one had come before, and the effort till now."""
+        gap = now_s - seen_s
+        if NEUTRAL_WITHIN_S < gap < math.inf:
+            self.n_blind += 1
+            if thrusts or self._neutral_s < math.inf:
+                self.blind_thrust_s.append(gap if thrusts else self._neutral_s)
+        self._neutral_s = math.inf
+
+
+_UNITS = {
+    "time_s": ("time_s", 1.0, 3),
+    "along": ("along_m", 1.0, 4),
+    "up": ("up_m", 1.0, 4),
+    "clearance": ("clearance_m", 1.0, 4),
+    "sway": ("sway_m_s", 1.0, 3),
+    "depth": ("depth_m", 1.0, 3),
+}
+
+
+def write_log(log: LoopLog, path: Path) -> None:
+    """Write the rows as CSV; units are in the names, cells of what is not known are empty.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    columns = [_column(name) for name in LoopRow._fields]
+    with writing(path), path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow([name for name, _, _ in columns])
+        for row in log.rows:
+            cells = zip(row, columns, strict=True)
+            table.writerow([_cell(value, factor, digits) for value, (_, factor, digits) in cells])
+
+
+def _column(name: str) -> tuple[str, float, int]:
+    """Return a column's heading, factor and decimals."""
+    if name in _UNITS:
+        return _UNITS[name]
+    if name.endswith("range"):
+        return f"{name}_m", 1.0, 4
+    if name.endswith(("pitch", "yaw", "heading", "tilt")):
+        return f"{name}_deg", 180.0 / math.pi, 3
+    if name in {"forward", "right", "down", "turn"}:
+        return f"effort_{name}", 1.0, 4
+    return name, 1.0, 0
+
+
+def _cell(value: object, factor: float, digits: int) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return str(int(value))
+    number = float(value) if isinstance(value, float) else math.nan
+    return f"{factor * number:.{digits}f}" if math.isfinite(number) else ""
+
+
+SETTLED_SHARE = 0.1
+"""A step has settled once the range stays within this share of it."""
+LOST_AFTER_S = 2.5
+"""Without sight for longer, in seconds, somebody has to take over."""
+# Swings that are that much greater at the end of a run than in its middle are growing, in metres.
+_GROWS, _GROWS_BY = 2.0, 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldMeasures:
+    """Of a stretch with a constant setpoint.
+
+    Attributes
+    ----------
+    range_rms, yaw_rms : float
+        Of the true posture about the setpoint, in metres and radians.
+    range_worst : float
+        Greatest error of the range, in metres.
+    least_clearance : float
+        Between hull and net, in metres; negative is contact.
+    n_lost : int
+        Frames without a posture.
+    n_guarded : int
+        Frames at which the safety gate changed the effort.
+    """
+
+    range_rms: float
+    yaw_rms: float
+    range_worst: float
+    least_clearance: float
+    n_lost: int
+    n_guarded: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepMeasures:
+    """Answer to a step of the range.
+
+    Attributes
+    ----------
+    settling : float
+        Seconds until the range stays within `SETTLED_SHARE` of the step; infinite if it never does.
+    overshoot : float
+        Share of the step by which it is exceeded; 0 if it is not.
+    """
+
+    settling: float
+    overshoot: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EffortMeasures:
+    """How often an effort turns round: thrusters wear by it, and shake the camera.
+
+    Attributes
+    ----------
+    reversals : float
+        Changes of the sign a minute; neutral between two of one sign is none.
+    jumps : float
+        Changes by more than `JUMP` from one frame to the next, a minute.
+    """
+
+    reversals: float
+    jumps: float
+
+
+JUMP = 0.25
+"""Of an effort: about what crossing a dead band takes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyMeasures:
+    """Of a whole run.
+
+    Attributes
+    ----------
+    least_clearance : float
+        In metres; negative is contact.
+    n_blind : int
+        Stretches of more than 0.2 s without a valid posture.
+    neutral_late : float
+        Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
+    stable : bool
+        Whether swings of the range do not grow while the net is in sight.
+    lost_s : float
+        When sight was lost for good; infinite if it was not.
+    greatest_tilt : float
+        Of the vehicle, in radians.
+    """
+
+    least_clearance: float
+    n_blind: int
+    neutral_late: float
+    stable: bool
+    lost_s: float
+    greatest_tilt: float
+
+    @property
+    def contact(self) -> bool:
+        """Whether the hull touched the net."""
+        return self.least_clearance <= 0.0
+
+    @property
+    def neutral_in_time(self) -> bool:
+        """Whether thrust always ended in time."""
+        return self.neutral_late <= NEUTRAL_WITHIN_S + 1e-9
+
+
+def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> HoldMeasures:
+    """Return what a stretch came to; frames without a setpoint count against the last one."""
+    here = _between(log, start_s, end_s)
+    off = log.column("range")[here] - _filled(log.column("wanted_range"))[here]
+    turned = log.column("yaw")[here] - _filled(log.column("wanted_yaw"))[here]
+    rows = [row for row, kept in zip(log.rows, here, strict=True) if kept]
+    return HoldMeasures(
+        range_rms=_rms(off),
+        yaw_rms=_rms(turned),
+        range_worst=float(np.abs(off).max()),
+        least_clearance=float(log.column("clearance")[here].min()),
+        n_lost=sum(row.refusal != "" for row in rows),
+        n_guarded=sum(row.reason != "" for row in rows),
+    )
+
+
+def effort_measures(
+    log: LoopLog, name: str, start_s: float = 0.0, end_s: float = math.inf
+) -> EffortMeasures:
+    """Return how often an effort turned round between two times.
+
+    Parameters
+    ----------
+    log : LoopLog
+    name : {"forward", "right", "down", "turn"}
+        Of the effort.
+    start_s, end_s : float
+    """
+    here = _between(log, start_s, end_s)
+    efforts, time_s = log.column(name)[here], log.column("time_s")[here]
+    minutes = max((time_s[-1] - time_s[0]) / 60.0, 1e-9) if len(time_s) else math.inf
+    signs = np.sign(efforts)
+    reversals = np.count_nonzero(np.diff(signs[signs != 0.0]))
+    jumps = np.count_nonzero(np.abs(np.diff(efforts)) > JUMP)
+    return EffortMeasures(reversals=reversals / minutes, jumps=jumps / minutes)
+
+
+def step_measures(
+    time_s: FloatArray, ranges: FloatArray, step_s: float, before: float, after: float
+) -> StepMeasures:
+    """Return settling time and overshoot of a step.
+
+    Parameters
+    ----------
+    time_s, ranges : array, shape (n,)
+        True ranges, or their mean over several runs.
+    step_s : float
+        When the setpoint changed.
+    before, after : float
+        Setpoints in metres.
+    """
+    later = time_s > step_s
+    share = (ranges[later] - before) / (after - before)
+    outside = np.flatnonzero(np.abs(share - 1.0) > SETTLED_SHARE)
+    times = time_s[later] - step_s
+    settling = 0.0 if len(outside) == 0 else float(times[outside[-1]])
+    if len(outside) and outside[-1] == len(times) - 1:
+        settling = math.inf
+    return StepMeasures(settling=settling, overshoot=max(0.0, float(share.max()) - 1.0))
+
+
+def safety_measures(log: LoopLog) -> SafetyMeasures:
+    """Return what a whole run came to."""
+    return SafetyMeasures(
+        least_clearance=float(log.column("clearance").min()),
+        n_blind=log.n_blind,
+        neutral_late=max(log.blind_thrust_s, default=0.0),
+        stable=_is_stable(log),
+        lost_s=_lost_s(log),
+        greatest_tilt=float(log.column("tilt").max()),
+    )
+
+
+def _lost_s(log: LoopLog) -> float:
+    """Return when the last valid posture was exposed, if more than that is missing at the end."""
+    last_s = _last_seen_s(log)
+    return last_s if log.rows[-1].time_s - last_s > LOST_AFTER_S else math.inf
+
+
+def _last_seen_s(log: LoopLog) -> float:
+    seen = np.flatnonzero(np.isfinite(log.column("measured_range")))
+    return float(log.column("time_s")[seen[-1]]) if len(seen) else 0.0
+
+
+def _is_stable(log: LoopLog) -> bool:
+    """Return whether the last third swings no more than the second, both about their setpoints."""
+    off = log.column("range") - _filled(log.column("wanted_range"))
+    off = off[log.column("time_s") <= _last_seen_s(log)]
+    third = len(off) // 3
+    if third == 0 or not np.isfinite(off[-1]):
+        return third == 0
+    middle, last = _rms(off[third : 2 * third]), _rms(off[2 * third :])
+    return last <= _GROWS * middle + _GROWS_BY
+
+
+def _between(log: LoopLog, start_s: float, end_s: float) -> BoolArray:
+    time_s = log.column("time_s")
+    here: BoolArray = (time_s >= start_s) & (time_s <= end_s)
+    return here
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Return values with the last known one where there is none."""
+    known = np.isfinite(values)
+    if not known.any():
+        return values
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    first = int(np.argmax(known))
+    filled: FloatArray = values[np.where(last < 0, first, last)]
+    return filled
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

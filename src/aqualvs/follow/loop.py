@@ -1,0 +1,360 @@
+"""The closed loop in simulated time: frames, time filter, pilot, vehicle, water and net.
+
+What decides is what decides live: the time filter, `NetPilot` with mission, controller and safety
+gate, and the rules of the live pilot's watchdog. Delays are those of events: a frame is exposed,
+arrives a while later, and its effort reaches the vehicle after the wire's latency.
+
+The simulated vehicle behind the link that control knows.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol, TypeAlias
+
+from aqualvs.control.autopilot import Decision, Motion, NetPilot
+from aqualvs.control.time_filter import FilteredPosture, PostureFilter
+from aqualvs.control.tune import shaping_of_model
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.follow.log import LoopLog, LoopRow
+from aqualvs.geometry.transforms import SE3
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.simulation.net_motion import NetWall
+from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
+
+# A vehicle tells its attitude ten times a second.
+_TELLS_HZ = 10.0
+
+
+class SimulatedLink:
+    """Commands a simulated vehicle and hears from it, in its own time.
+
+    Parameters
+    ----------
+    vehicle : SimulatedVehicle
+        Its latency is that of the wire.
+
+    Attributes
+    ----------
+    vehicle : SimulatedVehicle
+    effort : Effort
+        The last that was sent.
+    """
+
+    def __init__(self, vehicle: SimulatedVehicle) -> None:
+        self.vehicle = vehicle
+        self.effort = NEUTRAL
+        self._shaping = shaping_of_model(vehicle.model)
+        self._unsent: Effort | None = None
+        self._closed = False
+
+    @property
+    def name(self) -> str:
+        """How messages call it."""
+        return f"simulated {self.vehicle.model.name}"
+
+    def state(self) -> VehicleState:
+        """Return what the vehicle tells of itself, by the vehicle's clock."""
+        told = self.vehicle.telemetry()
+        return VehicleState(
+            heard_s=math.floor(told.time_s * _TELLS_HZ) / _TELLS_HZ,
+            armed=told.armed,
+            mode=Mode.OURS if told.obeys else Mode.PILOT,
+            mode_name="ALT_HOLD" if told.obeys else "MANUAL",
+            depth=told.depth,
+            heading=told.heading,
+            roll=told.roll,
+            pitch=told.pitch,
+        )
+
+    def send(self, effort: Effort) -> None:
+        """Ask for an effort."""
+        if not self._closed:
+            self.effort = effort
+            self._unsent = self._shaping.position(effort)
+
+    def pass_time(self, until_s: float) -> None:
+        """Let the vehicle move until a time; nothing if that is not ahead."""
+        step = until_s - self.vehicle.time_s
+        if step > 1e-9:
+            self.vehicle.step(self._unsent, step)
+            self._unsent = None
+
+    def close(self) -> None:
+        """Send neutral; further calls do nothing."""
+        self.send(NEUTRAL)
+        self._closed = True
+
+
+# The live run tells a silent stream after so long, and then so often; the watchdog looks so often.
+_SILENT_AFTER_S, _SILENT_EVERY_S, _DOG_LOOKS_S = 0.20, 0.10, 0.02
+
+
+OnStep: TypeAlias = Callable[[float, float, Posture | Refusal, Decision, VehicleState], object]
+
+
+class Eye(Protocol):
+    """Measures the net's posture from a vehicle."""
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
+        """Return what the frame exposed now gives; None where there is no frame at all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """When frames come.
+
+    Attributes
+    ----------
+    fps : float
+        Frames a second.
+    delay : float
+        From the exposure to the measured posture, in seconds.
+    """
+
+    fps: float = 25.0
+    delay: float = 0.06
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises
+        ------
+        OptionError
+            If there are no frames, or they come before their time.
+        """
+        if not (self.fps > 0.0 and self.delay >= 0.0):
+            raise OptionError(
+                f"simulated loop: {self.fps:g} frames a second, delay {self.delay:g} s; the first "
+                "is positive, the second 0 or more"
+            )
+
+
+class _Arrival(NamedTuple):
+    """A measured frame on its way."""
+
+    at_s: float
+    exposed_s: float
+    posture: Posture | Refusal
+
+
+@dataclass(slots=True)
+class _Sight:
+    """What is known of the stream, as the live run and the pilot's watchdog know it."""
+
+    patience_s: float
+    coming: deque[_Arrival] = field(default_factory=deque)
+    # When a frame came last, and when a silent stream was told last.
+    heard_s: float = 0.0
+    told_s: float = -math.inf
+    # Exposure of that frame.
+    exposed_s: float = 0.0
+    # When a valid posture came last.
+    seen_s: float = -math.inf
+
+    def silence_s(self) -> float:
+        """Return when a silent stream is told next."""
+        return max(self.heard_s + _SILENT_AFTER_S, self.told_s + _SILENT_EVERY_S)
+
+    def bark_s(self, thrusts: bool) -> float:
+        """Return when the watchdog stops the thrusters."""
+        return self.seen_s + self.patience_s + _DOG_LOOKS_S if thrusts else math.inf
+
+
+class SimulatedLoop:
+    """A vehicle before a net that it sees with lasers and steers by.
+
+    Parameters
+    ----------
+    link : SimulatedLink
+        To the vehicle.
+    net : NetWall
+    eye : Eye
+    steering : NetPilot
+        Engaged at the start.
+    timing : Timing, optional
+        Defaults if left out.
+    posture_filter : PostureFilter, optional
+        With default options if left out.
+    on_step : callable, optional
+        Called after every step of the pilot with the time, the frame's time, what was measured,
+        the decision and the vehicle's state.
+    """
+
+    def __init__(
+        self,
+        link: SimulatedLink,
+        net: NetWall,
+        eye: Eye,
+        steering: NetPilot,
+        timing: Timing | None = None,
+        posture_filter: PostureFilter | None = None,
+        on_step: OnStep | None = None,
+    ) -> None:
+        self.link, self.net, self.eye, self.steering = link, net, eye, steering
+        self.timing = timing or Timing()
+        self._filter = posture_filter or PostureFilter()
+        self.on_step = on_step
+        self._sight = _Sight(steering.gate.limits.posture_age)
+        self._decision: Decision | None = None
+        self._filtered: FilteredPosture | None = None
+        self.log = LoopLog()
+
+    @property
+    def seen_s(self) -> float:
+        """When a valid posture came last; -inf before the first."""
+        return self._sight.seen_s
+
+    @property
+    def filtered(self) -> FilteredPosture | None:
+        """What the time filter made of the last step; None where it does not run."""
+        return self._filtered
+
+    def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:
+        """Let simulated time pass and return the log; may be called again to go on.
+
+        Parameters
+        ----------
+        seconds : float
+            Until this simulated time.
+        every_frame : callable, optional
+            Called with the time before each frame: changes setpoints, shows the way, ends the run
+            by returning False.
+
+        Raises
+        ------
+        OptionError
+            If the pilot may not begin.
+        """
+        if not self.log.rows:
+            self._engage()
+        frame = len(self.log.rows)
+        while frame / self.timing.fps <= seconds:
+            now_s = frame / self.timing.fps
+            self._pass_time(now_s)
+            if every_frame is not None and every_frame(now_s) is False:
+                break
+            self._expose(now_s)
+            frame += 1
+        return self.log
+
+    def _engage(self) -> None:
+        refused = self.steering.engage(0.0, self.link.state())
+        if refused is not None:
+            raise OptionError(f"simulated loop: not engaged: {refused.words}")
+
+    def _pass_time(self, until_s: float) -> None:
+        """Let everything happen that happens until then."""
+        sight = self._sight
+        while True:
+            arrives_s = sight.coming[0].at_s if sight.coming else math.inf
+            silence_s, bark_s = sight.silence_s(), sight.bark_s(self.link.effort != NEUTRAL)
+            next_s = min(arrives_s, silence_s, bark_s)
+            if next_s > until_s:
+                break
+            self.link.pass_time(next_s)
+            if arrives_s == next_s:
+                self._arrive(sight.coming.popleft())
+            elif bark_s == next_s:
+                self._send(NEUTRAL, next_s)
+            else:
+                self._be_silent(next_s)
+        self.link.pass_time(until_s)
+
+    def _expose(self, now_s: float) -> None:
+        """Take a frame, and write down how things stand."""
+        posture = self.eye.look(self.link.vehicle.dome_pose, now_s)
+        if posture is not None:
+            self._sight.coming.append(_Arrival(now_s + self.timing.delay, now_s, posture))
+        self.log.rows.append(self._row(now_s, posture))
+
+    def _arrive(self, arrival: _Arrival) -> None:
+        """Take a step by a frame's posture."""
+        sight = self._sight
+        sight.heard_s, sight.exposed_s = arrival.at_s, arrival.exposed_s
+        if arrival.posture:
+            self.log.note_sight(sight.seen_s, arrival.at_s, self.link.effort != NEUTRAL)
+            sight.seen_s = arrival.at_s
+        self._step(arrival.at_s, arrival.exposed_s, arrival.exposed_s, arrival.posture)
+
+    def _be_silent(self, now_s: float) -> None:
+        """Take a step without a frame."""
+        sight = self._sight
+        sight.told_s = now_s
+        silent_s = now_s - sight.heard_s
+        refusal = Refusal(Reason.NO_FRAMES, f"no picture for {silent_s:.1f} s")
+        self._step(now_s, sight.exposed_s, sight.exposed_s + silent_s, refusal)
+
+    def _step(
+        self, now_s: float, frame_s: float, filter_s: float, posture: Posture | Refusal
+    ) -> None:
+        self._filtered = self._filter.update(filter_s, posture)
+        state = self.link.state()
+        decision = self._decision = self.steering.step(
+            now_s, frame_s, posture, _motion(self._filtered), state
+        )
+        if self.on_step is not None:
+            self.on_step(now_s, frame_s, posture, decision, state)
+        self._send(decision.effort if decision.engaged else NEUTRAL, now_s)
+
+    def _send(self, effort: Effort, now_s: float) -> None:
+        """Send an effort, or neutral for one that rests on too old a posture."""
+        seen_s = self._sight.seen_s
+        if now_s - seen_s > self._sight.patience_s:
+            effort = NEUTRAL
+        if effort == NEUTRAL and self.link.effort != NEUTRAL:
+            self.log.note_neutral(seen_s, now_s)
+        self.link.send(effort)
+
+    def _row(self, now_s: float, posture: Posture | Refusal | None) -> LoopRow:
+        vehicle, decision, seen = self.link.vehicle, self._decision, self._filtered
+        truth = self.net.posture_at(vehicle.dome_pose, now_s)
+        state = self.link.state()
+        guidance = decision.guidance if decision else None
+        setpoint = guidance.setpoint if guidance else None
+        measured = posture if isinstance(posture, Posture) else None
+        effort = self.link.effort
+        return LoopRow(
+            time_s=now_s,
+            range=truth.range,
+            pitch=truth.pitch,
+            yaw=truth.yaw,
+            along=truth.along,
+            up=truth.up,
+            clearance=self.net.clearance(vehicle.pose, vehicle.model.half_size, now_s),
+            tilt=math.acos(min(max(float(vehicle.pose.rotation[2, 2]), -1.0), 1.0)),
+            measured_range=measured.range if measured else math.nan,
+            measured_pitch=measured.pitch if measured else math.nan,
+            measured_yaw=measured.yaw if measured else math.nan,
+            filtered_range=seen.range if seen else math.nan,
+            filtered_yaw=seen.yaw if seen else math.nan,
+            wanted_range=setpoint.range if setpoint else math.nan,
+            wanted_yaw=setpoint.yaw if setpoint else math.nan,
+            sway=guidance.sway if guidance else 0.0,
+            forward=effort.forward,
+            right=effort.right,
+            down=effort.down,
+            turn=effort.yaw,
+            depth=state.depth if state.depth is not None else math.nan,
+            heading=state.heading if state.heading is not None else math.nan,
+            engaged=decision.engaged if decision else True,
+            stage=guidance.stage.value if guidance else "",
+            reason=decision.reason.value if decision and decision.reason else "",
+            refusal=_why_not(posture),
+        )
+
+
+def _why_not(posture: Posture | Refusal | None) -> str:
+    if posture is None:
+        return Reason.NO_FRAMES.value
+    return posture.reason.value if isinstance(posture, Refusal) else ""
+
+
+def _motion(filtered: FilteredPosture | None) -> Motion | None:
+    """Return the filter's answer in control's words, as the live pilot does."""
+    if filtered is None:
+        return None
+    range_rate, _, yaw_rate = filtered.rates.tolist()
+    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)

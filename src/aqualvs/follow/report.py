@@ -1,0 +1,301 @@
+"""The page and the summary of a simulated run.
+
+Pictures of a loop over time, after figures 22 and 23 of the paper.
+
+Constantinou, Georgiades and Loizou, Robotics 2021, 10, 126. Matplotlib is asked for when a picture
+is drawn, and only its Agg canvas: no display is needed.
+"""
+
+import html
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs.follow.log import JUMP, LoopLog, effort_measures, hold_measures, safety_measures
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.report.figure_style import new_canvas
+from aqualvs.results.files import replace_text, writing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_DPI = 160
+_BLUE, _ORANGE, _DARK, _GREY = "#1f4fc8", "#d55e00", "#23272e", "#8a8f98"
+_LOST, _GUARDED = "#f3c9bd", "#f6e3a8"
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e6ea",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+}
+# An axis shows at least so much, so that noise does not fill it: metres, degrees.
+_LEAST_DEPTH, _LEAST_RANGE, _LEAST_ANGLE = 0.2, 0.1, 6.0
+
+
+FIGURE_FILES = ("figure_22.png", "figure_23.png")
+
+
+def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
+    """Write `figure_22.png` and `figure_23.png`.
+
+    Parameters
+    ----------
+    log : LoopLog
+        With at least one row.
+    out : Path
+        Folder that exists.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
+    """
+    written = []
+    for name, figure in drawn_follow_figures(log).items():
+        path = out / f"{name}.png"
+        figure.savefig(path, dpi=_DPI)
+        written.append(path)
+    return written
+
+
+def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
+    """Return the same pictures by name, not yet written."""
+    from matplotlib import rc_context
+
+    with rc_context(_STYLE):
+        return {"figure_22": _motion(log), "figure_23": _control(log)}
+
+
+def _motion(log: LoopLog) -> "Figure":
+    """As figure 22: depth, range, heading and target yaw."""
+    figure, axes = _panels(3, 6.4)
+    time_s = log.column("time_s")
+    depth, ranges, angles = axes
+    depth.plot(time_s, log.column("depth"), color=_BLUE, linewidth=0.9)
+    _name(depth, "depth (m)", _LEAST_DEPTH)
+    depth.invert_yaxis()
+    ranges.plot(time_s, log.column("measured_range"), color=_BLUE, linewidth=0.9)
+    _name(ranges, "range (m)", _LEAST_RANGE)
+    heading = np.degrees(np.unwrap(log.column("heading")))
+    angles.plot(time_s, heading, color=_ORANGE, linewidth=0.9, label="heading")
+    yaw = np.degrees(log.column("measured_yaw"))
+    angles.plot(time_s, yaw, color=_BLUE, linewidth=0.9, label="target yaw")
+    _name(angles, "angle (deg)", _LEAST_ANGLE)
+    _legend(angles)
+    _finish(axes, log, time_s)
+    return figure
+
+
+def _control(log: LoopLog) -> "Figure":
+    """As figure 23: setpoint, measurement and command of both controllers."""
+    figure, axes = _panels(4, 8.0)
+    time_s = log.column("time_s")
+    _loop(axes[0], log, "range", 1.0)
+    _name(axes[0], "range (m)", _LEAST_RANGE)
+    _command(axes[1], time_s, log.column("forward"), "forward effort")
+    _loop(axes[2], log, "yaw", 180.0 / np.pi)
+    _name(axes[2], "target yaw (deg)", _LEAST_ANGLE)
+    _command(axes[3], time_s, log.column("turn"), "yaw effort")
+    _legend(axes[0])
+    _finish(axes, log, time_s)
+    return figure
+
+
+def _loop(axes: "Axes", log: LoopLog, name: str, unit: float) -> None:
+    time_s = log.column("time_s")
+    measured = unit * log.column(f"measured_{name}")
+    axes.plot(time_s, measured, color=_BLUE, linewidth=0.8, alpha=0.55, label="measured")
+    axes.plot(time_s, unit * log.column(name), color=_DARK, linewidth=1.0, label="true")
+    wanted = unit * log.column(f"wanted_{name}")
+    axes.plot(time_s, wanted, color=_ORANGE, linewidth=1.2, linestyle="--", label="setpoint")
+
+
+def _command(axes: "Axes", time_s: FloatArray, effort: FloatArray, name: str) -> None:
+    axes.axhline(0.0, color=_GREY, linewidth=0.6)
+    axes.plot(time_s, effort, color=_DARK, linewidth=0.7)
+    most = max(0.2, 1.15 * float(np.abs(effort).max()))
+    axes.set_ylim(-most, most)
+    axes.set_ylabel(name)
+
+
+def _panels(n: int, height_in: float) -> "tuple[Figure, list[Axes]]":
+    figure = new_canvas(7.2, height_in)
+    axes = figure.subplots(n, 1, sharex=True)
+    figure.align_ylabels(axes)
+    return figure, list(axes)
+
+
+def _name(axes: "Axes", label: str, least: float) -> None:
+    """Name an axis, and let it show at least so much."""
+    axes.set_ylabel(label)
+    low, high = axes.get_ylim()
+    short = least - abs(high - low)
+    if short > 0.0:
+        axes.set_ylim(low - 0.5 * short, high + 0.5 * short)
+
+
+def _legend(axes: "Axes") -> None:
+    """Put the legend above, out of the curves' way."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1)
+
+
+def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
+    """Shade where there was no posture, and where the gate stepped in."""
+    lost = np.array([row.refusal != "" for row in log.rows])
+    guarded = np.array([row.reason != "" for row in log.rows]) & ~lost
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    for one in axes:
+        for here, colour in ((lost, _LOST), (guarded, _GUARDED)):
+            for start, end in _stretches(here):
+                one.axvspan(time_s[start], time_s[end] + step_s, color=colour, linewidth=0)
+        one.set_xlim(float(time_s[0]), float(time_s[-1]))
+    notes = [
+        ("no posture", _LOST) if lost.any() else None,
+        ("safety gate", _GUARDED) if guarded.any() else None,
+    ]
+    words = ", ".join(f"{name} shaded {_COLOURS[colour]}" for name, colour in filter(None, notes))
+    axes[-1].set_xlabel("time (s)" + (f"   ({words})" if words else ""))
+
+
+_COLOURS = {_LOST: "red", _GUARDED: "yellow"}
+
+
+def _stretches(here: BoolArray) -> Iterator[tuple[int, int]]:
+    """Yield first and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(np.int8)))
+    yield from zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True)
+
+
+PAGE = "follow.html"
+SETTLED_S = 10.0
+"""A run begins at rest in moving water; errors count from then on, in seconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunFacts:
+    """What was simulated, in the words of the page."""
+
+    vehicle: str
+    current: float
+    waves: float
+    rendered: bool
+    fps: float
+
+    @property
+    def words(self) -> str:
+        """One line."""
+        eye = "rendered pictures, measured" if self.rendered else "sampled postures"
+        return (
+            f"{self.vehicle}, current {self.current:g} m/s, waves of {self.waves:g} m amplitude, "
+            f"{eye} at {self.fps:g} Hz"
+        )
+
+
+def summary(log: LoopLog) -> list[tuple[str, str]]:
+    """Return what a run came to, as names and values."""
+    rows = log.rows
+    start_s = SETTLED_S if rows[-1].time_s > 2.0 * SETTLED_S else 0.5 * rows[-1].time_s
+    hold, safety = hold_measures(log, start_s), safety_measures(log)
+    steered = sum(row.engaged for row in rows) / len(rows)
+    figures = [
+        (
+            f"range error, rms from {start_s:.0f} s on",
+            f"{1e3 * hold.range_rms:.1f} mm (worst {1e3 * hold.range_worst:.0f} mm)",
+        ),
+        ("yaw error, rms", f"{math.degrees(hold.yaw_rms):.2f} deg"),
+        *_efforts(log, start_s),
+        ("frames without a posture", f"{hold.n_lost}"),
+        ("frames at which the safety gate stepped in", f"{hold.n_guarded}"),
+        (
+            "nearest to the net",
+            f"{safety.least_clearance:.2f} m" + (" - CONTACT" if safety.contact else ""),
+        ),
+        ("share of the time under control", f"{100.0 * steered:.0f} %"),
+    ]
+    if safety.n_blind:
+        late = f"{safety.neutral_late:.2f} s after the last posture, at most"
+        figures.append((f"neutral in {safety.n_blind} blind stretches", late))
+    if math.isfinite(safety.lost_s):
+        figures.append(("LOST", f"the net, for good, at {safety.lost_s:.1f} s"))
+    return figures
+
+
+def _efforts(log: LoopLog, start_s: float) -> list[tuple[str, str]]:
+    """Return how often the efforts turned round."""
+    names = {"forward": "forward", "right": "right", "turn": "yaw"}
+    found = {name: effort_measures(log, column, start_s) for column, name in names.items()}
+    reversals = ", ".join(f"{name} {one.reversals:.0f}" for name, one in found.items())
+    jumps = ", ".join(f"{name} {one.jumps:.0f}" for name, one in found.items())
+    return [
+        ("reversals of the effort a minute", reversals),
+        (f"jumps of the effort above {JUMP:g} a minute", jumps),
+    ]
+
+
+def summary_lines(log: LoopLog, facts: RunFacts) -> list[str]:
+    """Return the summary as lines for a terminal."""
+    table = summary(log)
+    width = max(len(name) for name, _ in table)
+    return [facts.words, *(f"  {name:<{width}}  {value}" for name, value in table)]
+
+
+def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
+    """Draw the figures and write the page beside them; returns the page.
+
+    Raises
+    ------
+    OutputError
+        If something cannot be written.
+    """
+    with writing(out):
+        figures = draw_follow_figures(log, out)
+    path = out / PAGE
+    with writing(path):
+        replace_text(path, _page(log, facts, [figure.name for figure in figures]))
+    return path
+
+
+def _page(log: LoopLog, facts: RunFacts, figures: list[str]) -> str:
+    cells = "".join(
+        f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
+        for name, value in summary(log)
+    )
+    pictures = "".join(
+        f'<figure><img src="{name}" alt="{html.escape(_CAPTIONS[name])}">'
+        f"<figcaption>{html.escape(_CAPTIONS[name])}</figcaption></figure>"
+        for name in figures
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>aqualvs follow</title><style>{_REPORT_STYLE}</style></head><body>"
+        f"<h1>Hold and follow, simulated</h1><p>{html.escape(facts.words)}</p>"
+        f"<table>{cells}</table>{pictures}</body></html>\n"
+    )
+
+
+_CAPTIONS = {
+    "figure_22.png": "Depth, range, heading and target yaw over time.",
+    "figure_23.png": "The controllers on range and yaw: setpoint, measured, true, and the command.",
+}
+_REPORT_STYLE = (
+    "body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;"
+    "color:#23272e}table{border-collapse:collapse}th{text-align:left;font-weight:400;"
+    "padding-right:2rem}td{font-variant-numeric:tabular-nums}th,td{border-bottom:1px solid #ddd}"
+    "figure{margin:2rem 0}img{max-width:100%}figcaption{color:#5a6069}"
+)

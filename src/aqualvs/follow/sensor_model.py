@@ -1,0 +1,232 @@
+"""A scanner that is sampled instead of run: the true posture with noise, and with losses.
+
+A scanner that is run on rendered pictures: every frame goes through the real pipeline.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.live.health_monitor import FrozenPicture
+from aqualvs.optics.rig import Rig
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.scan import Frame, Planes, Scan, planes_of_image
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
+from aqualvs.simulation.net_motion import NetPosture, NetWall
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scene import Net, Scene
+
+# More than are under way from the exposure to the pilot.
+_N_KEPT = 8
+
+
+def net_scene(seed: int = 0) -> Scene:
+    """Return a diamond net with a little growth, in clear water."""
+    net = Net(bar=0.025, twine=0.0022, fouling=0.1, seed=seed)
+    return Scene(dome_from_scene=SE3.identity(), nets=(net,), target="net")
+
+
+class RenderedEye:
+    """Renders what the camera sees from a vehicle, and measures in it.
+
+    Parameters
+    ----------
+    net : NetWall
+    rig : Rig
+        That the pictures are taken with, and measured with.
+    rng : Generator
+        Source of the sensor's noise.
+    scene : Scene, optional
+        In the frame of the net at rest; `net_scene` if left out.
+    options : ScannerOptions, optional
+        Defaults if left out.
+    samples : int
+        Rays along each side of a pixel.
+    camera : SimulatedCamera
+        Takes the pictures; they are measured before it compresses them.
+    freeze_s : float
+        From then on the last picture comes again and again, with time stamps that run on.
+
+    Attributes
+    ----------
+    shots : deque of (Frame, Scan)
+        The last pictures, and what was measured in them.
+    """
+
+    def __init__(
+        self,
+        net: NetWall,
+        rig: Rig,
+        rng: np.random.Generator,
+        scene: Scene | None = None,
+        options: ScannerOptions | None = None,
+        samples: int = 1,
+        camera: SimulatedCamera = IDEAL,
+        freeze_s: float = math.inf,
+    ) -> None:
+        self._net, self._rng = net, rng
+        self._scene = net_scene() if scene is None else scene
+        self._renderer = Renderer(rig, samples=samples, camera=camera)
+        self._scanner = Scanner(rig, options)
+        self._n_frames = 0
+        self._freeze_s, self._frozen = freeze_s, FrozenPicture()
+        self._planes: Planes | None = None
+        self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
+        """Return what the frame exposed now gives."""
+        if self._planes is None or time_s < self._freeze_s:
+            self._planes = self._rendered(world_from_dome, time_s)
+        frame = Frame(self._n_frames, time_s, *self._planes)
+        self._n_frames += 1
+        # As the live run does.
+        still_s = self._frozen.update(time_s, frame.luma)
+        if still_s > 0.0:
+            return Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
+        scan = self._scanner.process(frame)
+        self.shots.append((frame, scan))
+        return scan.posture
+
+    def _rendered(self, world_from_dome: SE3, time_s: float) -> Planes:
+        scene = self._net.scene_at(world_from_dome, time_s, self._scene)
+        image = self._renderer.render(scene, time_s, self._rng).image
+        # OpenCV's order of colours.
+        return planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
+
+
+# What a posture of the example rig rests on, about.
+_N_POINTS = 400
+_GREATEST_ANGLE = math.radians(60.0)
+
+
+class Loss(StrEnum):
+    """How sight is lost."""
+
+    TARGET = "target"
+    """Frames come, but nothing is measured in them."""
+    STREAM = "stream"
+    """No frames come."""
+    FROZEN = "frozen"
+    """The last picture comes again and again: its posture repeats to the bit."""
+    STUCK = "stuck"
+    """Frames come with noise of their own, but show what was there at the start."""
+
+
+@dataclass(frozen=True, slots=True)
+class Blind:
+    """A stretch without a valid posture.
+
+    Attributes
+    ----------
+    start_s, end_s : float
+        Of the exposures, in seconds.
+    loss : Loss
+    """
+
+    start_s: float
+    end_s: float
+    loss: Loss = Loss.TARGET
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PostureNoise:
+    """Standard deviations, of each frame by itself.
+
+    Attributes
+    ----------
+    range_share : float
+        Of the range.
+    pitch, yaw : float
+        In radians.
+    outliers : float
+        Share of frames with ten times that noise, unknown to the scanner.
+    """
+
+    range_share: float = 0.003
+    pitch: float = math.radians(0.4)
+    yaw: float = math.radians(0.4)
+    outliers: float = 0.0
+
+
+class SampledEye:
+    """Gives the true posture with noise.
+
+    Parameters
+    ----------
+    net : NetWall
+    rng : Generator
+        Source of the noise.
+    noise : PostureNoise, optional
+        Defaults if left out.
+    blind : sequence of Blind
+        Stretches without sight.
+    working_range : (float, float)
+        Outside of it nothing is measured, in metres.
+    """
+
+    def __init__(
+        self,
+        net: NetWall,
+        rng: np.random.Generator,
+        noise: PostureNoise | None = None,
+        blind: Sequence[Blind] = (),
+        working_range: tuple[float, float] = (0.3, 1.0),
+    ) -> None:
+        self._net, self._rng = net, rng
+        self._noise = noise or PostureNoise()
+        self._blind = tuple(blind)
+        self._working_range = working_range
+        self._stuck: tuple[Blind, NetPosture] | None = None
+        self._last: Posture | Refusal | None = None
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
+        """Return what the frame exposed now gives."""
+        self._last = self._look(self._net.posture_at(world_from_dome, time_s), time_s)
+        return self._last
+
+    def _look(self, truth: NetPosture, time_s: float) -> Posture | Refusal | None:
+        # Drawn in any case: the noise of a frame does not depend on what happened before.
+        draws = self._rng.normal(size=3)
+        wild = self._rng.uniform() < self._noise.outliers
+        blind = next((one for one in self._blind if one.start_s <= time_s < one.end_s), None)
+        if blind is not None:
+            if blind.loss is Loss.STREAM:
+                return None
+            if blind.loss is Loss.TARGET:
+                return Refusal(Reason.TOO_FEW_POINTS)
+            if blind.loss is Loss.FROZEN and self._last is not None:
+                return self._last
+            if self._stuck is None or self._stuck[0] is not blind:
+                self._stuck = blind, truth
+            truth = self._stuck[1]
+        near, far = self._working_range
+        if not near <= truth.range <= far:
+            return Refusal(Reason.OUT_OF_RANGE, f"{truth.range:.2f} m")
+        if max(abs(truth.yaw), abs(truth.pitch)) > _GREATEST_ANGLE:
+            return Refusal(Reason.COLLINEAR, "the lasers leave the net")
+        return self._measured(truth, (10.0 if wild else 1.0) * draws)
+
+    def _measured(self, truth: NetPosture, draws: FloatArray) -> Posture:
+        noise = self._noise
+        sigma = np.array([noise.range_share * truth.range, noise.pitch, noise.yaw])
+        distance, pitch, yaw = (np.array(truth[:3]) + sigma * draws).tolist()
+        normal = np.array([math.tan(yaw), 1.0, math.tan(pitch)])
+        normal /= np.linalg.norm(normal)
+        return Posture(
+            range=distance,
+            pitch=pitch,
+            yaw=yaw,
+            covariance=np.diag(sigma**2),
+            normal_in_dome=normal,
+            slant_range=distance / float(normal[1]),
+            nearest=distance,
+            n_points=_N_POINTS,
+            rms=0.001,
+        )

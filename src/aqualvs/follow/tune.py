@@ -1,0 +1,207 @@
+"""`aqualvs tune`: gains for a vehicle, with the margins they leave and a step in the simulator.
+
+A step of the range in the simulator: what tuning promises, tried on the whole vehicle.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.control.controller import RangeYawController
+from aqualvs.control.gains import ControlGains
+from aqualvs.control.gains_file import gains_text, save_gains
+from aqualvs.control.tune import Margins, Tuned, TuneOptions, shaping_of_model, tune
+from aqualvs.control.vehicle import Setpoint
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.results.files import Claim
+from aqualvs.simulation.vehicle.models import VEHICLES, VehicleModel
+from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle, level_pose
+from aqualvs.simulation.vehicle.water_motion import WaterMotion
+
+# The wall stands across north, so far from the origin; the vehicle is so deep, in metres.
+_WALL, _DEPTH = 5.0, 5.0
+_REST_S, _AFTER_S = 6.0, 12.0
+_BAND = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class StepOptions:
+    """What is tried.
+
+    Attributes
+    ----------
+    begin, end : float
+        Ranges before and after, in metres.
+    delay : float
+        From a frame to its effort at the vehicle, in seconds.
+    frame : float
+        Seconds between frames.
+    """
+
+    begin: float = 0.8
+    end: float = 0.6
+    delay: float = 0.1
+    frame: float = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class StepAnswer:
+    """What came of it.
+
+    Attributes
+    ----------
+    time, range : array, shape (N,)
+        Seconds since the step, from before it on; metres.
+    overshoot : float
+        Share of the step.
+    settling : float
+        Seconds after which the range stays within 5 % of the step; infinite if it does not.
+    """
+
+    time: FloatArray
+    range: FloatArray
+    overshoot: float
+    settling: float
+
+
+def simulate_step(
+    model: VehicleModel,
+    gains: ControlGains,
+    options: StepOptions | None = None,
+    water: WaterMotion | None = None,
+) -> StepAnswer:
+    """Hold a range before a wall, then another one; postures are exact.
+
+    Parameters
+    ----------
+    model : VehicleModel
+        Need not be the one that the gains are for.
+    gains : ControlGains
+    options : StepOptions, optional
+    water : WaterMotion, optional
+        Still if left out.
+    """
+    options = options or StepOptions()
+    ahead = _WALL - options.begin - model.dome_position[0]
+    pose = level_pose(np.array([ahead, 0.0, _DEPTH]), 0.0)
+    vehicle = SimulatedVehicle(
+        model, water or WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
+    )
+    controller, shaping = RangeYawController(gains), shaping_of_model(model)
+    n_rest, n_after = (round(span / options.frame) for span in (_REST_S, _AFTER_S))
+    time = options.frame * np.arange(-n_rest, n_after, dtype=np.float64)
+    ranges = np.empty(len(time))
+    before = _posture(vehicle)
+    for k, now in enumerate(time.tolist()):
+        goal = options.begin if now < 0.0 else options.end
+        ranges[k], yaw = _posture(vehicle)
+        rates = ((ranges[k] - before[0]) / options.frame, (yaw - before[1]) / options.frame)
+        before = (ranges[k], yaw)
+        effort = controller.update(now, *before, *rates, Setpoint(goal))
+        vehicle.step(shaping.position(effort), options.frame)
+    return _answer(time, ranges, options)
+
+
+def _posture(vehicle: SimulatedVehicle) -> tuple[float, float]:
+    """Return range and yaw to the wall."""
+    world_from_dome = vehicle.dome_pose
+    normal = world_from_dome.rotation[0]
+    return _WALL - float(world_from_dome.translation[0]), math.atan2(normal[0], normal[1])
+
+
+def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepAnswer:
+    after = time >= 0.0
+    size = options.end - options.begin
+    beyond = (ranges[after] - options.end) / size
+    outside = np.flatnonzero(np.abs(beyond) > _BAND)
+    last = int(outside[-1]) + 1 if len(outside) else 0
+    settling = float(time[after][last]) if last < len(beyond) else math.inf
+    return StepAnswer(time, ranges, max(0.0, float(beyond.max())), settling)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TuneRequest:
+    """What the command line asks for.
+
+    Attributes
+    ----------
+    model : str
+        Name of a vehicle model.
+    output : Path or None
+        Gains file; None prints the gains.
+    overwrite : bool
+        Whether to replace a file that this command wrote before.
+    options : TuneOptions
+        What the loops must stand.
+    """
+
+    model: str
+    output: Path | None = None
+    overwrite: bool = False
+    options: TuneOptions = field(default_factory=TuneOptions)
+
+
+def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
+    """Tune, try a step, write or print the gains.
+
+    Raises
+    ------
+    OptionError
+        If the model is unknown, or nothing stands what is asked.
+    OutputError
+        If the file cannot be written.
+    """
+    model = VEHICLES.get(request.model)
+    if model is None:
+        raise OptionError(f"tune {request.model}: no such model; use one of {', '.join(VEHICLES)}")
+    files = [] if request.output is None else [request.output]
+    with Claim("tune", files, overwrite=request.overwrite):
+        tuned = tune(model, request.options)
+        for line in report(model, tuned, request.options):
+            tell(line)
+        if request.output is None:
+            tell(gains_text(tuned.gains))
+        else:
+            save_gains(tuned.gains, request.output)
+            tell(f"written to {request.output}")
+
+
+def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
+    """Return what to say of gains: margins at both delays, as it is and at worst; steps."""
+    usual, most = options.delay, options.greatest_delay
+    lines = [
+        f"{model.name}: margins with the model as it is, and in the worst corner (mass "
+        f"x{options.mass_factor:g}, drag x{options.drag_factor:g} either way, current to "
+        f"{options.current:g} m/s)",
+        f"  {'':26}crossover    phase   gain   delay  modulus",
+    ]
+    rows = (
+        ("range", usual, "as it is", tuned.range_usual),
+        ("range", usual, "worst", tuned.range_corner),
+        ("range", most, "worst", tuned.range_late),
+        ("yaw", usual, "as it is", tuned.yaw_usual),
+        ("yaw", most, "worst", tuned.yaw_late),
+    )
+    lines += [
+        f"  {axis:5} {1e3 * delay:4.0f} ms, {which:9}  {_row(one)}"
+        for axis, delay, which, one in rows
+    ]
+    for delay in (usual, most):
+        step = StepOptions(delay=delay, frame=options.frame)
+        answer = simulate_step(model, tuned.gains, step)
+        lines.append(
+            f"  step {step.begin:g} to {step.end:g} m in still water, delay {1e3 * delay:.0f} ms: "
+            f"overshoot {100.0 * answer.overshoot:.1f} %, within 5 % after {answer.settling:.1f} s"
+        )
+    return lines
+
+
+def _row(one: Margins) -> str:
+    return (
+        f"{one.crossover:5.2f} rad/s  {math.degrees(one.phase):4.0f}°  {one.gain:5.2f}  "
+        f"{1e3 * one.delay:4.0f} ms  {one.modulus:.2f}"
+    )

@@ -1,0 +1,171 @@
+"""Positive definite systems of a few unknowns inside compiled kernels, by Cholesky's factor.
+
+They are solved in less time than it takes to hand them to LAPACK.
+
+Three-vectors as tuples, for kernels: they stay in registers.
+
+Symmetric 3 x 3 systems inside compiled kernels, where calling LAPACK costs more than the job.
+"""
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inline_kernel,
+    kernel,
+)
+
+Vec: TypeAlias = tuple[float, float, float]
+
+
+@inline_borrowing_kernel
+def dot(a: Vec, b: Vec) -> float:
+    """Return the scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inline_borrowing_kernel
+def cross(a: Vec, b: Vec) -> Vec:
+    """Return the vector product."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@inline_borrowing_kernel
+def minus(a: Vec, b: Vec) -> Vec:
+    """Return a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inline_borrowing_kernel
+def along(origin: Vec, direction: Vec, t: float) -> Vec:
+    """Return origin + t * direction."""
+    return (
+        origin[0] + t * direction[0],
+        origin[1] + t * direction[1],
+        origin[2] + t * direction[2],
+    )
+
+
+@inline_borrowing_kernel
+def scaled(a: Vec, factor: float) -> Vec:
+    """Return factor * a."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@inline_borrowing_kernel
+def unit(a: Vec) -> Vec:
+    """Return a with length 1."""
+    inverse = 1.0 / np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    return a[0] * inverse, a[1] * inverse, a[2] * inverse
+
+
+@inline_borrowing_kernel
+def combine(a: Vec, x: float, b: Vec, y: float, c: Vec, z: float) -> Vec:
+    """Return x a + y b + z c."""
+    return (
+        x * a[0] + y * b[0] + z * c[0],
+        x * a[1] + y * b[1] + z * c[1],
+        x * a[2] + y * b[2] + z * c[2],
+    )
+
+
+@inline_borrowing_kernel
+def row3(values: FloatArray, i: int, j: int) -> Vec:
+    """Return values[i, j:j+3] as a tuple."""
+    return values[i, j], values[i, j + 1], values[i, j + 2]
+
+
+# Relative to the product of the diagonal: a smaller determinant is rounding, not information.
+_SINGULAR = 1e-13
+
+
+@inline_kernel
+def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
+    """Invert a positive definite 3 x 3 matrix by its cofactors; only its lower half is read.
+
+    False, and nothing written, where the matrix is singular to rounding or not positive.
+    """
+    a, b, c = matrix[0, 0], matrix[1, 0], matrix[2, 0]
+    d, e, f = matrix[1, 1], matrix[2, 1], matrix[2, 2]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    if not determinant > _SINGULAR * a * d * f:
+        return False
+    inverse[0, 0] = c00 / determinant
+    inverse[0, 1] = inverse[1, 0] = c01 / determinant
+    inverse[0, 2] = inverse[2, 0] = c02 / determinant
+    inverse[1, 1] = (a * f - c * c) / determinant
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
+    inverse[2, 2] = (a * d - b * b) / determinant
+    return bool(determinant < np.inf)
+
+
+@inline_kernel
+def solve_symmetric(
+    matrix: FloatArray, right: FloatArray, scratch: FloatArray, solution: FloatArray
+) -> bool:
+    """Solve a positive definite 3 x 3 system; False, and nothing written, where it is singular."""
+    if not invert_symmetric(matrix, scratch):
+        return False
+    for i in range(3):
+        solution[i] = scratch[i, 0] * right[0] + scratch[i, 1] * right[1] + scratch[i, 2] * right[2]
+    return True
+
+
+@borrowing_kernel
+def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArray) -> bool:
+    """Write the lower factor of a matrix (N, N), its diagonal times 1 + damping, to `factor`.
+
+    Only the lower half of the matrix is read; `factor` may be the matrix itself. False where a
+    pivot is not above `least` of its diagonal element: it is rounding, not information.
+    """
+    n = len(matrix)
+    for i in range(n):
+        own = matrix[i, i]
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            if i == j:
+                rest += damping * own
+            for k in range(j):
+                rest -= factor[i, k] * factor[j, k]
+            if i != j:
+                factor[i, j] = rest / factor[j, j]
+            elif rest > least * own:
+                factor[i, i] = math.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@borrowing_kernel
+def solve_factorised(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
+    """Write the solution (N,) of factor factor' x = right to `out`, which may be `right` itself."""
+    n = len(right)
+    for i in range(n):
+        rest = right[i]
+        for k in range(i):
+            rest -= factor[i, k] * out[k]
+        out[i] = rest / factor[i, i]
+    for i in range(n - 1, -1, -1):
+        rest = out[i]
+        for k in range(i + 1, n):
+            rest -= factor[k, i] * out[k]
+        out[i] = rest / factor[i, i]
+
+
+@kernel
+def inverse_of(factor: FloatArray) -> FloatArray:
+    """Return the inverse (N, N) of the matrix that a factor was made from."""
+    inverse = np.eye(len(factor))
+    for k in range(len(factor)):
+        solve_factorised(factor, inverse[k], inverse[k])
+    return inverse

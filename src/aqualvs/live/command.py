@@ -1,0 +1,326 @@
+"""`aqualvs live`: from a stream to pilot, autopilot and log.
+
+Following the water's index beside a live run, so that no frame waits for it.
+
+What a live run says in the terminal: one line that stays, or a line now and then in a log.
+"""
+
+import math
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO
+
+from aqualvs.control.time_filter import PostureFilter
+from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.errors import OptionError
+from aqualvs.live.options import OutputRequest, make_outputs, serve_page
+from aqualvs.live.outputs.base import Output
+from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner, ScannerSupply, warm_up
+from aqualvs.optics.rig import Rig
+from aqualvs.recording import PictureFormat, RecorderOptions, RecorderSwitch
+from aqualvs.recording.sample import LiveSample
+from aqualvs.results.run_request import Water, prepared_rig
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources.base import Feed, PartHealth, State
+from aqualvs.sources.opening import open_feed
+from aqualvs.sources.remote import Transport
+from aqualvs.terminal import StopSignals
+from aqualvs.workers.water_index import WaterFollowingScanner
+
+_PATIENCE_S = 3.0
+
+
+class WaterFollower:
+    """Supplies the scanner for the water as it is known, from a thread that reads the target.
+
+    Parameters
+    ----------
+    following : WaterFollowingScanner
+        Looks at the target; used by the thread alone from here on.
+    """
+
+    def __init__(self, following: WaterFollowingScanner) -> None:
+        self._following = following
+        self._frames: queue.Queue[Frame | None] = queue.Queue(1)
+        self._scanner, self._sigma = following.scanner, following.sigma_n_water
+        self._thread = threading.Thread(target=self._look, name="water", daemon=True)
+        self._thread.start()
+
+    @property
+    def scanner(self) -> Scanner:
+        """The one to use for the next frame."""
+        return self._scanner
+
+    @property
+    def sigma_n_water(self) -> float:
+        """Standard deviation of its index; NaN until the target has been seen."""
+        return self._sigma
+
+    def offer(self, frame: Frame) -> None:
+        """Have a frame looked at when it is due and nobody is looking."""
+        if self._following.is_due(frame) and self._frames.empty():
+            self._frames.put_nowait(frame)
+
+    def close(self) -> None:
+        """End the thread."""
+        if not self._thread.is_alive():
+            return
+        while not self._frames.empty():
+            self._frames.get_nowait()
+        self._frames.put(None)
+        self._thread.join(_PATIENCE_S)
+
+    def _look(self) -> None:
+        while (frame := self._frames.get()) is not None:
+            self._following.look(frame)
+            self._scanner = self._following.scanner
+            self._sigma = self._following.sigma_n_water
+
+
+_SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
+
+
+class Console:
+    """An output for whoever started the run.
+
+    Parameters
+    ----------
+    stream : file, optional
+        Standard error if left out.
+    """
+
+    name = "console"
+    inline = False
+    keeps_all = False
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._on_screen = self._stream.isatty()
+        self._next_s = -math.inf
+        self._parts: dict[str, tuple[State, str]] = {}
+
+    def send(self, sample: LiveSample) -> None:
+        """Tell of parts that have changed at once, and of the posture when it is time."""
+        self._tell_changes(sample)
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        self._next_s = now_s + (_SCREEN_EVERY_S if self._on_screen else _LOG_EVERY_S)
+        self._write(status_line(sample), stays=False)
+
+    def health(self) -> PartHealth:
+        """Return that all is well: the terminal shows by itself if not."""
+        return PartHealth(self.name, State.OK)
+
+    def close(self) -> None:
+        """Leave the line that stayed."""
+        if self._on_screen and math.isfinite(self._next_s):
+            self._stream.write("\n")
+            self._stream.flush()
+
+    def _tell_changes(self, sample: LiveSample) -> None:
+        health = sample.health
+        for part in (health.source, *health.lasers, *health.outputs):
+            before = self._parts.get(part.name, (State.OFF, ""))[0]
+            self._parts[part.name] = part.state, part.detail
+            alarming = part.state in (State.WARN, State.FAULT)
+            if part.state is not before and (alarming or before in (State.WARN, State.FAULT)):
+                self._write(f"{part.name}: {part.state.value}: {part.detail}", stays=True)
+
+    def _write(self, line: str, *, stays: bool) -> None:
+        if self._on_screen:
+            self._stream.write(f"\r\x1b[K{line}" + ("\n" if stays else ""))
+        else:
+            self._stream.write(f"{line}\n")
+        self._stream.flush()
+
+
+def status_line(sample: LiveSample) -> str:
+    """Return posture and health of a sample in one line."""
+    posture, health = sample.scan.posture, sample.health
+    if isinstance(posture, Posture):
+        sigma = posture.total_covariance.diagonal() ** 0.5
+        told = (
+            f"range {posture.range:.3f} ± {sigma[0]:.3f} m  "
+            f"yaw {math.degrees(posture.yaw):+.1f} ± {math.degrees(sigma[2]):.1f} deg  "
+            f"pitch {math.degrees(posture.pitch):+.1f} ± {math.degrees(sigma[1]):.1f} deg"
+        )
+    else:
+        told = f"no posture: {posture.detail or posture.reason.value}"
+    total = health.delays[-1] if health.delays else None
+    delay = "" if total is None else f"  {1e3 * total.median_s:.1f} ms"
+    dropped = f"  {health.n_dropped} dropped" if health.n_dropped else ""
+    return f"{told}  | {health.rate_hz:.0f} Hz{delay}{dropped}"
+
+
+# Threads wait for the interpreter at most so long; Python's own 5 ms would show in the delays.
+SWITCH_S = 0.0005
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeedRequest:
+    """How the source shall deliver, where it has a choice; see `open_feed`.
+
+    Attributes
+    ----------
+    fps : float or None
+        Of images, or asked of a camera.
+    size : str or None
+        `WIDTHxHEIGHT`, asked of a camera.
+    pixel_format : str or None
+        Asked of a camera.
+    transport : {"tcp", "udp"} or None
+        How RTSP shall send.
+    """
+
+    fps: float | None = None
+    size: str | None = None
+    pixel_format: str | None = None
+    transport: Transport | None = None
+
+    def opened(self, source: str, *, realtime: bool) -> Feed:
+        """Return the feed of a source.
+
+        Raises
+        ------
+        OptionError, SourceError
+            As `open_feed`; also if the size is none.
+        """
+        return open_feed(
+            source,
+            realtime=realtime,
+            fps=self.fps,
+            size_px=None if self.size is None else _size_px(self.size),
+            pixel_format=self.pixel_format,
+            transport=self.transport,
+        )
+
+
+def _size_px(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise OptionError(f"--size {text}: not understood; give WIDTHxHEIGHT, such as 1920x1080")
+    return int(width), int(height)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveRequest:
+    """What to run live.
+
+    Attributes
+    ----------
+    source : str
+        As `open_feed` takes it.
+    rig : Path
+    feed : FeedRequest
+    outputs : OutputRequest
+    dashboard : str or None
+        Address HOST:PORT of the pilot's page.
+    token : str or None
+        Its password.
+    record : bool
+        Whether to record from the start; the page's button begins and ends recordings, too.
+    record_to : Path
+        Folder of recordings.
+    record_video : bool
+    smooth : bool
+        Whether the time filter runs.
+    fast : bool
+        Measure every frame of a file, as fast as possible.
+    water : Water
+    scanner : ScannerOptions
+    index_target : Path or None
+        Markers on the vehicle that tell the water's index.
+    """
+
+    source: str
+    rig: Path
+    feed: FeedRequest = field(default_factory=FeedRequest)
+    outputs: OutputRequest = field(default_factory=OutputRequest)
+    dashboard: str | None = None
+    token: str | None = None
+    record: bool = False
+    record_to: Path = Path("dives")
+    record_video: bool = False
+    smooth: bool = False
+    fast: bool = False
+    water: Water = field(default_factory=Water)
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    index_target: Path | None = None
+
+
+def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
+    """Run until the source ends or somebody stops it, which is how live runs end; returns 0.
+
+    Raises
+    ------
+    AqualvsError
+        If an input cannot be used, or the source can never work.
+    """
+    rig = prepared_rig(request.rig, request.water, no_dome=False)
+    feed = request.feed.opened(request.source, realtime=not request.fast)
+    sys.setswitchinterval(SWITCH_S)
+    with ExitStack() as undo:
+        undo.callback(feed.close)
+        outputs = _outputs(request, rig, tell)
+        for output in outputs:
+            undo.callback(output.close)
+        runner = LiveRunner(
+            feed,
+            _supply(request, rig),
+            outputs,
+            LiveOptions(keep_every=request.fast),
+            PostureFilter() if request.smooth else None,
+        )
+        undo.pop_all()
+    with StopSignals() as stop:
+        fault = runner.run(lambda: stop.caught is not None)
+    if fault is not None:
+        raise fault
+    return 0
+
+
+def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> list[Output]:
+    """Make all outputs; those made before one that fails are closed."""
+    options = recorder_options(request.scanner, video=request.record_video)
+    recorder = RecorderSwitch(request.record_to, options)
+    with ExitStack() as made:
+        outputs: list[Output] = [recorder, Console()]
+        made.callback(recorder.close)
+        if request.record:
+            tell(f"recording: {recorder.start()}")
+        outputs += make_outputs(request.outputs)
+        for output in outputs[2:]:
+            made.callback(output.close)
+        if request.dashboard is not None:
+            holder = SetpointHolder(rig.working_range)
+            outputs.append(
+                serve_page(request.dashboard, request.token, rig, holder, recorder, tell)
+            )
+        made.pop_all()
+    return outputs
+
+
+def recorder_options(scanner: ScannerOptions, *, video: bool) -> RecorderOptions:
+    """Return what recordings hold: with `video` the pictures, too."""
+    return RecorderOptions(pictures=PictureFormat.JPEG if video else None, scanner=scanner)
+
+
+def _supply(request: LiveRequest, rig: Rig) -> ScannerSupply:
+    if request.index_target is None:
+        scanner = Scanner(rig, request.scanner)
+        warm_up(scanner)
+        return FixedScanner(scanner)
+    if rig.dome is None:
+        raise OptionError("--index-target: without a dome the water's index cannot be seen")
+    following = WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
+    warm_up(following.scanner)
+    return WaterFollower(following)

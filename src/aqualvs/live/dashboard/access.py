@@ -1,0 +1,361 @@
+"""Who may see the pilot's page, and who may command from it.
+
+What the page may ask for: messages checked by type and size, and what they do.
+
+Limits on connections and on wrong tokens.
+"""
+
+import asyncio
+import heapq
+import ipaddress
+import math
+import re
+import secrets
+from collections import Counter, OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Annotated, Any, ClassVar, Literal, Protocol
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from aqualvs.control.vehicle import Setpoint, SetpointHolder
+from aqualvs.errors import OptionError
+
+MAX_MESSAGE_BYTES = 2048
+"""Longer messages close the connection."""
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Hello(_Message):
+    """The first message of a page."""
+
+    kind: Literal["hello"]
+    token: Annotated[str, Field(max_length=200)] = ""
+
+
+class Shown(_Message):
+    """The page has shown a picture and can take the next."""
+
+    kind: Literal["shown"]
+
+
+class RecordCommand(_Message):
+    """Begin or end a recording."""
+
+    kind: Literal["record"]
+    on: bool
+
+
+class SetpointCommand(_Message):
+    """Set what is to be held; without a range it is taken back."""
+
+    kind: Literal["setpoint"]
+    range_m: float | None
+    yaw_deg: float = 0.0
+
+
+Message = Annotated[Hello | Shown | RecordCommand | SetpointCommand, Field(discriminator="kind")]
+Command = RecordCommand | SetpointCommand
+_ADAPTER: TypeAdapter[Message] = TypeAdapter(Message)
+
+
+def parse_message(text: str) -> Message:
+    """Return a page's message.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    return _ADAPTER.validate_json(text)
+
+
+class RecordButton(Protocol):
+    """What the page needs of a recorder."""
+
+    def start(self) -> None:
+        """Begin a recording; does nothing while one is under way."""
+
+    def stop(self) -> None:
+        """End it; does nothing where there is none."""
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return `on` (bool) and `words` (a file's name, or why it does not work)."""
+
+
+class NoRecorder:
+    """Stands where nothing can be recorded."""
+
+    def start(self) -> None:
+        """Refuse."""
+        raise OptionError("record: this run records nothing; start it with --record FOLDER")
+
+    def stop(self) -> None:
+        """Do nothing."""
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return that nothing is recorded."""
+        return {"on": False, "words": ""}
+
+
+class Controls:
+    """What the page can move.
+
+    Parameters
+    ----------
+    setpoint : SetpointHolder
+    recorder : RecordButton
+    """
+
+    def __init__(self, setpoint: SetpointHolder, recorder: RecordButton) -> None:
+        self.setpoint, self.recorder = setpoint, recorder
+
+    def carry_out(self, command: Command) -> None:
+        """Do what a page with the right to command asks for.
+
+        Raises
+        ------
+        AqualvsError
+            If it cannot be done; nothing has changed then.
+        """
+        if isinstance(command, SetpointCommand):
+            wanted = None
+            if command.range_m is not None:
+                wanted = Setpoint(command.range_m, math.radians(command.yaw_deg))
+            self.setpoint.put(wanted)
+        elif command.on:
+            self.recorder.start()
+        else:
+            self.recorder.stop()
+
+
+_LEAST_TOKEN = 8
+_HOST = re.compile(r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::([0-9]{1,5}))?", re.ASCII)
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*://", re.ASCII)
+_MAX_PORT = 65535
+_LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """The rules: this machine may watch, whoever has the token may watch and command.
+
+    Attributes
+    ----------
+    host : str
+        Address that the page is served at.
+    token : str
+        The password.
+    """
+
+    host: str
+    token: str
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine can reach the page."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    def may_command(self, token: str) -> bool:
+        """Return whether somebody with this token may command."""
+        return secrets.compare_digest(token.encode(), self.token.encode())
+
+    def may_watch(self, token: str) -> bool:
+        """Return whether somebody with this token may see the data."""
+        return self.is_local or self.may_command(token)
+
+    def is_own_page(self, origin: str | None, host: str) -> bool:
+        """Return whether a connection comes from the page itself rather than from a foreign one.
+
+        Parameters
+        ----------
+        origin : str or None
+            The header that browsers send with the page's address; programs send none.
+        host : str
+            The header with the address as the browser knows it. Served to this machine only, it
+            must be a name of this machine: a foreign name that points here is an attack.
+        """
+        if self.is_local and urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
+            return False
+        return origin is None or urlsplit(origin).netloc == host
+
+
+def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
+    """Return whether the headers `Host` and `Origin` of a request are written as addresses are.
+
+    Parameters
+    ----------
+    hosts, origins : sequence of str
+        All values of these headers; a program may send none, nobody may send two.
+    """
+    if len(hosts) > 1 or len(origins) > 1:
+        return False
+    return all(map(_is_host, hosts)) and all(map(_is_origin, origins))
+
+
+def _is_host(text: str) -> bool:
+    """Return whether a text is a name or an IP address, with or without a port (RFC 9110, 7.2)."""
+    found = _HOST.fullmatch(text)
+    if found is None or int(found[1] or 0) > _MAX_PORT:
+        return False
+    try:
+        # The brackets of what is no IPv6 address raise here.
+        return urlsplit(f"//{text}").hostname is not None
+    except ValueError:
+        return False
+
+
+def _is_origin(text: str) -> bool:
+    """Return whether a text is an origin, as browsers write it (RFC 6454, 6.2)."""
+    scheme = _SCHEME.match(text)
+    return text == "null" or (scheme is not None and _is_host(text[scheme.end() :]))
+
+
+def make_access(host: str, token: str | None) -> Access:
+    """Return the rules for an address; without a token a new one is made."""
+    return Access(host, token if token else secrets.token_urlsafe(12))
+
+
+def token_fault(token: str | None) -> str:
+    """Return what is wrong with a token that a user chose; "" if nothing is."""
+    if token is None or len(token) >= _LEAST_TOKEN:
+        return ""
+    return f"--token: {len(token)} characters; choose at least {_LEAST_TOKEN}, or leave it out"
+
+
+Peer = tuple[str, int]
+"""Address and port of the other end."""
+
+
+class ConnectionLimits:
+    """Bound on the connections that wait for a page's greeting; used from one event loop alone.
+
+    A connection over a limit replaces the oldest one of the address that holds the most. Strangers
+    so replace each other, and a page that greets at once always finds room.
+    """
+
+    PER_ADDRESS: ClassVar[int] = 12
+    """A browser opens up to six connections to load a page, and one to follow it."""
+    IN_ALL: ClassVar[int] = 48
+    SILENCE_S: ClassVar[float] = 10.0
+    """Time to load a file, or to greet, in seconds; then the connection is closed."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[Peer, asyncio.Transport] = {}
+
+    def open(self, peer: Peer, transport: asyncio.Transport) -> None:
+        """Note a new connection."""
+        self._waiting = {key: one for key, one in self._waiting.items() if not one.is_closing()} | {
+            peer: transport
+        }
+        asyncio.get_running_loop().call_later(self.SILENCE_S, self._time_out, peer, transport)
+        held = Counter(address for address, _ in self._waiting)
+        if held[peer[0]] > self.PER_ADDRESS:
+            self._close_oldest(peer[0])
+        elif len(self._waiting) > self.IN_ALL:
+            self._close_oldest(held.most_common(1)[0][0])
+
+    def holds(self, peer: Peer) -> bool:
+        """Return whether a connection that waits for its greeting is still open."""
+        transport = self._waiting.get(peer)
+        return transport is not None and not transport.is_closing()
+
+    def welcome(self, peer: Peer) -> None:
+        """Note that a page has greeted: its connection may stay."""
+        self._waiting.pop(peer, None)
+
+    def _close_oldest(self, address: str) -> None:
+        oldest = next(peer for peer in self._waiting if peer[0] == address)
+        self._waiting.pop(oldest).abort()
+
+    def _time_out(self, peer: Peer, transport: asyncio.Transport) -> None:
+        if self._waiting.get(peer) is transport:
+            self._waiting.pop(peer).abort()
+
+    def protocol(self) -> type[asyncio.Protocol]:
+        """Return the HTTP protocol for uvicorn that observes these limits."""
+        limits = self
+
+        class Limited(H11Protocol):
+            def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+                super().connection_made(transport)
+                if self.client is not None:
+                    limits.open(self.client, transport)
+
+        return Limited
+
+
+class TokenGate:
+    """Check of one token at a time: parallel connections guess no faster than one.
+
+    Addresses that have shown the right token come first, then those with the fewest wrong ones, so
+    that guesses do not keep the pilot waiting. Used from one event loop alone.
+
+    Parameters
+    ----------
+    access : Access
+    """
+
+    WRONG_S: ClassVar[float] = 1.0
+    """Time that a wrong token costs, in seconds."""
+    MAX_ADDRESSES: ClassVar[int] = 1024
+    """Addresses that are remembered."""
+
+    def __init__(self, access: Access) -> None:
+        self._access = access
+        self._n_wrong: OrderedDict[str, int] = OrderedDict()
+        self._busy = False
+        self._queue: list[tuple[int, int, asyncio.Future[None]]] = []
+        self._numbers = count()
+
+    async def check(self, address: str, token: str) -> bool:
+        """Return whether a token is right, when its turn has come."""
+        await self._turn(address)
+        right = self._access.may_command(token)
+        self._remember(address, right)
+        if right:
+            self._next()
+        else:
+            # The next turn waits even if this caller is cancelled: hanging up saves no time.
+            asyncio.get_running_loop().call_later(self.WRONG_S, self._next)
+            await asyncio.sleep(self.WRONG_S)
+        return right
+
+    async def _turn(self, address: str) -> None:
+        if not self._busy:
+            self._busy = True
+            return
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        rank = self._n_wrong.get(address, 0)
+        heapq.heappush(self._queue, (rank, next(self._numbers), turn))
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():
+                self._next()
+            raise
+
+    def _next(self) -> None:
+        while self._queue:
+            turn = heapq.heappop(self._queue)[2]
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self._busy = False
+
+    def _remember(self, address: str, right: bool) -> None:
+        self._n_wrong[address] = -1 if right else max(0, self._n_wrong.get(address, 0)) + 1
+        self._n_wrong.move_to_end(address)
+        if len(self._n_wrong) > self.MAX_ADDRESSES:
+            self._n_wrong.popitem(last=False)

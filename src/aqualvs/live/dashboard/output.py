@@ -1,0 +1,150 @@
+"""The pilot's page as an output of a live run.
+
+The camera's picture for the page: small, and cheap to make.
+
+From an address to the pilot's page, ready to be opened.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.errors import OptionError
+from aqualvs.live.dashboard.access import Controls, NoRecorder, make_access, token_fault
+from aqualvs.live.dashboard.server import DashboardServer, page_state
+from aqualvs.optics.rig import Rig
+from aqualvs.recording import RecorderSwitch
+from aqualvs.recording.sample import LiveSample
+from aqualvs.scanning.scan import Frame, ImagePlane
+from aqualvs.sources.base import PartHealth, State
+
+_MAX_WIDTH, _QUALITY = 960, 70
+
+
+def page_picture(frame: Frame) -> bytes:
+    """Return the frame as a JPEG of at most 960 px width."""
+    height, width = frame.luma.shape
+    scale = min(1.0, _MAX_WIDTH / width)
+    # Even numbers: the colour planes have half the size.
+    size = (2 * round(scale * width / 2), 2 * round(scale * height / 2))
+    luma = _resized(frame.luma, size)
+    if frame.chroma is None:
+        image = luma
+    else:
+        half = (size[0] // 2, size[1] // 2)
+        planes = [luma.ravel(), *(_resized(plane, half).ravel() for plane in frame.chroma)]
+        stacked = np.concatenate(planes).reshape(size[1] * 3 // 2, size[0])
+        image = np.asarray(cv2.cvtColor(stacked, cv2.COLOR_YUV2BGR_I420), np.uint8)
+    done, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not done:
+        raise RuntimeError("the picture could not be encoded")
+    return bytes(code)
+
+
+def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
+    if (plane.shape[1], plane.shape[0]) == size:
+        return np.ascontiguousarray(plane)
+    return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# More than a pilot sees; the rest of the machine's time belongs to the measurement.
+_STATE_EVERY_S, _PICTURE_EVERY_S = 0.04, 0.08
+
+
+class Dashboard:
+    """Sends samples to the pages that are open; costs next to nothing while there is none.
+
+    Parameters
+    ----------
+    server : DashboardServer
+        Owned from here on.
+    controls : Controls
+    """
+
+    name = "dashboard"
+    inline = False
+    keeps_all = False
+
+    def __init__(self, server: DashboardServer, controls: Controls) -> None:
+        self._server, self._controls = server, controls
+        self._state_s = self._picture_s = 0.0
+
+    def send(self, sample: LiveSample) -> None:
+        """Send a sample, and now and then its picture behind the number of its frame."""
+        now_s = time.monotonic()
+        if not self._server.hub.n_watchers or now_s - self._state_s < 0.5 * _STATE_EVERY_S:
+            return
+        self._state_s = now_s
+        picture = None
+        if sample.frame is not None and now_s - self._picture_s > _PICTURE_EVERY_S:
+            self._picture_s = now_s
+            picture = sample.frame.index.to_bytes(4, "big") + page_picture(sample.frame)
+        recording = self._controls.recorder.facts()
+        setpoint = self._controls.setpoint.setpoint
+        self._server.publish(page_state(sample, setpoint, recording), picture)
+
+    def health(self) -> PartHealth:
+        """Return how many pages are open."""
+        n = self._server.hub.n_watchers
+        return PartHealth(self.name, State.OK, f"{n} page{'' if n == 1 else 's'} open")
+
+    def close(self) -> None:
+        """End the server."""
+        self._server.close()
+
+
+class SwitchButton:
+    """The page's record button on a recorder's switch.
+
+    Parameters
+    ----------
+    switch : RecorderSwitch
+    """
+
+    def __init__(self, switch: RecorderSwitch) -> None:
+        self._switch = switch
+
+    def start(self) -> None:
+        """Begin a recording."""
+        self._switch.start()
+
+    def stop(self) -> None:
+        """End it."""
+        self._switch.stop()
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return whether a recording is on, and its file or what is wrong."""
+        path, health = self._switch.path, self._switch.health()
+        words = health.detail if health.state is State.FAULT else path.name if path else ""
+        return {"on": path is not None, "words": words}
+
+
+def start_dashboard(
+    host: str,
+    port: int,
+    token: str | None,
+    rig: Rig,
+    holder: SetpointHolder,
+    recorder: RecorderSwitch | None,
+    tell: Callable[[str], object],
+) -> Dashboard:
+    """Serve the page and tell its address; without a recorder, its button refuses.
+
+    Raises
+    ------
+    OptionError
+        If the token is too short, or the address cannot be listened to.
+    """
+    fault = token_fault(token)
+    if fault:
+        raise OptionError(fault)
+    access = make_access(host, token)
+    controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
+    server = DashboardServer(host, port, access, rig, controls)
+    shown = f"[{host}]" if ":" in host else host
+    tell(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
+    return Dashboard(server, controls)

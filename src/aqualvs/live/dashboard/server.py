@@ -1,0 +1,519 @@
+"""The page's web server, in a thread of its own.
+
+From a sample to what the page shows, as JSON.
+
+Hands the latest state and picture to every page that is open; slow pages skip some.
+"""
+
+import asyncio
+import importlib.resources
+import json
+import logging
+import math
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import uvicorn
+from pydantic import ValidationError
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from aqualvs import __version__
+from aqualvs.control.time_filter import FilteredPosture
+from aqualvs.control.vehicle import Setpoint
+from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.live.dashboard.access import (
+    MAX_MESSAGE_BYTES,
+    Access,
+    ConnectionLimits,
+    Controls,
+    Hello,
+    Peer,
+    Shown,
+    TokenGate,
+    are_addresses,
+    parse_message,
+)
+from aqualvs.optics.rig import Rig
+from aqualvs.recording.sample import LiveSample
+from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
+from aqualvs.scanning.posture import Refusal
+from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.sources.base import Health, PartHealth
+from aqualvs.text import laser_colour
+
+_MAX_POINTS = 360
+
+
+def page_state(sample: LiveSample, setpoint: Setpoint | None, recording: Mapping[str, Any]) -> str:
+    """Return the message for the page about one sample.
+
+    Its `posture` holds the cells of the frame's row in `posture.csv`, as they are written there.
+    """
+    row = posture_row(sample.scan).rstrip("\n").split(",")
+    posture = sample.scan.posture
+    found = {
+        "kind": "state",
+        "utc_ms": sample.utc_ns // 10**6,
+        "posture": dict(zip(POSTURE_COLUMNS, row, strict=True)),
+        "detail": posture.detail if isinstance(posture, Refusal) else "",
+        "n_water": f"{sample.scan.n_water:.4f}",
+        "filtered": _filtered(sample.filtered),
+        "setpoint": None
+        if setpoint is None
+        else {"range_m": setpoint.range, "yaw_deg": math.degrees(setpoint.yaw)},
+        "recording": recording,
+        "health": _health(sample.health),
+        "points": _points(sample.scan.points),
+    }
+    return json.dumps(_without_nan(found), separators=(",", ":"))
+
+
+def rig_state(rig: Rig, *, may_command: bool) -> str:
+    """Return the message that begins a connection: what does not change."""
+    near, far = rig.working_range
+    found = {
+        "kind": "rig",
+        "name": rig.name,
+        "size_px": rig.size_px,
+        "lasers": [
+            {"name": laser.name, "colour": laser_colour(i)} for i, laser in enumerate(rig.lasers)
+        ],
+        "working_range_m": [near, far],
+        "may_command": may_command,
+    }
+    return json.dumps(found, separators=(",", ":"))
+
+
+def _points(points: ScanPoints) -> dict[str, Any]:
+    """Return every so-many-th point: in the picture, and in metres from above and from the side."""
+    step = max(1, math.ceil(len(points) / _MAX_POINTS))
+    some = slice(None, None, step)
+    xyz = np.round(points.points_in_dome[some], 3)
+    pixels = np.round(points.pixels[some], 1)
+    return {
+        "laser": points.laser[some].tolist(),
+        "u": pixels[:, 0].tolist(),
+        "v": pixels[:, 1].tolist(),
+        "x": xyz[:, 0].tolist(),
+        "y": xyz[:, 1].tolist(),
+        "z": xyz[:, 2].tolist(),
+        "used": points.used[some].astype(int).tolist(),
+        "net": (points.label[some] == Label.NET).astype(int).tolist(),
+    }
+
+
+def _filtered(filtered: FilteredPosture | None) -> dict[str, float] | None:
+    if filtered is None:
+        return None
+    sigma = np.sqrt(filtered.total_covariance.diagonal())
+    return {
+        "range_m": filtered.range,
+        "pitch_deg": math.degrees(filtered.pitch),
+        "yaw_deg": math.degrees(filtered.yaw),
+        "sigma_range_m": float(sigma[0]),
+        "age_s": filtered.age_s,
+    }
+
+
+def _health(health: Health) -> dict[str, Any]:
+    return {
+        "state": health.state.value,
+        "rate_hz": round(health.rate_hz, 1),
+        "valid_share": health.valid_share,
+        "n_frames": health.n_frames,
+        "n_dropped": health.n_dropped,
+        "n_lost": health.n_lost,
+        "quality": health.quality,
+        "sigma_n_water": health.sigma_n_water,
+        "delays_ms": {
+            d.name: [round(1e3 * d.median_s, 2), round(1e3 * d.p99_s, 2)] for d in health.delays
+        },
+        "source": _part(health.source),
+        "lasers": [_part(part) for part in health.lasers],
+        "outputs": [_part(part) for part in health.outputs],
+    }
+
+
+def _part(part: PartHealth) -> dict[str, Any]:
+    return asdict(part)
+
+
+def _without_nan(value: Any) -> Any:
+    """Return the same with null for what is no number: JSON has no other word for it."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+# Pictures on their way to a page that has not yet shown them: one being drawn, one being sent.
+_ON_THE_WAY = 2
+
+
+@dataclass(slots=True, eq=False)
+class Watcher:
+    """One page.
+
+    Attributes
+    ----------
+    may_command : bool
+    unshown : int
+        Pictures that were sent and not yet shown.
+    gone : Event
+        Set when another page takes this one's place.
+    """
+
+    may_command: bool
+    unshown: int = 0
+    gone: asyncio.Event = field(default_factory=asyncio.Event)
+    _state: str | None = None
+    _picture: bytes | None = None
+    _news: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def put(self, state: str, picture: bytes | None) -> None:
+        """Leave the latest; what has not been sent is replaced."""
+        self._state = state
+        self._picture = picture if picture is not None else self._picture
+        self._news.set()
+
+    def shown(self) -> None:
+        """Note that the page can take one picture more."""
+        self.unshown = max(0, self.unshown - 1)
+        self._news.set()
+
+    async def next(self) -> tuple[str | None, bytes | None]:
+        """Wait for news; returns a state and, where the page keeps up, a picture."""
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            state, self._state = self._state, None
+            picture = None
+            if self._picture is not None and self.unshown < _ON_THE_WAY:
+                picture, self._picture = self._picture, None
+                self.unshown += 1
+            if state is not None or picture is not None:
+                return state, picture
+
+
+class Hub:
+    """All pages; used from the server's event loop alone, but for `n_watchers`."""
+
+    MAX_WATCHERS = 8
+
+    def __init__(self) -> None:
+        # In the order in which they came.
+        self._watchers: dict[Watcher, None] = {}
+
+    @property
+    def n_watchers(self) -> int:
+        """Pages that are open."""
+        return len(self._watchers)
+
+    def join(self, watcher: Watcher) -> bool:
+        """Add a page; False if there are too many.
+
+        A page that may command takes the place of the oldest one that may not.
+        """
+        if len(self._watchers) >= self.MAX_WATCHERS:
+            oldest = next((one for one in self._watchers if not one.may_command), None)
+            if oldest is None or not watcher.may_command:
+                return False
+            self.leave(oldest)
+            oldest.gone.set()
+        self._watchers[watcher] = None
+        return True
+
+    def leave(self, watcher: Watcher) -> None:
+        """Remove a page."""
+        self._watchers.pop(watcher, None)
+
+    def publish(self, state: str, picture: bytes | None) -> None:
+        """Hand out the latest state, and picture if there is a new one."""
+        for watcher in self._watchers:
+            watcher.put(state, picture)
+
+
+_ASSETS = {
+    "": ("dashboard.html", "text/html; charset=utf-8"),
+    "dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
+    "dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
+    "views.js": ("views.js", "text/javascript; charset=utf-8"),
+    "uPlot.iife.min.js": ("uPlot.iife.min.js", "text/javascript; charset=utf-8"),
+    "uPlot.min.css": ("uPlot.min.css", "text/css; charset=utf-8"),
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+}
+# A page that has connected greets within the first of these times.
+_HELLO_S, _START_S, _STOP_S = 5.0, 10.0, 3.0
+# How often it is checked that whoever waits for the check of a token is still there.
+_ALIVE_S = 0.5
+_REFUSED = 1008
+_log = logging.getLogger(__name__)
+
+
+class DashboardServer:
+    """Serves page and data until it is closed.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0 takes any that is free.
+    access : Access
+    rig : Rig
+    controls : Controls
+
+    Attributes
+    ----------
+    port : int
+        Where it listens.
+    hub : Hub
+
+    Raises
+    ------
+    OptionError
+        If the address cannot be listened to.
+    """
+
+    def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
+        self.hub = Hub()
+        self._access, self._rig, self._controls = access, rig, controls
+        self._limits, self._gate = ConnectionLimits(), TokenGate(access)
+        self._socket = _listening(host, port)
+        self.port: int = self._socket.getsockname()[1]
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                _refusing_malformed(self._app()),
+                http=self._limits.protocol(),
+                log_level="warning",
+                access_log=False,
+                ws_max_size=MAX_MESSAGE_BYTES,
+                ws_ping_interval=5.0,
+                ws_ping_timeout=10.0,
+                timeout_graceful_shutdown=1,
+            )
+        )
+        self._thread = threading.Thread(target=self._serve, name="dashboard", daemon=True)
+        self._thread.start()
+        if not self._started():
+            raise OptionError(f"dashboard: {host}:{self.port} did not start; try another port")
+
+    def publish(self, state: str, picture: bytes | None) -> None:
+        """Hand the latest to the pages; called from any thread."""
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self.hub.publish, state, picture)
+
+    def close(self) -> None:
+        """Close all connections and end the thread; further calls do nothing."""
+        self._server.should_exit = True
+        self._thread.join(_STOP_S)
+        self._socket.close()
+
+    def _started(self) -> bool:
+        end = time.monotonic() + _START_S
+        while self._thread.is_alive() and time.monotonic() < end:
+            if self._server.started:
+                return True
+            time.sleep(0.01)
+        return False
+
+    def _serve(self) -> None:
+        asyncio.run(self._serve_in_loop())
+
+    async def _serve_in_loop(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        await self._server.serve(sockets=[self._socket])
+
+    def _app(self) -> Starlette:
+        return Starlette(
+            routes=[
+                Route("/register_service", _blueos, methods=["GET"]),
+                Route("/{name:path}", _asset, methods=["GET"]),
+                WebSocketRoute("/live", self._talk),
+            ]
+        )
+
+    async def _talk(self, socket: WebSocket) -> None:
+        peer = socket.client.host if socket.client else "unknown"
+        headers = socket.headers
+        if not self._access.is_own_page(headers.get("origin"), headers.get("host", "")):
+            _log.warning("dashboard: %s refused: foreign page %s", peer, headers.get("origin"))
+            await socket.close(_REFUSED)
+            return
+        await socket.accept()
+        try:
+            watcher = await self._welcome(socket, peer)
+            if watcher is not None:
+                await self._attend(socket, watcher, peer)
+        except (WebSocketDisconnect, RuntimeError, OSError):
+            # The page has gone; that is its right.
+            return
+
+    async def _welcome(self, socket: WebSocket, peer: str) -> Watcher | None:
+        """Read the greeting; None if the page may not stay."""
+        try:
+            hello = parse_message(await asyncio.wait_for(socket.receive_text(), _HELLO_S))
+        except (TimeoutError, ValidationError, KeyError) as fault:
+            await _refuse(socket, peer, f"no greeting: {type(fault).__name__}")
+            return None
+        token = hello.token if isinstance(hello, Hello) else ""
+        known = bool(token) and await self._is_right(socket, token)
+        watcher = Watcher(may_command=known)
+        why = self._why_not(token, watcher)
+        if why:
+            await _refuse(socket, peer, why)
+            return None
+        self._limits.welcome(_end(socket))
+        await socket.send_text(rig_state(self._rig, may_command=known))
+        return watcher
+
+    async def _is_right(self, socket: WebSocket, token: str) -> bool:
+        """Return whether a token is right, when its turn has come; a page that goes loses it."""
+        end = _end(socket)
+        asking = asyncio.create_task(self._gate.check(end[0], token))
+        while self._limits.holds(end):
+            done, _ = await asyncio.wait({asking}, timeout=_ALIVE_S)
+            if done:
+                return asking.result()
+        asking.cancel()
+        raise WebSocketDisconnect
+
+    def _why_not(self, token: str, watcher: Watcher) -> str:
+        """Let a page in, or return why not."""
+        if token and not watcher.may_command:
+            return "wrong token"
+        if not self._access.may_watch(token):
+            return "no token"
+        return "" if self.hub.join(watcher) else "too many pages are open"
+
+    async def _attend(self, socket: WebSocket, watcher: Watcher, peer: str) -> None:
+        """Send what is new and listen, until the page goes."""
+        beside = [
+            asyncio.create_task(_send_news(socket, watcher)),
+            asyncio.create_task(_make_room(socket, watcher, peer)),
+        ]
+        try:
+            while True:
+                await self._hear(socket, watcher, peer, await socket.receive_text())
+        except (ValidationError, KeyError):
+            await _refuse(socket, peer, "message not understood")
+        finally:
+            self.hub.leave(watcher)
+            for task in beside:
+                task.cancel()
+
+    async def _hear(self, socket: WebSocket, watcher: Watcher, peer: str, text: str) -> None:
+        message = parse_message(text)
+        if isinstance(message, Shown):
+            watcher.shown()
+        elif isinstance(message, Hello):
+            return
+        elif not watcher.may_command:
+            _log.warning("dashboard: %s: %s refused: no token", peer, message.kind)
+            await socket.send_json({"kind": "refused", "why": "open the page with its token"})
+        else:
+            try:
+                await asyncio.to_thread(self._controls.carry_out, message)
+                _log.info("dashboard: %s: %s", peer, message)
+            except AqualvsError as fault:
+                await socket.send_json({"kind": "refused", "why": str(fault)})
+
+
+async def _send_news(socket: WebSocket, watcher: Watcher) -> None:
+    while True:
+        state, picture = await watcher.next()
+        if state is not None:
+            await socket.send_text(state)
+        if picture is not None:
+            await socket.send_bytes(picture)
+
+
+async def _make_room(socket: WebSocket, watcher: Watcher, peer: str) -> None:
+    await watcher.gone.wait()
+    await _refuse(socket, peer, "a page with the token took this place")
+
+
+async def _refuse(socket: WebSocket, peer: str, why: str) -> None:
+    _log.warning("dashboard: %s refused: %s", peer, why)
+    await socket.close(_REFUSED, why)
+
+
+def _end(socket: WebSocket) -> Peer:
+    """Return address and port of a page."""
+    return (socket.client.host, socket.client.port) if socket.client else ("unknown", 0)
+
+
+def _refusing_malformed(app: ASGIApp) -> ASGIApp:
+    """Return an application that answers 400 where a request's addresses are malformed."""
+
+    async def checked(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] in ("http", "websocket"):
+            headers = Headers(scope=scope)
+            if not are_addresses(headers.getlist("host"), headers.getlist("origin")):
+                answer = PlainTextResponse("malformed Host or Origin\n", 400, headers=_HEADERS)
+                if scope["type"] == "websocket":
+                    await WebSocket(scope, receive, send).send_denial_response(answer)
+                else:
+                    await answer(scope, receive, send)
+                return
+        await app(scope, receive, send)
+
+    return checked
+
+
+async def _blueos(_request: Request) -> Response:
+    """Tell BlueOS, which looks for it at every port, what is served here."""
+    return JSONResponse(
+        {
+            "name": "aqualvs",
+            "description": "Range, pitch and yaw to a net or wall from laser lines.",
+            "icon": "mdi-laser-pointer",
+            "company": "aqualvs",
+            "version": __version__,
+            "webpage": "/",
+            "api": "",
+        },
+        headers=_HEADERS,
+    )
+
+
+async def _asset(request: Request) -> Response:
+    found = _ASSETS.get(request.path_params["name"])
+    if found is None:
+        return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
+    folder = importlib.resources.files("aqualvs.live.dashboard") / "assets"
+    return Response((folder / found[0]).read_bytes(), media_type=found[1], headers=_HEADERS)
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as fault:
+        listener.close()
+        raise OptionError(
+            f"--dashboard-address {host}:{port}: {fault.strerror}; choose another address"
+        ) from fault
+    listener.listen(16)
+    return listener

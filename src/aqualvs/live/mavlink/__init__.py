@@ -1,0 +1,1 @@
+"""MAVLink: the connection, its peers and ports, and ArduSub behind it."""

@@ -1,0 +1,488 @@
+"""ArduSub by MAVLink: what it tells of itself, and our efforts to it.
+
+Never arms or disarms, never changes the mode, never presses a button: what goes out is
+`MANUAL_CONTROL` with no button pressed, or a speed in GUIDED, and nothing else.
+
+Whether the pilot moves his sticks, as far as an onboard computer can see it.
+
+Two ways, for no one of them works everywhere:
+
+- `MANUAL_CONTROL` of the ground station, where the router passes it on. The message's `target` is
+  no target field to MAVLink's routing tables, so mavlink-router and ArduPilot's own routing treat
+  it as broadcast.
+- `RC_CHANNELS` of the vehicle: what all senders together made of the stick channels. Ours are among
+  them, scaled by a pilot gain that is not told; whatever lies outside of what we sent in the last
+  second is the pilot's.
+
+Depth as ArduSub tells it, from the best message that there is.
+"""
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Final
+
+from aqualvs.control.sticks import FULL, MIDDLE, PARAMETERS, Sticks, shaping_of
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
+from aqualvs.errors import OptionError
+from aqualvs.live.mavlink.ardusub_commands import (
+    Command,
+    Commander,
+    GuidedCommander,
+    StickCommander,
+    StickResponse,
+    is_finite,
+)
+from aqualvs.live.mavlink.ardusub_parameters import (
+    FOR_STICKS,
+    PILOT_TIMEOUT,
+    ParameterWatch,
+    StationRange,
+    Weight,
+    advise_on_fail_safe,
+    advise_on_station,
+)
+from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
+from aqualvs.vehicle_logs.tlog import SUB_MODES
+
+FRESH_S = 1.0
+"""An older message says nothing of now; ground stations send sticks 5 to 50 times a second."""
+
+_INVALID = 32767
+# ArduSub turns full deflection at a pilot gain of 1 into 400 us about 1500 us (joystick.cpp).
+_CENTRE_US, _FULL_US = 1500, 400
+_LEAST_US, _MOST_US = 800, 2200
+_YAW, _FORWARD, _LATERAL, _VERTICAL = "chan4_raw", "chan5_raw", "chan6_raw", "chan3_raw"
+_KEPT = 200
+
+
+class PilotSticks:
+    """Watches the pilot's sticks.
+
+    Parameters
+    ----------
+    link : MavlinkLink
+    own : (int, int)
+        System and component in whose name we send sticks ourselves.
+    dead_band : float
+        Deflection, as a share of the full one, that counts as centred.
+    """
+
+    def __init__(self, link: MavlinkLink, *, own: tuple[int, int], dead_band: float) -> None:
+        self._link, self._own, self._dead_band = link, own, dead_band
+        self._sent: deque[tuple[int, Sticks]] = deque(maxlen=_KEPT)
+
+    def note(self, sticks: Sticks) -> None:
+        """Remember what we sent ourselves, now."""
+        self._sent.append((time.monotonic_ns(), sticks))
+
+    def moved(self) -> bool:
+        """Return whether the pilot's sticks are off their centre."""
+        return self._joystick_moved() or self._channels_moved()
+
+    def _joystick_moved(self) -> bool:
+        # One who holds his sticks still must not hide another who moves his.
+        return any(self._moves(found) for found in self._link.every("MANUAL_CONTROL"))
+
+    def _moves(self, found: Received) -> bool:
+        if found.age_s > FRESH_S or (found.system, found.component) == self._own:
+            return False
+        sticks = found.message
+        swings = (sticks.x, sticks.y, sticks.r, _swing_of_z(sticks.z))
+        return any(abs(s) > FULL * self._dead_band for s in swings if s != _INVALID)
+
+    def _channels_moved(self) -> bool:
+        found = self._link.latest("RC_CHANNELS", system=self._link.system)
+        if found is None or found.age_s > FRESH_S:
+            return False
+        since = found.received_ns - round(1e9 * FRESH_S)
+        # The thread that sends may add while this one reads.
+        ours = [s for at, s in self._sent.copy() if since <= at <= found.received_ns]
+        told = found.message
+        if self._beyond(told, _FORWARD, [s.x for s in ours]):
+            return True
+        if self._beyond(told, _LATERAL, [s.y for s in ours]):
+            return True
+        if self._beyond(told, _YAW, [s.r for s in ours]):
+            return True
+        # JS_THR_GAIN scales the vertical by up to 4: where we use that axis, it tells nothing.
+        vertical_is_ours = any(s.z != MIDDLE for s in ours)
+        return not vertical_is_ours and self._beyond(told, _VERTICAL, [])
+
+    def _beyond(self, told: Any, channel: str, ours: list[int]) -> bool:
+        """Return whether a channel lies outside of what our own sticks can have made of it."""
+        pulse_us = getattr(told, channel)
+        if not _LEAST_US <= pulse_us <= _MOST_US:
+            return False
+        swing = (pulse_us - _CENTRE_US) / _FULL_US
+        least, most = min((0, *ours)) / FULL, max((0, *ours)) / FULL
+        return not least - self._dead_band <= swing <= most + self._dead_band
+
+
+def _swing_of_z(z: int) -> int:
+    """Return the vertical stick as the others count, -1000 to 1000."""
+    return z if z == _INVALID else 2 * (z - MIDDLE)
+
+
+# As in logs: height above home, which ArduSub puts at the surface; then above mean sea level; then
+# that of the spare estimator.
+_CANDIDATES: Final = (
+    ("GLOBAL_POSITION_INT", "relative_alt", -1e-3),
+    ("VFR_HUD", "alt", -1.0),
+    ("AHRS2", "altitude", -1.0),
+)
+_PRESSURE: Final = ("SCALED_PRESSURE2", "press_abs", 100.0 / (1025.0 * 9.80665))
+# An estimate that stands still while the outer pressure changes is that of a filter without
+# origin, not a depth.
+_STUCK_SHARE, _DIVED_M = 0.1, 0.5
+
+
+class DepthChoice:
+    """Reads the depth; remembers which estimates stood still.
+
+    Parameters
+    ----------
+    link : MavlinkLink
+    fresh_s : float
+        Older messages do not count.
+    """
+
+    def __init__(self, link: MavlinkLink, fresh_s: float) -> None:
+        self._link, self._fresh_s = link, fresh_s
+        self._spans: dict[str, tuple[float, float]] = {}
+
+    def read(self) -> float | None:
+        """Return the depth in metres, positive down; None if none is known."""
+        # Only its span counts: what the pressure was at the surface, nobody says.
+        self._value(*_PRESSURE)
+        found = {kind: self._value(kind, field, scale) for kind, field, scale in _CANDIDATES}
+        for kind, depth in found.items():
+            if depth is not None and not self._stands_still(kind):
+                return depth
+        return None
+
+    def _value(self, kind: str, field: str, scale: float) -> float | None:
+        received = self._link.latest(kind, system=self._link.system)
+        if received is None or received.age_s > self._fresh_s:
+            return None
+        value = scale * float(getattr(received.message, field))
+        low, high = self._spans.get(kind, (value, value))
+        self._spans[kind] = (min(low, value), max(high, value))
+        return value
+
+    def _stands_still(self, kind: str) -> bool:
+        dived = self._span(_PRESSURE[0])
+        return dived > _DIVED_M and self._span(kind) < _STUCK_SHARE * dived
+
+    def _span(self, kind: str) -> float:
+        low, high = self._spans.get(kind, (0.0, 0.0))
+        return high - low
+
+
+_AUTOPILOT = 1
+# Not a ground station's own component (190 as a rule): a router would take the two for one, and
+# keep its messages from us.
+_SENDER = MAV_COMP_ID_ONBOARD_COMPUTER
+_ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
+_ARMED = 128
+_FRESH_S = 1.0
+# Two and a half of ArduSub's heartbeats.
+_BEATS_WITHIN_S = 2.5
+# Sticks that were in use so lately may still be in force when the link is closed.
+_LATELY_S = 3.0
+_GOODBYES, _GOODBYE_EVERY_S = 3, 0.02
+# Depth hold alone: elsewhere the vehicle would sink or rise under a neutral stick, or goes its way.
+_KEEPS_DEPTH: Final = {
+    Command.STICKS: ("ALT_HOLD", "POSHOLD", "SURFTRAK"),
+    Command.GUIDED: ("GUIDED",),
+}
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArduSubOptions:
+    """How ArduSub is steered, and who must be there.
+
+    Attributes
+    ----------
+    command : Command
+        Sticks, or speeds in GUIDED.
+    modes : tuple of str
+        Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
+    ground_station : int
+        System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
+        SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
+    station_timeout_s : float or None
+        Without its heartbeat for so long, efforts are not ours to give: our own sticks would keep
+        ArduSub from noticing that its ground station is gone. None where nobody need be there.
+    stick_dead_band : float
+        Deflection of the pilot's sticks that counts as centred, as a share of the full one.
+    speed : float
+        In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
+    turning_rate : float
+        In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
+    """
+
+    command: Command = Command.STICKS
+    modes: tuple[str, ...] = ()
+    ground_station: int = 255
+    station_timeout_s: float | None = 3.0
+    stick_dead_band: float = 0.1
+    speed: float = 0.3
+    turning_rate: float = math.radians(30.0)
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        allowed = _KEEPS_DEPTH[self.command]
+        for mode in self.modes:
+            if mode not in allowed:
+                raise OptionError(
+                    f"ArduSub mode {mode}: cannot be steered by {self.command}; choose of "
+                    f"{', '.join(allowed)}"
+                )
+        if not 1 <= self.ground_station <= 255:
+            raise OptionError(
+                f"ArduSub ground_station {self.ground_station}: must lie between 1 and 255"
+            )
+        for name in ("station_timeout_s", "speed", "turning_rate"):
+            value = getattr(self, name)
+            if value is not None and not (value > 0.0 and math.isfinite(value)):
+                raise OptionError(f"ArduSub {name} {value:g}: must be positive")
+        if not 0.0 < self.stick_dead_band < 1.0:
+            raise OptionError(
+                f"ArduSub stick_dead_band {self.stick_dead_band:g}: must lie between 0 and 1"
+            )
+
+    @property
+    def own_modes(self) -> tuple[str, ...]:
+        """The modes in which efforts are taken."""
+        return self.modes or _KEEPS_DEPTH[self.command][:1]
+
+
+class ArduSubLink:
+    """A vehicle with ArduSub, as `aqualvs.control.vehicle.VehicleLink`.
+
+    Parameters
+    ----------
+    link : str or MavlinkLink
+        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
+    options : ArduSubOptions, optional
+        Defaults if left out.
+    advises : bool
+        Whether settings of the vehicle that are not safe are logged.
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
+    """
+
+    def __init__(
+        self,
+        link: str | MavlinkLink,
+        options: ArduSubOptions | None = None,
+        *,
+        advises: bool = True,
+    ) -> None:
+        self.options = options or ArduSubOptions()
+        self._owns_link = isinstance(link, str)
+        self.link = MavlinkLink(link) if isinstance(link, str) else link
+        self.name = f"ArduSub {self.link.url}"
+        station = self.options.ground_station
+        self._commander = self._make_commander()
+        self._sticks = PilotSticks(
+            self.link,
+            own=(station, _SENDER),
+            dead_band=self.options.stick_dead_band,
+        )
+        self._depth = DepthChoice(self.link, _FRESH_S)
+        self._response = StickResponse(self.link)
+        self._watch = ParameterWatch(self.link, FOR_STICKS)
+        # The autopilot takes ten requests at once.
+        self._shapes = [
+            ParameterWatch(self.link, PARAMETERS[k : k + 10]) for k in range(0, len(PARAMETERS), 10)
+        ]
+        self._advised = not advises
+        # A watchdog sends from a thread of its own.
+        self._sending = threading.Lock()
+        self._sent_s = float("-inf")
+        self._closed = False
+
+    def state(self) -> VehicleState:
+        """Return the latest state; returns at once."""
+        beat = self.link.latest("HEARTBEAT", system=self.link.system, component=_AUTOPILOT)
+        if beat is None:
+            return VehicleState()
+        parameters = self._watch.read()
+        self._advise(parameters)
+        mode, mode_name = self._mode(beat, parameters)
+        self._shape(beat)
+        roll, pitch, heading = self._attitude()
+        return VehicleState(
+            heard_s=self._heard_s(beat),
+            armed=bool(beat.message.base_mode & _ARMED),
+            mode=mode,
+            mode_name=mode_name,
+            pilot_moves=self._sticks.moved(),
+            depth=self._depth.read(),
+            heading=heading,
+            roll=roll,
+            pitch=pitch,
+            doubt=self._response.doubt(),
+            rival=self.link.rival,
+        )
+
+    def send(self, effort: Effort) -> None:
+        """Ask for an effort; returns at once.
+
+        ArduSub keeps it until another one comes, from us or from the ground station, or until its
+        pilot-input fail-safe (FS_PILOT_TIMEOUT; in GUIDED 3 s) has run out.
+
+        Raises
+        ------
+        OSError
+            If it could not be sent.
+        ValueError
+            If a part of it is not finite; neutral is sent then.
+        """
+        finite = is_finite(effort)
+        sent = self._send(effort if finite else NEUTRAL)
+        if not finite:
+            raise ValueError(f"effort is not finite: {effort}")
+        if not sent:
+            raise OSError(f"{self.name}: not sent; {self.link.health().detail}")
+
+    def close(self) -> None:
+        """Send neutral, if efforts may still be in force, and free everything."""
+        if self._closed:
+            return
+        self._closed = True
+        if time.monotonic() - self._sent_s < _LATELY_S:
+            for _ in range(_GOODBYES):
+                with contextlib.suppress(OSError):
+                    self._send(NEUTRAL)
+                time.sleep(_GOODBYE_EVERY_S)
+        if self._owns_link:
+            self.link.close()
+
+    def _make_commander(self) -> Commander:
+        options, link = self.options, self.link
+        if options.command is Command.GUIDED:
+            return GuidedCommander(
+                link.dialect,
+                target=link.system,
+                speed=options.speed,
+                turning_rate=options.turning_rate,
+            )
+        packer = link.make_packer(options.ground_station, _SENDER)
+        return StickCommander(link.dialect, packer, target=link.system)
+
+    def _send(self, effort: Effort) -> bool:
+        with self._sending:
+            if isinstance(self._commander, StickCommander):
+                sticks = self._commander.sticks(effort)
+                self._sticks.note(sticks)
+                self._response.note(sticks)
+            message = self._commander.message(effort)
+            sent = self.link.send(message, urgent=True, to_vehicle=True)
+            self._sent_s = time.monotonic() if sent else self._sent_s
+        return sent
+
+    def _shape(self, beat: Received) -> None:
+        """Take out of the sticks what the vehicle, as it tells, makes of them."""
+        if not isinstance(self._commander, StickCommander):
+            return
+        known: dict[str, float] = {}
+        for watch in self._shapes:
+            known = watch.read()
+        keeps_place = SUB_MODES.get(beat.message.custom_mode) == "POSHOLD"
+        with self._sending:
+            self._commander.shaping = shaping_of(known)
+            self._commander.keeps_place = keeps_place
+
+    def _advise(self, parameters: dict[str, float]) -> None:
+        """Log once what the vehicle's settings mean, as soon as they are known or silent."""
+        if self._advised or self.options.command is not Command.STICKS:
+            return
+        if not (StationRange(parameters).known or self._watch.was_patient):
+            return
+        if PILOT_TIMEOUT not in parameters and not self._watch.was_patient:
+            return
+        self._advised = True
+        advice = advise_on_station(parameters, self.options.ground_station)
+        for one in (advice, *advise_on_fail_safe(parameters)):
+            if one.weight is not Weight.FINE:
+                _log.warning("%s: %s", self.name, one.text)
+
+    def _mode(self, beat: Received, parameters: dict[str, float]) -> tuple[Mode, str]:
+        heard = beat.message
+        if heard.autopilot != _ARDUPILOT or heard.type != _SUBMARINE:
+            return Mode.UNKNOWN, f"not ArduSub (vehicle type {heard.type})"
+        name = SUB_MODES.get(heard.custom_mode, f"mode {heard.custom_mode}")
+        if name not in self.options.own_modes:
+            return Mode.PILOT, name
+        if self.link.conflict:
+            return Mode.CONFLICT, f"{name}; {self.link.conflict}"
+        if self._is_ignored(parameters):
+            advice = advise_on_station(parameters, self.options.ground_station)
+            return Mode.IGNORED, f"{name}; {advice.text}"
+        if not self._is_supervised():
+            return Mode.NO_STATION, f"{name}; {self._missing_station()}"
+        return Mode.OURS, name
+
+    def _is_ignored(self, parameters: dict[str, float]) -> bool:
+        """Return whether the vehicle has told that it takes sticks of others only."""
+        obeyed = StationRange(parameters)
+        by_sticks = self.options.command is Command.STICKS
+        return by_sticks and obeyed.known and self.options.ground_station not in obeyed
+
+    def _is_supervised(self) -> bool:
+        """Return whether the ground station is there, or need not be."""
+        timeout_s = self.options.station_timeout_s
+        if timeout_s is None:
+            return True
+        beat = self.link.latest("HEARTBEAT", system=self.options.ground_station)
+        if beat is None or beat.message.type != _GROUND_STATION:
+            return False
+        return beat.age_s < timeout_s
+
+    def _missing_station(self) -> str:
+        """Say which ground station is missing, and which is there instead."""
+        wanted = f"no heartbeat of ground station {self.options.ground_station}"
+        others = {
+            beat.system
+            for beat in self.link.every("HEARTBEAT")
+            if beat.message.type == _GROUND_STATION and beat.age_s < _BEATS_WITHIN_S
+        } - {self.options.ground_station}
+        return f"{wanted}, but of {', '.join(map(str, sorted(others)))}" if others else wanted
+
+    def _heard_s(self, beat: Received) -> float:
+        """Return when the vehicle was heard last.
+
+        Heartbeats come once a second, attitude ten times and more: between two heartbeats attitude
+        tells that the vehicle is there. Without heartbeats it does not: mode and arming are then
+        unknown.
+        """
+        heard_ns = beat.received_ns
+        attitude = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)
+        if attitude is not None and beat.age_s < _BEATS_WITHIN_S:
+            heard_ns = max(heard_ns, attitude.received_ns)
+        return 1e-9 * heard_ns
+
+    def _attitude(self) -> tuple[float | None, float | None, float | None]:
+        """Return roll, pitch and heading (in [0, 2 pi)), in radians."""
+        found = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)
+        if found is None or found.age_s > _FRESH_S:
+            return None, None, None
+        told = found.message
+        return told.roll, told.pitch, told.yaw % (2.0 * math.pi)

@@ -1,0 +1,266 @@
+"""What ArduSub is told: efforts as stick positions, or as speeds over the ground in GUIDED.
+
+Whether the vehicle does what our sticks say, as far as it tells.
+
+ArduSub drops sticks of others than its ground station without a word, and answers nothing to those
+that it takes. What it makes of them shows in `RC_CHANNELS`: 400 us times the pilot gain for a full
+stick (joystick.cpp). Where no channels are told, a yaw stick must turn it.
+"""
+
+import math
+import time
+from collections import deque
+from enum import StrEnum
+from typing import Any, Protocol
+
+from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping
+from aqualvs.control.vehicle import Effort
+from aqualvs.live.mavlink.link import MavlinkLink
+
+# Sticks and answers are looked at for so long, and are so many at least: six messages of three
+# channels, or as many of the attitude.
+_WINDOW_S, _LEAST_PAIRS = 6.0, 18
+# Of the squares of all sticks together: six at a tenth say enough of channels.
+_LEAST_SQUARES = 6 * 0.1**2
+# The least pilot gain is 0.1, 40 us for a full stick; half of the messages may hold the pilot's
+# own sticks, so that a quarter of that is an answer still.
+_LEAST_SLOPE_US = 10.0
+# Sticks to and fro may be faster than channels are told; the channels then move all the same.
+_STILL_US = 3.0
+# Below that a stick may lie within the dead zone of the channel. A vehicle that turns by less for
+# a full stick does not turn by it.
+_TURNING_STICK, _LEAST_TURN = 0.5, math.radians(2.0)
+_LONGEST_STICK_S = 0.3
+_CENTRE_US, _LEAST_US, _MOST_US = 1500, 800, 2200
+_AXES = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
+
+
+class StickResponse:
+    """Compares our sticks with the channels and the turning that follow.
+
+    Parameters
+    ----------
+    link : MavlinkLink
+    """
+
+    def __init__(self, link: MavlinkLink) -> None:
+        self._link = link
+        self._stick: tuple[float, Sticks] | None = None
+        self._began_s = math.inf
+        self._seen_ns = {"RC_CHANNELS": 0, "ATTITUDE": 0}
+        self._channels = {channel: _Pairs() for channel, _ in _AXES}
+        self._turns = _Pairs()
+
+    def note(self, sticks: Sticks) -> None:
+        """Remember what we send now."""
+        now_s = time.monotonic()
+        if self._stick is None or now_s - self._stick[0] > _LONGEST_STICK_S:
+            self._began_s = now_s
+        self._stick = now_s, sticks
+
+    def doubt(self) -> str:
+        """Return why the vehicle seems not to obey, empty if it does or nothing is known."""
+        now_s, stick = time.monotonic(), self._stick
+        if stick is None or now_s - stick[0] > _LONGEST_STICK_S:
+            for pairs in (*self._channels.values(), self._turns):
+                pairs.clear()
+            return ""
+        self._take(now_s, stick[1])
+        channels = [pair for pairs in self._channels.values() for pair in pairs.since(now_s)]
+        still = all(pairs.swing <= _STILL_US for pairs in self._channels.values())
+        if still and _slope(channels) < _LEAST_SLOPE_US:
+            return "RC_CHANNELS does not follow our sticks: the vehicle does not obey them"
+        if channels or now_s - self._began_s < 0.5 * _WINDOW_S:
+            return ""
+        if _slope(self._turns.since(now_s)) < _LEAST_TURN:
+            return "the vehicle does not turn as our yaw stick says"
+        return "RC_CHANNELS is not told: whether our sticks are obeyed is not seen"
+
+    def _take(self, now_s: float, sticks: Sticks) -> None:
+        """Pair what has come since the last look with our stick."""
+        told = self._new("RC_CHANNELS")
+        if told is not None:
+            for channel, axis in _AXES:
+                share, pulse_us = getattr(sticks, axis) / FULL, getattr(told, channel)
+                # 0 and 65535 stand for a channel that nobody moves.
+                off_us = pulse_us - _CENTRE_US if _LEAST_US < pulse_us < _MOST_US else 0
+                self._channels[channel].add(now_s, share, float(off_us))
+        told = self._new("ATTITUDE")
+        turn = sticks.r / FULL
+        if told is not None and abs(turn) >= _TURNING_STICK:
+            self._turns.add(now_s, turn, float(told.yawspeed))
+
+    def _new(self, kind: str) -> Any:
+        found = self._link.latest(kind, system=self._link.system)
+        if found is None or found.received_ns <= self._seen_ns[kind]:
+            return None
+        self._seen_ns[kind] = found.received_ns
+        return found.message
+
+
+class _Pairs:
+    """What a stick said and what the vehicle answered, over the last seconds."""
+
+    def __init__(self) -> None:
+        self._pairs: deque[tuple[float, float, float]] = deque()
+
+    def add(self, now_s: float, share: float, answer: float) -> None:
+        """Add a pair."""
+        self._pairs.append((now_s, share, answer))
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._pairs.clear()
+
+    def since(self, now_s: float) -> list[tuple[float, float]]:
+        """Return the pairs of the window that ends now; older ones are forgotten."""
+        while self._pairs and now_s - self._pairs[0][0] > _WINDOW_S:
+            self._pairs.popleft()
+        return [(share, answer) for _, share, answer in self._pairs]
+
+    @property
+    def swing(self) -> float:
+        """Greatest answer less the least."""
+        answers = [answer for _, _, answer in self._pairs]
+        return max(answers, default=0.0) - min(answers, default=0.0)
+
+
+def _slope(pairs: list[tuple[float, float]]) -> float:
+    """Return the answer to a full stick by least squares; infinite where too little is known."""
+    squares = sum(share * share for share, _ in pairs)
+    if len(pairs) < _LEAST_PAIRS or squares < _LEAST_SQUARES:
+        return math.inf
+    return sum(share * answer for share, answer in pairs) / squares
+
+
+_MAX_SEQ = 256
+
+
+class Command(StrEnum):
+    """How ArduSub is steered; the value is what a user writes."""
+
+    STICKS = "sticks"
+    """`MANUAL_CONTROL`: what a pilot's joystick would send."""
+    GUIDED = "guided"
+    """`SET_POSITION_TARGET_LOCAL_NED`: speeds in the body's axes, by the vehicle's own position
+    estimate."""
+
+
+class Packable(Protocol):
+    """A message as `MavlinkLink.send` takes it."""
+
+    def pack(self, packer: Any, /) -> bytes:
+        """Return the frame."""
+
+
+class Commander(Protocol):
+    """Puts efforts into messages."""
+
+    def message(self, effort: Effort) -> Packable:
+        """Return what to send for an effort of finite parts."""
+
+
+def is_finite(effort: Effort) -> bool:
+    """Return whether every part of an effort is a number."""
+    return all(map(math.isfinite, (effort.forward, effort.right, effort.down, effort.yaw)))
+
+
+class StickCommander:
+    """Efforts as `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
+
+    Parameters
+    ----------
+    dialect : module
+        pymavlink's messages.
+    packer : object
+        Of the sender, see `MavlinkLink.make_packer`; its system id must be the vehicle's
+        MAV_GCS_SYSID (SYSID_MYGCS), its component must not be the ground station's own, or a router
+        would take the two for one.
+    target : int
+        System id of the vehicle.
+
+    Attributes
+    ----------
+    shaping : StickShaping
+        What the vehicle makes of sticks; ArduSub's default until it has told.
+    keeps_place : bool
+        Whether its mode is POSHOLD.
+    """
+
+    def __init__(self, dialect: Any, packer: Any, *, target: int) -> None:
+        self.shaping, self.keeps_place = StickShaping(), False
+        self._message = dialect.MAVLink_manual_control_message(target, 0, 0, MIDDLE, 0, 0)
+        self._packer = packer
+
+    def sticks(self, effort: Effort) -> Sticks:
+        """Return the stick positions for an effort of finite parts."""
+        return self.shaping.sticks(effort, keeps_place=self.keeps_place)
+
+    def message(self, effort: Effort) -> Packable:
+        """Return the message; no button is ever pressed."""
+        sticks, told = self.sticks(effort), self._message
+        told.x, told.y, told.z, told.r = sticks.x, sticks.y, sticks.z, sticks.r
+        return _OnBehalf(told, self._packer)
+
+
+class GuidedCommander:
+    """Efforts as speeds in the body's axes, for a vehicle that knows where it is.
+
+    Parameters
+    ----------
+    dialect : module
+        pymavlink's messages.
+    target : int
+        System id of the vehicle.
+    speed : float
+        What an effort of 1 forward, right or down asks for, in m/s.
+    turning_rate : float
+        What an effort of 1 in yaw asks for, in rad/s.
+    """
+
+    def __init__(self, dialect: Any, *, target: int, speed: float, turning_rate: float) -> None:
+        self._speed, self._turning_rate = speed, turning_rate
+        ignored = (
+            "POSITION_TARGET_TYPEMASK_X_IGNORE",
+            "POSITION_TARGET_TYPEMASK_Y_IGNORE",
+            "POSITION_TARGET_TYPEMASK_Z_IGNORE",
+            "POSITION_TARGET_TYPEMASK_AX_IGNORE",
+            "POSITION_TARGET_TYPEMASK_AY_IGNORE",
+            "POSITION_TARGET_TYPEMASK_AZ_IGNORE",
+            "POSITION_TARGET_TYPEMASK_YAW_IGNORE",
+        )
+        self._message = dialect.MAVLink_set_position_target_local_ned_message(
+            0,
+            target,
+            dialect.MAV_COMP_ID_AUTOPILOT1,
+            dialect.MAV_FRAME_BODY_NED,
+            sum(getattr(dialect, name) for name in ignored),
+            *(0.0,) * 11,
+        )
+
+    def message(self, effort: Effort) -> Packable:
+        """Return the message."""
+        told = self._message
+        told.time_boot_ms = (time.monotonic_ns() // 1_000_000) & 0xFFFF_FFFF
+        told.vx = self._speed * _limited(effort.forward)
+        told.vy = self._speed * _limited(effort.right)
+        told.vz = self._speed * _limited(effort.down)
+        told.yaw_rate = self._turning_rate * _limited(effort.yaw)
+        packable: Packable = told
+        return packable
+
+
+class _OnBehalf:
+    """A message that is packed in another sender's name than the link's."""
+
+    def __init__(self, message: Any, packer: Any) -> None:
+        self._message, self._packer = message, packer
+
+    def pack(self, _packer: Any, /) -> bytes:
+        frame: bytes = self._message.pack(self._packer)
+        self._packer.seq = (self._packer.seq + 1) % _MAX_SEQ
+        return frame
+
+
+def _limited(share: float) -> float:
+    return min(max(share, -1.0), 1.0)

@@ -1,0 +1,293 @@
+"""What ArduSub is set to, what that means for us, and what to set instead.
+
+Names and meanings are those of ArduSub's `Parameters.cpp`, `GCS.cpp` (MAV_), and
+`AP_RangeFinder_Params.cpp` (RNGFND1_); the second name is that of releases before 4.7.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from aqualvs.live.mavlink.link import MavlinkLink
+
+STATION = ("MAV_GCS_SYSID", "SYSID_MYGCS")
+STATION_HIGH = "MAV_GCS_SYSID_HI"
+PILOT_INPUT, PILOT_TIMEOUT = "FS_PILOT_INPUT", "FS_PILOT_TIMEOUT"
+SPEED_UP, SPEED_DOWN = "PILOT_SPEED_UP", "PILOT_SPEED_DN"
+RANGE_TYPE, RANGE_ORIENT = "RNGFND1_TYPE", "RNGFND1_ORIENT"
+RANGE_NEAR = (("RNGFND1_MIN", 1.0), ("RNGFND1_MIN_CM", 0.01))
+RANGE_FAR = (("RNGFND1_MAX", 1.0), ("RNGFND1_MAX_CM", 0.01))
+"""Names with their units in metres."""
+
+FOR_STICKS = (*STATION, STATION_HIGH, PILOT_INPUT, PILOT_TIMEOUT, SPEED_UP, SPEED_DOWN)
+FOR_DISTANCE = (RANGE_TYPE, RANGE_ORIENT, *(name for name, _ in (*RANGE_NEAR, *RANGE_FAR)))
+
+FULL_CLIMB_RATE = 0.5
+"""What a full stick asks for at a pilot gain of 1 in m/s, as the packaged gains take it."""
+
+_DISABLED, _DISARM = 0, 2
+_MAVLINK_RANGEFINDER, _FORWARD = 10, 0
+# A last effort that stands longer than this goes far.
+_LONGEST_TIMEOUT_S = 1.0
+# The rate of descent closes its loop by the depth: half as fast or twice as fast still works.
+_CLIMB_RATE_RATIO = 2.0
+_ASK_EVERY_S, _ASK_SELDOM_S, _ROUNDS = 1.0, 30.0, 5
+
+
+class Weight(StrEnum):
+    """How much an advice matters."""
+
+    FINE = "fine"
+    CARE = "care"
+    """It works, but not as well, or not as safely."""
+    BROKEN = "broken"
+    """It does not work."""
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """What a setting of the vehicle means.
+
+    Attributes
+    ----------
+    weight : Weight
+    text : str
+        One line: name, value, meaning, and what to set.
+    """
+
+    weight: Weight
+    text: str
+
+
+class StationRange:
+    """The system ids that the vehicle takes for its ground station.
+
+    Parameters
+    ----------
+    parameters : mapping
+        As the vehicle told them.
+    """
+
+    def __init__(self, parameters: Mapping[str, float]) -> None:
+        told = [name for name in STATION if name in parameters]
+        self.name = told[0] if told else STATION[0]
+        self._least = round(parameters[self.name]) if told else None
+        self._most = round(parameters.get(STATION_HIGH, 0))
+
+    @property
+    def known(self) -> bool:
+        """Whether the vehicle has told."""
+        return self._least is not None
+
+    def __contains__(self, system: int) -> bool:
+        """Return whether a system id counts; `GCS::sysid_is_gcs`."""
+        if self._least is None:
+            return False
+        return self._least <= system <= max(self._least, self._most)
+
+    def __str__(self) -> str:
+        """Return the ids as messages show them."""
+        if self._least is None:
+            return "unknown"
+        return f"{self._least} to {self._most}" if self._most > self._least else f"{self._least}"
+
+
+class ParameterWatch:
+    """Asks the vehicle for parameters now and then until it has told them; never waits.
+
+    Parameters
+    ----------
+    link : MavlinkLink
+    names : tuple of str
+        At most ten.
+    """
+
+    def __init__(self, link: MavlinkLink, names: tuple[str, ...]) -> None:
+        self._link, self._names = link, names
+        self._next_s, self._n_asked = float("-inf"), 0
+
+    def read(self) -> dict[str, float]:
+        """Return what is known, and ask for the rest when it is time."""
+        known = self._link.parameters()
+        missing = [name for name in self._names if name not in known]
+        now_s = time.monotonic()
+        if missing and now_s >= self._next_s and self._link.autopilot() is not None:
+            # Some names belong to other releases: they are never answered.
+            self._n_asked += 1
+            self._next_s = now_s + (_ASK_EVERY_S if self._n_asked < _ROUNDS else _ASK_SELDOM_S)
+            self._link.ask_parameters(missing)
+        return known
+
+    @property
+    def was_patient(self) -> bool:
+        """Whether the vehicle had time enough to answer."""
+        return self._n_asked >= _ROUNDS
+
+
+def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
+    """Say whether the vehicle obeys sticks that are sent in a ground station's name."""
+    obeyed = StationRange(parameters)
+    if not obeyed.known:
+        return Advice(
+            Weight.CARE,
+            f"{' or '.join(STATION)} is not told: whether the vehicle obeys sticks of ground "
+            f"station {station} is unknown; look it up in the ground station",
+        )
+    if station in obeyed:
+        return Advice(
+            Weight.FINE,
+            f"{obeyed.name} {obeyed}: sticks in the name of ground station {station} are obeyed",
+        )
+    return Advice(
+        Weight.BROKEN,
+        f"{obeyed.name} {obeyed}: every stick in the name of ground station {station} is ignored, "
+        f"the pilot's too; set {obeyed.name} {station}, or ground_station {obeyed} in the vehicle "
+        "file",
+    )
+
+
+def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
+    """Say what the pilot-input fail-safe does when efforts end."""
+    action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
+    found = []
+    if action is None:
+        found.append(Advice(Weight.CARE, f"{PILOT_INPUT} is not told; see that it is 1 or 2"))
+    elif round(action) == _DISABLED:
+        found.append(
+            Advice(
+                Weight.BROKEN,
+                f"{PILOT_INPUT} 0 (off): if follow is killed its last effort stands for ever; set "
+                f"{PILOT_INPUT} 1",
+            )
+        )
+    elif round(action) == _DISARM:
+        found.append(
+            Advice(
+                Weight.CARE,
+                f"{PILOT_INPUT} 2 (disarm): without a joystick that sends, the vehicle disarms "
+                f"{_seconds(timeout_s)} after Enter gives it back, and sinks if it is heavy; set "
+                f"{PILOT_INPUT} 1, or leave the joystick on",
+            )
+        )
+    else:
+        found.append(Advice(Weight.FINE, f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed"))
+    if timeout_s is None:
+        found.append(Advice(Weight.CARE, f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1"))
+    elif timeout_s > _LONGEST_TIMEOUT_S:
+        found.append(
+            Advice(
+                Weight.CARE,
+                f"{PILOT_TIMEOUT} {timeout_s:g} s: if follow is killed its last effort stands for "
+                f"so long; set {PILOT_TIMEOUT} 1",
+            )
+        )
+    else:
+        found.append(
+            Advice(
+                Weight.FINE,
+                f"{PILOT_TIMEOUT} {timeout_s:g} s: so long a last effort stands if follow is "
+                "killed",
+            )
+        )
+    return found
+
+
+def advise_on_speed(
+    parameters: Mapping[str, float], full_climb_rate: float = FULL_CLIMB_RATE
+) -> list[Advice]:
+    """Say what a full vertical stick asks for, beside what gains take for granted.
+
+    Parameters
+    ----------
+    parameters : mapping
+    full_climb_rate : float
+        At a full stick and a pilot gain of 1, in m/s.
+    """
+    up = parameters.get(SPEED_UP)
+    if up is None:
+        return [Advice(Weight.CARE, f"{SPEED_UP} is not told: plans that change the depth are off")]
+    # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
+    down = parameters.get(SPEED_DOWN) or up
+    return [
+        _climb_advice(name, speed, full_climb_rate)
+        for name, speed in ((SPEED_UP, up), (SPEED_DOWN, down))
+    ]
+
+
+def advise_on_distance(
+    parameters: Mapping[str, float], working_range: tuple[float, float] | None = None
+) -> list[Advice]:
+    """Say what the vehicle makes of `DISTANCE_SENSOR`.
+
+    Parameters
+    ----------
+    parameters : mapping
+    working_range : (float, float), optional
+        Of the rig, in metres.
+    """
+    kind = parameters.get(RANGE_TYPE)
+    if kind is None:
+        return [Advice(Weight.CARE, f"{RANGE_TYPE} is not told; set 10 (MAVLink) for the distance")]
+    if round(kind) != _MAVLINK_RANGEFINDER:
+        return [
+            Advice(
+                Weight.CARE,
+                f"{RANGE_TYPE} {kind:.0f}: the distance to the net is not taken in; set "
+                f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and start the autopilot anew",
+            )
+        ]
+    orient = parameters.get(RANGE_ORIENT)
+    if orient is None or round(orient) != _FORWARD:
+        told = "is not told" if orient is None else f"{orient:.0f}"
+        return [
+            Advice(
+                Weight.CARE,
+                f"{RANGE_ORIENT} {told}: ours looks forward, and others are left out; set "
+                f"{RANGE_ORIENT} 0",
+            )
+        ]
+    text = f"{RANGE_TYPE} 10, {RANGE_ORIENT} 0: the distance to the net is taken in"
+    return [Advice(Weight.FINE, text), *_limits_advice(parameters, working_range)]
+
+
+def _climb_advice(name: str, told: float, full_climb_rate: float) -> Advice:
+    speed = 0.01 * told
+    means = f"{name} {told:.0f}: a full stick asks for {speed:.2g} m/s times the pilot gain"
+    if full_climb_rate / _CLIMB_RATE_RATIO <= speed <= full_climb_rate * _CLIMB_RATE_RATIO:
+        return Advice(Weight.FINE, means)
+    return Advice(
+        Weight.CARE,
+        f"{means}, but gains take {full_climb_rate:g} m/s: follow changes the depth at another "
+        f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * full_climb_rate:.0f}",
+    )
+
+
+def _limits_advice(
+    parameters: Mapping[str, float], working_range: tuple[float, float] | None
+) -> list[Advice]:
+    near, far = _first(parameters, RANGE_NEAR), _first(parameters, RANGE_FAR)
+    if near is None or far is None:
+        return []
+    (near_name, least), (far_name, most) = near, far
+    means = f"{near_name}, {far_name}: {least:g} to {most:g} m count"
+    if working_range is None:
+        return [Advice(Weight.FINE, f"{means}; the rig's working range must lie within")]
+    if least <= working_range[0] and most >= working_range[1]:
+        return [Advice(Weight.FINE, means)]
+    wanted = f"{working_range[0]:g} to {working_range[1]:g} m"
+    return [
+        Advice(Weight.CARE, f"{means}, but the rig measures {wanted}; set them to enclose that")
+    ]
+
+
+def _first(
+    parameters: Mapping[str, float], names: tuple[tuple[str, float], ...]
+) -> tuple[str, float] | None:
+    """Return the first name that was told, and its value in metres."""
+    told = [(name, unit * parameters[name]) for name, unit in names if name in parameters]
+    return told[0] if told else None
+
+
+def _seconds(timeout_s: float | None) -> str:
+    return f"{PILOT_TIMEOUT}" if timeout_s is None else f"{timeout_s:g} s"

@@ -1,0 +1,493 @@
+"""One MAVLink connection, kept alive: shared by all that talk to the autopilot."""
+
+import contextlib
+import importlib
+import selectors
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from aqualvs.errors import OptionError
+from aqualvs.live.mavlink.peers import MOVES_AFTER_S, Peer, PeerTable, Signer
+from aqualvs.live.mavlink.ports import (
+    AllowedPeers,
+    Port,
+    SerialAddress,
+    check_address,
+    open_port,
+    parse_address,
+    why,
+)
+from aqualvs.sources.base import PartHealth, State
+
+MAV_COMP_ID_ONBOARD_COMPUTER = 191
+HEARTBEAT_EVERY_S = 1.0
+SILENT_AFTER_S = MOVES_AFTER_S
+"""A vehicle without a heartbeat for so long counts as gone."""
+
+_LOOK_EVERY_S = 0.1
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
+# A connection that lasts so long was a good one: the next attempt follows quickly again.
+_LASTING_S = 2.0
+# A peer that was heard and falls silent may have moved to another address.
+_REOPEN_AFTER_S = 10.0
+_REFUSED_FOR_S = 3.0
+# Of each kind of message the latest of so many senders is kept, besides the vehicle's.
+_MAX_SENDERS = 64
+# Datagrams taken in before the next look at what is to be sent.
+_READ_AT_ONCE = 64
+# What a serial driver already holds delays a message by so much at most; beyond, it is dropped.
+_PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
+_ARDUPILOT, _NO_AUTOPILOT = 3, 8
+_AUTOPILOT_COMPONENT = 1
+# ArduPilot queues 20 requests at most (GCS_Param.cpp), and a lost datagram loses some.
+_ASKED_AT_ONCE, _ASK_AGAIN_S, _ANSWER_POLL_S = 10, 0.3, 0.01
+_ARDUPILOT_NAMES = {1: "ArduPlane", 2: "ArduCopter", 10: "ArduRover", 11: "ArduBoat", 12: "ArduSub"}
+_AUTOPILOT_NAMES = {_ARDUPILOT: "ArduPilot", 12: "PX4"}
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A message that came in.
+
+    Attributes
+    ----------
+    message : object
+        As pymavlink decodes it.
+    received_ns : int
+        By `time.monotonic_ns`.
+    system, component : int
+        Who sent it.
+    """
+
+    message: Any
+    received_ns: int
+    system: int
+    component: int
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it came."""
+        return 1e-9 * (time.monotonic_ns() - self.received_ns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkOptions:
+    """Who we are on a connection, and who may speak to us.
+
+    Attributes
+    ----------
+    system : int
+        Own system id; that of the vehicle, whose part this computer is.
+    component : int
+        Own component id.
+    peers : tuple of str
+        Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
+        everybody if empty. Other connections hear one peer only.
+    key : bytes or None
+        Of MAVLink 2 signing, see `load_key`: what is sent is signed, and what is not signed with
+        it is not heard. None: nothing is signed, and nothing checked.
+    """
+
+    system: int = 1
+    component: int = MAV_COMP_ID_ONBOARD_COMPUTER
+    peers: tuple[str, ...] = ()
+    key: bytes | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises
+        ------
+        OptionError
+            If one makes no sense.
+        """
+        _check_id("system", self.system)
+        _check_id("component", self.component)
+        AllowedPeers(self.peers)
+
+
+class MavlinkLink:
+    """Sends and receives MAVLink 2 as an onboard computer.
+
+    The constructor returns at once. A thread opens the connection, sends a heartbeat every second,
+    takes in what comes, and opens the connection again whenever it breaks, a little later each time
+    up to four seconds. `send` never waits and never raises for the state of the connection.
+
+    A system id belongs to the address where it was heard first, until it has been silent there for
+    five seconds; what others send in its name is left out (see `PeerTable`).
+
+    Parameters
+    ----------
+    url : str
+        See `parse_address`.
+    options : LinkOptions, optional
+        Defaults if left out.
+
+    Attributes
+    ----------
+    system : int
+        System id of the vehicle, and our own.
+    dialect : module
+        pymavlink's messages and constants (ardupilotmega, which holds all common ones).
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
+    """
+
+    def __init__(self, url: str, options: LinkOptions | None = None) -> None:
+        options = options or LinkOptions()
+        self.url = url
+        self.system = system = options.system
+        self._autopilot_ids = (system, _AUTOPILOT_COMPONENT)
+        self.dialect: Any = _dialect()
+        self._address = parse_address(url)
+        check_address(self._address)
+        self._signer = None if options.key is None else Signer(self.dialect, options.key)
+        self._packer = self.make_packer(system, options.component)
+        self._heartbeat = self.dialect.MAVLink_heartbeat_message(
+            self.dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+            self.dialect.MAV_AUTOPILOT_INVALID,
+            0,
+            0,
+            self.dialect.MAV_STATE_ACTIVE,
+            3,
+        )
+        # Guards the port and the packer, and is only held for calls that never wait.
+        self._sending = threading.Lock()
+        self._port: Port | None = None
+        self._broken: OSError | None = None
+        self._fault = "not open yet"
+        self._n_unsent = 0
+        self._receiving = threading.Lock()
+        self._inbox: dict[str, dict[tuple[int, int, Peer], Received]] = {}
+        self._parameters: dict[str, float] = {}
+        self._n_received: Counter[str] = Counter()
+        self._closing = threading.Event()
+        self._allowed, self._n_foreign, self._foreign = AllowedPeers(options.peers), 0, ""
+        self._peers = PeerTable(self._make_parser, (self.dialect.MAVError,), system)
+        self._thread = threading.Thread(target=self._run, name=f"mavlink {url}", daemon=True)
+        self._thread.start()
+
+    def make_packer(self, system: int, component: int) -> Any:
+        """Return a packer of pymavlink for another sender's name on this connection."""
+        packer = self.dialect.MAVLink(None, system, component)
+        if self._signer is not None:
+            self._signer.sign(packer)
+        return packer
+
+    def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
+        """Send messages together, in one datagram where there are datagrams; never waits.
+
+        Parameters
+        ----------
+        *messages
+            pymavlink's message objects, made from `dialect`; may be changed and sent again.
+        urgent : bool
+            On a serial line, may be delayed a little where others are dropped.
+        to_vehicle : bool
+            To the vehicle alone, also where others are heard.
+
+        Returns
+        -------
+        sent : bool
+            False if there is no connection, nobody to send to, or no room; they are dropped then.
+
+        Raises
+        ------
+        struct.error
+            If a field does not fit into its type.
+        """
+        patience_s = _URGENT_PATIENCE_S if urgent else _PATIENCE_S
+        with self._sending:
+            sent = self._send(messages, patience_s, to_vehicle=to_vehicle)
+            self._n_unsent += not sent
+        return sent
+
+    @property
+    def n_unsent(self) -> int:
+        """Calls of `send` that found no connection or no room."""
+        return self._n_unsent
+
+    def latest(
+        self, kind: str, *, system: int | None = None, component: int | None = None
+    ) -> Received | None:
+        """Return the last message of a kind (such as `ATTITUDE`), None if none has come.
+
+        Parameters
+        ----------
+        kind : str
+            Name of the message.
+        system, component : int or None
+            Only from these; from any if None.
+        """
+        found = [
+            entry
+            for entry in self.every(kind)
+            if system in (None, entry.system) and component in (None, entry.component)
+        ]
+        return max(found, key=lambda entry: entry.received_ns, default=None)
+
+    def every(self, kind: str) -> list[Received]:
+        """Return the last message of a kind of each sender."""
+        with self._receiving:
+            return list(self._inbox.get(kind, {}).values())
+
+    @property
+    def conflict(self) -> str:
+        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        return self._peers.conflict
+
+    @property
+    def rival(self) -> str:
+        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        return self._peers.rival
+
+    def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
+        """Ask the autopilot for parameters and wait for the answers.
+
+        Parameters
+        ----------
+        names : iterable of str
+            As ArduPilot calls them, such as `RC4_DZ`.
+        patience_s : float
+            How long to ask and wait, in seconds.
+
+        Returns
+        -------
+        parameters : dict of str to float
+            In the autopilot's units. A parameter that the autopilot does not have, or did not
+            answer in time, is left out.
+        """
+        wanted = list(dict.fromkeys(names))
+        with self._receiving:
+            for name in wanted:
+                self._parameters.pop(name, None)
+        end_s = time.monotonic() + patience_s
+        missing = wanted
+        while missing and time.monotonic() < end_s and not self._closing.is_set():
+            asked = missing[:_ASKED_AT_ONCE]
+            self.ask_parameters(asked)
+            again_s = min(time.monotonic() + _ASK_AGAIN_S, end_s)
+            while time.monotonic() < again_s and not all(map(self._parameters.__contains__, asked)):
+                time.sleep(_ANSWER_POLL_S)
+            # Those that stay silent go to the end, so that the others are asked for.
+            rotated = [*missing[_ASKED_AT_ONCE:], *asked]
+            missing = [name for name in rotated if name not in self._parameters]
+        known = self.parameters()
+        return {name: known[name] for name in wanted if name in known}
+
+    def ask_parameters(self, names: Iterable[str]) -> None:
+        """Ask the autopilot for parameters, ten at once at most; returns at once."""
+        request = self.dialect.MAVLink_param_request_read_message
+        for name in names:
+            asked = request(self.system, _AUTOPILOT_COMPONENT, name.encode("ascii"), -1)
+            self.send(asked, to_vehicle=True)
+
+    def parameters(self) -> dict[str, float]:
+        """Return the parameters that the autopilot has told, whoever asked for them."""
+        with self._receiving:
+            return dict(self._parameters)
+
+    def n_received(self, kind: str) -> int:
+        """Return how many messages of a kind have come from the vehicle's autopilot."""
+        with self._receiving:
+            return self._n_received[kind]
+
+    def autopilot(self) -> Received | None:
+        """Return the last heartbeat of the own vehicle's autopilot, None if none has come."""
+        beats = [beat for beat in self._autopilots() if beat.system == self.system]
+        return max(beats, key=lambda beat: beat.received_ns, default=None)
+
+    def health(self) -> PartHealth:
+        """Return how the connection is."""
+        state, detail = self._state()
+        return PartHealth(f"mavlink {self.url}", state, detail, self._n_unsent)
+
+    def close(self) -> None:
+        """End the thread and free the port; further calls do nothing."""
+        self._closing.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+
+    def _state(self) -> tuple[State, str]:
+        port = self._port
+        if self._closing.is_set():
+            return State.OFF, "closed"
+        if port is None:
+            return State.FAULT, self._fault
+        refused_s = port.refused_s
+        beat = self.autopilot()
+        age_s = beat.age_s if beat else float("inf")
+        if refused_s is not None and time.monotonic() - refused_s < min(_REFUSED_FOR_S, age_s):
+            return State.FAULT, f"nobody listens at {self._address}"
+        if beat is None:
+            return State.WARN, self._waiting_for()
+        if age_s > SILENT_AFTER_S:
+            return State.WARN, f"no heartbeat for {age_s:.0f} s"
+        doubt = self._peers.conflict or self._peers.rival
+        if doubt:
+            return State.WARN, doubt
+        return State.OK, f"autopilot {_name(beat)} seen {age_s:.1f} s ago"
+
+    def _waiting_for(self) -> str:
+        others = [beat for beat in self._autopilots() if beat.age_s < SILENT_AFTER_S]
+        if others:
+            return f"no heartbeat of sysid {self.system}, but of {_name(others[-1])}"
+        told = f"no heartbeat of sysid {self.system} yet"
+        if self._signer is not None and self._signer.n_refused:
+            told += f"; {self._signer.n_refused} messages are not signed with our key, or are old"
+        if self._n_foreign:
+            told += f"; {self._foreign} is none of the peers that may speak"
+        return told
+
+    def _autopilots(self) -> list[Received]:
+        beats = self.every("HEARTBEAT")
+        return [beat for beat in beats if beat.message.autopilot != _NO_AUTOPILOT]
+
+    def _send(
+        self, messages: tuple[Any, ...], patience_s: float, *, to_vehicle: bool = False
+    ) -> bool:
+        port = self._port
+        if port is None or self._broken is not None:
+            return False
+        try:
+            vehicle = self._peers.vehicle if port.many else ()
+            if port.lag_s > patience_s or (to_vehicle and vehicle is None):
+                return False
+            if self._signer is not None:
+                self._signer.advance()
+            frames = b"".join([self._packed(message) for message in messages])
+            if to_vehicle and vehicle is not None:
+                return port.write(frames, vehicle)
+            return port.write_all(frames, self._peers.receivers())
+        except OSError as fault:
+            self._broken = fault
+            return False
+
+    def _packed(self, message: Any) -> bytes:
+        frame: bytes = message.pack(self._packer)
+        self._packer.seq = (self._packer.seq + 1) % 256
+        return frame
+
+    def _run(self) -> None:
+        wait_s = _FIRST_WAIT_S
+        while not self._closing.is_set():
+            began_s = time.monotonic()
+            try:
+                self._serve(open_port(self._address))
+            except (OSError, ValueError) as fault:
+                # A name that cannot be one is a ValueError.
+                if time.monotonic() - began_s > _LASTING_S:
+                    wait_s = _FIRST_WAIT_S
+                again = f"tried again every {wait_s:.2g} s"
+                self._fault = f"{self._address}: {why(fault)}; {again}"
+                self._closing.wait(wait_s)
+                wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+
+    def _serve(self, port: Port) -> None:
+        """Use an open port until it breaks or `close` is called."""
+        with contextlib.closing(port), selectors.DefaultSelector() as selector:
+            selector.register(port, selectors.EVENT_READ)
+            self._peers.restart()
+            with self._sending:
+                self._port, self._broken = port, None
+            try:
+                self._pump(port, selector)
+            finally:
+                with self._sending:
+                    self._port = None
+
+    def _pump(self, port: Port, selector: selectors.BaseSelector) -> None:
+        opened_s = beat_s = time.monotonic()
+        while not self._closing.is_set():
+            now_s = time.monotonic()
+            if now_s >= beat_s:
+                beat_s = now_s + HEARTBEAT_EVERY_S
+                with self._sending:
+                    self._send((self._heartbeat,), _URGENT_PATIENCE_S)
+            events = selectors.EVENT_READ | (selectors.EVENT_WRITE if port.unsent else 0)
+            selector.modify(port, events)
+            for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):
+                if ready & selectors.EVENT_READ:
+                    self._read(port)
+            self._flush(port)
+            self._check_silence(opened_s)
+
+    def _flush(self, port: Port) -> None:
+        with self._sending:
+            port.flush()
+            if self._broken is not None:
+                raise self._broken
+
+    def _check_silence(self, opened_s: float) -> None:
+        """Raise if the peer was heard once and has been silent long, to look it up anew."""
+        beat = self.autopilot()
+        if beat is None or isinstance(self._address, SerialAddress):
+            return
+        if self._address.kind == "udpin":
+            return
+        if min(beat.age_s, time.monotonic() - opened_s) > _REOPEN_AFTER_S:
+            raise TimeoutError(0, f"no heartbeat for {beat.age_s:.0f} s")
+
+    def _make_parser(self) -> Any:
+        parser = self.dialect.MAVLink(None)
+        parser.robust_parsing = True
+        if self._signer is not None:
+            self._signer.check(parser)
+        return parser
+
+    def _read(self, port: Port) -> None:
+        """Take in what has come, but not so much that sending has to wait."""
+        for _ in range(_READ_AT_ONCE):
+            data, peer = port.read()
+            if not data:
+                return
+            if peer not in self._allowed:
+                self._n_foreign, self._foreign = self._n_foreign + 1, str(peer[0])
+                continue
+            for message in self._peers.decode(peer, data, whole=port.whole):
+                if self._peers.admit(peer, message):
+                    self._keep(peer, message)
+
+    def _keep(self, peer: Peer, message: Any) -> None:
+        """Keep a message as the latest of its kind and sender."""
+        kind, received_ns = message.get_type(), time.monotonic_ns()
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        with self._receiving:
+            latest = self._inbox.setdefault(kind, {})
+            latest.pop((*sender, peer), None)
+            latest[*sender, peer] = Received(message, received_ns, *sender)
+            if len(latest) > _MAX_SENDERS:
+                others = [key for key in latest if key[0] != self.system]
+                del latest[(others or list(latest))[0]]
+            self._n_received[kind] += sender == self._autopilot_ids
+            if kind == "PARAM_VALUE" and sender == self._autopilot_ids:
+                # ArduPilot casts integers to float; it does not copy their bits.
+                self._parameters[message.param_id] = float(message.param_value)
+
+
+def _check_id(name: str, value: int) -> None:
+    if not 1 <= value <= 255:
+        raise OptionError(f"MAVLink {name} id {value}: must lie between 1 and 255")
+
+
+def _dialect() -> Any:
+    """Import pymavlink's messages; version 2, whatever the environment says."""
+    try:
+        return importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
+    except ImportError as fault:
+        raise OptionError("MAVLink needs pymavlink: pip install 'aqualvs[mavlink]'") from fault
+
+
+def _name(beat: Received) -> str:
+    kind, autopilot = beat.message.type, beat.message.autopilot
+    name = _AUTOPILOT_NAMES.get(autopilot, f"of type {autopilot}")
+    if autopilot == _ARDUPILOT:
+        name = _ARDUPILOT_NAMES.get(kind, name)
+    return f"sysid {beat.system} {name}"

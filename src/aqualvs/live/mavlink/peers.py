@@ -1,0 +1,368 @@
+"""Who speaks on a MAVLink connection, and which of them is the vehicle.
+
+Anybody in the network may send to an open port. So senders are kept apart by their address: each
+has a parser of its own, and each system id belongs to the address where it was heard first, until
+nothing has come from there for a while. Nobody else can speak as the vehicle, or receive what is
+meant for it.
+
+MAVLink 2 signing by pymavlink: who does not have the key is not heard.
+
+https://mavlink.io/en/guide/message_signing.html
+"""
+
+import hashlib
+import logging
+import os
+import re
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from aqualvs.errors import OptionError
+
+_HEX_KEY = re.compile(r"[0-9A-Fa-f]{64}")
+_LONGEST_KEY = 1000
+# Signatures count units of 10 us since 2015-01-01 00:00 UTC.
+_EPOCH_S, _UNITS_PER_S = 1_420_070_400, 100_000
+_READABLE_BY_OTHERS = 0o077
+_log = logging.getLogger(__name__)
+
+
+def load_key(path: Path) -> bytes:
+    """Return the key of a file: 64 hexadecimal digits, or a passphrase.
+
+    The key of a passphrase is its SHA-256, as in MAVProxy, Mission Planner and QGroundControl.
+
+    Raises
+    ------
+    OptionError
+        If there is no such file, or it holds neither.
+    """
+    try:
+        if not path.is_file():
+            raise FileNotFoundError(0, "no such file")
+        with path.open("rb") as file:
+            data = file.read(_LONGEST_KEY + 1)
+        readable = os.name == "posix" and bool(path.stat().st_mode & _READABLE_BY_OTHERS)
+        text = data.decode().strip()
+    except OSError as fault:
+        raise OptionError(f"MAVLink key {path}: cannot be read ({fault.strerror})") from None
+    except UnicodeDecodeError:
+        text = ""
+    if not text or len(data) > _LONGEST_KEY or not text.isprintable():
+        raise OptionError(
+            f"MAVLink key {path}: write one line, a passphrase or 64 hexadecimal digits"
+        )
+    if readable:
+        _log.warning("MAVLink key %s: others can read it; chmod 600 %s", path, path)
+    return (
+        bytes.fromhex(text) if _HEX_KEY.fullmatch(text) else hashlib.sha256(text.encode()).digest()
+    )
+
+
+class Signer:
+    """Signs what one connection sends, and checks what it receives.
+
+    Parameters
+    ----------
+    dialect : module
+        pymavlink's messages.
+    key : bytes
+        32 of them.
+    """
+
+    def __init__(self, dialect: Any, key: bytes) -> None:
+        self._outgoing, self._incoming = dialect.MAVLinkSigning(), dialect.MAVLinkSigning()
+        for state in (self._outgoing, self._incoming):
+            state.secret_key, state.timestamp = key, _now()
+        self._outgoing.sign_outgoing = True
+        # Given, and never true, so that pymavlink counts what it refuses.
+        self._incoming.allow_unsigned_callback = lambda *_: False
+
+    @property
+    def n_refused(self) -> int:
+        """Messages that were not signed with the key, or were old."""
+        return int(self._incoming.reject_count)
+
+    def sign(self, packer: Any) -> None:
+        """Let a packer sign."""
+        packer.signing = self._outgoing
+
+    def check(self, parser: Any) -> None:
+        """Let a parser take signed messages only."""
+        parser.signing = self._incoming
+        is_signed = parser.check_signature
+
+        def check_signature(frame: bytearray, system: int, component: int) -> bool:
+            # pymavlink notes the time of a message before it looks at the signature: a forged one
+            # from the future would lock the true sender out.
+            stamps = self._incoming.stream_timestamps
+            before = dict(stamps)
+            if is_signed(frame, system, component):
+                return True
+            stamps.clear()
+            stamps.update(before)
+            return False
+
+        parser.check_signature = check_signature
+
+    def advance(self) -> None:
+        """Bring the time of the next signature up to the clock, and to that of the others."""
+        self._outgoing.timestamp = max(self._outgoing.timestamp, self._incoming.timestamp, _now())
+
+
+def _now() -> int:
+    return round(_UNITS_PER_S * (time.time() - _EPOCH_S))
+
+
+Peer: TypeAlias = tuple[object, ...]
+"""Address of a sender, as the system writes it; empty where a connection has only one."""
+
+MOVES_AFTER_S = 5.0
+"""A system id that was silent for so long may be heard from another address."""
+
+# Those that are sent to: heard within so many seconds, the vehicle and so many others at most.
+_HEARD_S, _MAX_OTHERS = 10.0, 8
+# Two and a half heartbeats, and what a busy machine adds: what somebody said of the vehicle's mode
+# counts for so long.
+_SAYS_FOR_S = 3.0
+_MAX_CLAIMS = 32
+_NO_AUTOPILOT = 8
+_ARMED = 128
+_MAGIC = (0xFD, 0xFE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Claim:
+    """What a heartbeat says of the vehicle."""
+
+    component: int
+    kind: int
+    autopilot: int
+    mode: int
+    armed: bool
+
+
+@dataclass(slots=True)
+class _Sender:
+    """An address from which valid messages have come."""
+
+    parser: Any
+    heard_s: float
+
+
+@dataclass(slots=True)
+class _Home:
+    """The address that a system id belongs to, and when it was heard there."""
+
+    peer: Peer
+    heard_s: float
+
+
+@dataclass(slots=True)
+class _Contest:
+    """What heartbeats of the vehicle have said lately, and until when they contradict."""
+
+    now: dict[int, _Claim] = field(default_factory=dict)
+    given_up_s: dict[_Claim, float] = field(default_factory=dict)
+    rivals: dict[Peer, tuple[_Claim, float]] = field(default_factory=dict)
+    until_s: float = float("-inf")
+    words: str = ""
+
+
+class PeerTable:
+    """Keeps the senders on a connection apart.
+
+    Parameters
+    ----------
+    make_parser : callable
+        Returns a new parser of pymavlink.
+    errors : tuple of exception types
+        Those that a parser raises for bad data.
+    system : int
+        System id of the vehicle.
+    """
+
+    def __init__(
+        self,
+        make_parser: Callable[[], Any],
+        errors: tuple[type[Exception], ...],
+        system: int,
+    ) -> None:
+        self._make_parser, self._system = make_parser, system
+        self._errors: tuple[type[Exception], ...] = (*errors, struct.error, IndexError, ValueError)
+        # Threads that send ask for addresses while another takes messages in.
+        self._lock = threading.Lock()
+        self._senders: dict[Peer, _Sender] = {}
+        self._homes: dict[int, _Home] = {}
+        self._contest = _Contest()
+
+    @property
+    def vehicle(self) -> Peer | None:
+        """Address of the vehicle; None before its first heartbeat."""
+        with self._lock:
+            home = self._homes.get(self._system)
+        return None if home is None else home.peer
+
+    @property
+    def conflict(self) -> str:
+        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        with self._lock:
+            contest = self._contest
+            return contest.words if time.monotonic() < contest.until_s else ""
+
+    @property
+    def rival(self) -> str:
+        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        since_s = time.monotonic() - _SAYS_FOR_S
+        with self._lock:
+            rivals = self._contest.rivals
+            found = [peer for peer, (_, at_s) in rivals.items() if at_s > since_s]
+            home = self._homes.get(self._system)
+        if home is None or not found:
+            return ""
+        return f"{_shown(home.peer)} and {_shown(found[-1])} both speak as sysid {self._system}"
+
+    def receivers(self) -> list[Peer]:
+        """Return the addresses that were heard lately: the vehicle's, then the others'."""
+        since_s = time.monotonic() - _HEARD_S
+        vehicle = self.vehicle
+        with self._lock:
+            found = [peer for peer, sender in self._senders.items() if sender.heard_s > since_s]
+        return sorted(found, key=lambda peer: peer != vehicle)
+
+    def restart(self) -> None:
+        """Forget half messages and receivers, after the connection was made anew."""
+        with self._lock:
+            self._senders.clear()
+
+    def decode(self, peer: Peer, data: bytes, *, whole: bool) -> list[Any]:
+        """Return the messages that have come from an address; what is none is left out.
+
+        Parameters
+        ----------
+        peer : tuple
+        data : bytes
+        whole : bool
+            Whether it is a datagram: one that begins like a message begins one, and what was left
+            of the one before belongs to none.
+        """
+        sender = self._senders.get(peer)
+        parser = self._make_parser() if sender is None else sender.parser
+        if whole and data[:1] and data[0] in _MAGIC:
+            _reset(parser)
+        try:
+            found = parser.parse_buffer(data) or []
+        except self._errors:
+            _reset(parser)
+            return []
+        messages = [message for message in found if _is_valid(message)]
+        if messages or not whole:
+            self._remember(peer, parser)
+        return messages
+
+    def admit(self, peer: Peer, message: Any) -> bool:
+        """Return whether a message comes from where its system id belongs.
+
+        The pilot's sticks count wherever they come from: they can only stop us.
+        """
+        system: int = message.get_srcSystem()
+        kind = message.get_type()
+        with self._lock:
+            if kind == "HEARTBEAT" and self._may_bind(system, message):
+                self._bind(peer, system, message)
+            home = self._homes.get(system)
+        if kind == "MANUAL_CONTROL" and system != self._system:
+            return True
+        if home is None:
+            return system != self._system
+        return home.peer == peer
+
+    def _may_bind(self, system: int, message: Any) -> bool:
+        """Return whether a heartbeat says where a system is; the vehicle's autopilot alone does."""
+        return system != self._system or bool(message.autopilot != _NO_AUTOPILOT)
+
+    def _bind(self, peer: Peer, system: int, message: Any) -> None:
+        now_s = time.monotonic()
+        home = self._homes.get(system)
+        if home is None or now_s - home.heard_s > MOVES_AFTER_S:
+            home = self._homes[system] = _Home(peer, now_s)
+        if home.peer == peer:
+            home.heard_s = now_s
+        if system == self._system:
+            self._compare(peer, home.peer, _claim(message), now_s)
+
+    def _compare(self, peer: Peer, home: Peer, claim: _Claim, now_s: float) -> None:
+        """Notice where heartbeats of the vehicle contradict each other."""
+        contest = self._contest
+        if peer == home:
+            contest.rivals.pop(peer, None)
+            before = contest.now.get(claim.component)
+            contest.now[claim.component] = claim
+            if before is not None and before != claim:
+                # What comes back so soon was never given up: two speak from one address.
+                if now_s - contest.given_up_s.pop(claim, float("-inf")) < _SAYS_FOR_S:
+                    self._contradicted(now_s, f"from {_shown(peer)}")
+                _put(contest.given_up_s, before, now_s)
+        else:
+            _put(contest.rivals, peer, (claim, now_s))
+        for rival, (said, at_s) in contest.rivals.items():
+            ours = contest.now.get(said.component)
+            if now_s - at_s < _SAYS_FOR_S and ours is not None and said != ours:
+                self._contradicted(at_s, f"from {_shown(home)} and {_shown(rival)}")
+
+    def _contradicted(self, at_s: float, where: str) -> None:
+        self._contest.until_s = max(self._contest.until_s, at_s + _SAYS_FOR_S)
+        self._contest.words = f"heartbeats of sysid {self._system} {where} contradict each other"
+
+    def _remember(self, peer: Peer, parser: Any) -> None:
+        """Keep the parser of an address, and send to it; strangers never displace anybody."""
+        now_s = time.monotonic()
+        sender = self._senders.get(peer)
+        if sender is not None:
+            sender.heard_s = now_s
+            return
+        vehicle = self.vehicle
+        with self._lock:
+            for other in [p for p, s in self._senders.items() if now_s - s.heard_s > _HEARD_S]:
+                del self._senders[other]
+            others = len(self._senders) - (vehicle in self._senders)
+            if peer == vehicle or others < _MAX_OTHERS:
+                self._senders[peer] = _Sender(parser, now_s)
+
+
+def _reset(parser: Any) -> None:
+    """Let a parser begin a new message."""
+    # It works the length of a message out anew as soon as three bytes are there.
+    parser.buf, parser.buf_index = bytearray(), 0
+
+
+def _is_valid(message: Any) -> bool:
+    kind = message.get_type()
+    return kind != "BAD_DATA" and not kind.startswith("UNKNOWN")
+
+
+def _claim(message: Any) -> _Claim:
+    return _Claim(
+        message.get_srcComponent(),
+        message.type,
+        message.autopilot,
+        message.custom_mode,
+        bool(message.base_mode & _ARMED),
+    )
+
+
+def _put(kept: dict[Any, Any], key: object, value: object) -> None:
+    """Put a value last into a dictionary that stays small."""
+    kept.pop(key, None)
+    kept[key] = value
+    if len(kept) > _MAX_CLAIMS:
+        del kept[next(iter(kept))]
+
+
+def _shown(peer: Peer) -> str:
+    return f"{peer[0]}:{peer[1]}" if len(peer) > 1 else "one connection"

@@ -1,0 +1,592 @@
+"""Ways to a MAVLink peer: UDP, TCP and serial ports that never wait.
+
+Where a MAVLink peer is, as pilots write it.
+
+A serial port by the system's own calls; POSIX only.
+"""
+
+import errno
+import fcntl
+import ipaddress
+import os
+import re
+import socket
+import struct
+import termios
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias
+
+from aqualvs.errors import OptionError
+from aqualvs.live.mavlink.peers import Peer
+
+DEFAULT_BAUD = 115_200
+_FORMS = (
+    "write udpout:HOST:PORT, udpin:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT "
+    "or /dev/ttyACM0,115200"
+)
+_NET_KINDS: dict[str, "NetKind"] = {
+    "udpout": "udpout",
+    "udpin": "udpin",
+    "udp": "udpin",
+    "udpbcast": "udpbcast",
+    "tcp": "tcp",
+    "udpclient": "udpout",
+    "udpserver": "udpin",
+    "tcpclient": "tcp",
+}
+
+NetKind: TypeAlias = Literal["udpout", "udpin", "udpbcast", "tcp"]
+
+
+@dataclass(frozen=True, slots=True)
+class NetAddress:
+    """A peer in the network, or the port that peers send to.
+
+    Attributes
+    ----------
+    kind : str
+        `udpout` sends to the address; `udpin` listens there and answers whoever was heard;
+        `udpbcast` sends to a broadcast address; `tcp` connects.
+    host : str
+        Name or number.
+    port : int
+        1 to 65535; 0, any free one, for `udpin`.
+    """
+
+    kind: NetKind
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        """Return the address as messages show it."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class SerialAddress:
+    """A serial device and its speed in baud."""
+
+    device: str
+    baud: int
+
+    def __str__(self) -> str:
+        """Return the device as messages show it."""
+        return self.device
+
+
+Address: TypeAlias = NetAddress | SerialAddress
+
+
+def parse_address(url: str) -> Address:
+    """Read a connection in the forms that pymavlink, MAVProxy and ground stations use.
+
+    Parameters
+    ----------
+    url : str
+        `udpout:HOST:PORT`, `udpin:HOST:PORT`, `udp:HOST:PORT` (the same as `udpin`, as in
+        pymavlink), `udpbcast:HOST:PORT`, `tcp:HOST:PORT`; two slashes after the colon are allowed,
+        and `udpclient`, `udpserver` and `tcpclient`, as BlueOS calls them.
+        An empty host to listen at means every address of this computer.
+        `/dev/ttyACM0`, `/dev/ttyACM0,57600`, `serial:/dev/ttyACM0:57600`; 115200 baud if left out.
+
+    Raises
+    ------
+    OptionError
+        If it is none of these.
+    """
+    scheme, colon, rest = url.partition(":")
+    kind = _NET_KINDS.get(scheme.lower()) if colon else None
+    if kind is not None:
+        return _net_address(kind, rest.removeprefix("//"), url)
+    if scheme.lower() == "serial" and colon:
+        device = rest.removeprefix("//") if rest.startswith("///") else rest
+        return _serial_address(device, url)
+    if url.startswith("/dev/") or re.match(r"COM\d+\b", url):
+        return _serial_address(url, url)
+    raise OptionError(f"MAVLink connection {url!r}: not understood; {_FORMS}")
+
+
+class AllowedPeers:
+    """Addresses that are listened to.
+
+    Parameters
+    ----------
+    rules : sequence of str
+        Each `ADDRESS`, `ADDRESS:PORT` or `NETWORK/BITS`, in numbers; everybody if there is none.
+
+    Raises
+    ------
+    OptionError
+        If one is none of these.
+    """
+
+    def __init__(self, rules: Sequence[str] = ()) -> None:
+        self._rules = [_peer_rule(text) for text in rules]
+
+    def __contains__(self, peer: Sequence[object]) -> bool:
+        """Return whether an address, as the system writes it, may speak."""
+        if not self._rules or not peer:
+            return True
+        address = ipaddress.ip_address(str(peer[0]).partition("%")[0])
+        return any(address in network and port in (None, peer[1]) for network, port in self._rules)
+
+
+def _peer_rule(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, int | None]:
+    host, port = parse_host_port(text) or (text, None)
+    try:
+        return ipaddress.ip_network(host, strict=False), port
+    except ValueError:
+        raise OptionError(
+            f"MAVLink peer {text!r}: not understood; write numbers, such as 192.168.2.2, "
+            "192.168.2.2:14550 or 192.168.2.0/24"
+        ) from None
+
+
+def parse_host_port(text: str) -> tuple[str, int] | None:
+    """Return host and port of `HOST:PORT` or `[IPV6]:PORT`, None if it is neither."""
+    match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([^:\s\[\]/]*)):(\d{1,5})", text)
+    if match is None or int(match[3]) > 65535:
+        return None
+    return match[1] or match[2], int(match[3])
+
+
+def _net_address(kind: NetKind, rest: str, url: str) -> NetAddress:
+    found = parse_host_port(rest)
+    if found is None:
+        raise OptionError(f"MAVLink connection {url!r}: no HOST:PORT after the scheme; {_FORMS}")
+    host, port = found
+    listens = kind == "udpin"
+    if not listens and (not host or not port):
+        raise OptionError(f"MAVLink connection {url!r}: whom to send to is missing; {_FORMS}")
+    return NetAddress(kind, host or "0.0.0.0", port)
+
+
+def _serial_address(text: str, url: str) -> SerialAddress:
+    match = re.fullmatch(r"([^,]+?)(?:[,:](\d+))?", text)
+    if match is None:
+        raise OptionError(f"MAVLink connection {url!r}: no serial device; {_FORMS}")
+    return SerialAddress(match[1], int(match[2] or DEFAULT_BAUD))
+
+
+_DATAGRAM = 65_535
+_CHUNK = 4096
+_CONNECT_S = 1.0
+# A stream that takes nothing for so long leads nowhere.
+_STALLED_S = 5.0
+_SEND_BUFFER = 16_384
+_NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
+
+
+class Port(Protocol):
+    """An open way to a peer. Whatever shows that it is broken is raised as OSError."""
+
+    @property
+    def many(self) -> bool:
+        """Whether anybody may send to it, and addresses keep senders apart."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether what is read is a datagram."""
+
+    @property
+    def refused_s(self) -> float | None:
+        """When the peer's computer said that nobody listens (`time.monotonic`), if ever."""
+
+    @property
+    def unsent(self) -> bool:
+        """Whether the end of a message waits for room."""
+
+    @property
+    def lag_s(self) -> float:
+        """How long the driver is going to send what it holds already."""
+
+    def fileno(self) -> int:
+        """Return the number to wait on."""
+
+    def read(self) -> tuple[bytes, Peer]:
+        """Return what has come, empty if nothing, and from where."""
+
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
+        """Send all of it, or nothing if there is no room; return whether it went.
+
+        Where there is only one peer, its address is left empty.
+        """
+
+    def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
+        """Send to everybody: to those heard, where the port has no address of its own."""
+
+    def flush(self) -> None:
+        """Send what waits, as far as there is room."""
+
+    def close(self) -> None:
+        """Free the port at once; what waits is lost."""
+
+
+def open_port(address: Address) -> Port:
+    """Open the way to a peer; may take a second for TCP, and longer for names.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened now; later it may.
+    """
+    if isinstance(address, SerialAddress):
+        return SerialPort(address)
+    if address.kind == "tcp":
+        return _TcpPort(address)
+    if address.kind == "udpbcast":
+        return _UdpBroadcaster(address)
+    return _UdpListener(address) if address.kind == "udpin" else _UdpSender(address)
+
+
+def check_address(address: Address) -> None:
+    """Raise if this computer can never open such an address.
+
+    Raises
+    ------
+    OptionError
+        For a serial port where there are none, or at a speed that it does not know.
+    """
+    if not isinstance(address, SerialAddress):
+        return
+    try:
+        pass
+    except ImportError as fault:
+        raise OptionError(
+            f"MAVLink connection {address.device}: serial ports need Linux or macOS; let MAVProxy "
+            "or BlueOS forward it, and use udpin:"
+        ) from fault
+    speed_of(address)
+
+
+def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tuple[object, ...]]:
+    """Return a socket that never waits, and the address as the system writes it."""
+    flags = socket.AI_PASSIVE if passive else 0
+    found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=flags)
+    # Autopilots and their routers listen to IPv4, also where the name has both.
+    family, kind, protocol, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
+    made = socket.socket(family, kind, protocol)
+    made.setblocking(False)
+    return made, where
+
+
+class _UdpPort:
+    """What both directions of UDP share: a datagram goes at once or not at all."""
+
+    unsent = False
+    lag_s = 0.0
+    whole = True
+
+    def __init__(self, made: socket.socket) -> None:
+        self._socket = made
+        self.refused_s: float | None = None
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def flush(self) -> None:
+        """Do nothing: nothing ever waits."""
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _sent(self, frames: bytes, where: Peer) -> bool:
+        """Send a datagram to an address, or to the connected peer if that is empty."""
+        # A refusal belongs to an earlier datagram; this one has not been tried yet.
+        for _ in range(2):
+            try:
+                if where:
+                    self._socket.sendto(frames, where)
+                else:
+                    self._socket.send(frames)
+            except (ConnectionRefusedError, ConnectionResetError):
+                self.refused_s = time.monotonic()
+            except OSError as fault:
+                if fault.errno in _NOT_NOW:
+                    return False
+                raise
+            else:
+                return True
+        return False
+
+    def _received(self) -> tuple[bytes, Peer]:
+        try:
+            return self._socket.recvfrom(_DATAGRAM)
+        except (ConnectionRefusedError, ConnectionResetError):
+            self.refused_s = time.monotonic()
+        except OSError as fault:
+            if fault.errno not in _NOT_NOW:
+                raise
+        return b"", ()
+
+
+class _UdpSender(_UdpPort):
+    """Sends to one address, and hears that alone."""
+
+    many = False
+
+    def __init__(self, address: NetAddress) -> None:
+        made, where = _open_udp(address, passive=False)
+        super().__init__(made)
+        try:
+            # Connected, so that the system tells when nobody listens, and lets nobody else in.
+            made.connect(where)
+        except OSError:
+            made.close()
+            raise
+
+    def read(self) -> tuple[bytes, Peer]:
+        return self._received()[0], ()
+
+    def write(self, frames: bytes, _peer: Peer, /) -> bool:
+        return self._sent(frames, ())
+
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
+        return self._sent(frames, ())
+
+
+class _UdpBroadcaster(_UdpPort):
+    """Sends to a broadcast address; hears whoever answers."""
+
+    many = True
+
+    def __init__(self, address: NetAddress) -> None:
+        made, self._where = _open_udp(address, passive=False)
+        super().__init__(made)
+        try:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            # Bound, so that it can be read before the first datagram goes out.
+            made.bind(("", 0))
+        except OSError:
+            made.close()
+            raise
+
+    def read(self) -> tuple[bytes, Peer]:
+        return self._received()
+
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
+        return self._sent(frames, peer)
+
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
+        return self._sent(frames, self._where)
+
+
+class _UdpListener(_UdpPort):
+    """Listens, and sends to those it has heard."""
+
+    many = True
+
+    def __init__(self, address: NetAddress) -> None:
+        made, where = _open_udp(address, passive=True)
+        super().__init__(made)
+        try:
+            made.bind(where)
+        except OSError as fault:
+            made.close()
+            if fault.errno == errno.EADDRNOTAVAIL:
+                raise OSError(
+                    fault.errno,
+                    f"{address.host} is no address of this computer; to send there use udpout:",
+                ) from fault
+            raise
+
+    def read(self) -> tuple[bytes, Peer]:
+        return self._received()
+
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
+        """Send to one peer; one that cannot be reached must not keep it from the others."""
+        try:
+            return self._sent(frames, peer)
+        except OSError:
+            return False
+
+    def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
+        sent = [self.write(frames, peer) for peer in heard]
+        return any(sent)
+
+
+class StreamPort:
+    """What TCP and serial share: a message may go in parts, and the rest goes before the next."""
+
+    refused_s: float | None = None
+    many = whole = False
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._moved_s = time.monotonic()
+
+    @property
+    def unsent(self) -> bool:
+        """Whether the end of a message waits for room."""
+        return bool(self._rest)
+
+    @property
+    def lag_s(self) -> float:
+        """How long the driver is going to send what it holds already."""
+        return 0.0
+
+    def read(self) -> tuple[bytes, Peer]:
+        """Return what has come, empty if nothing, and from where: from the only peer."""
+        try:
+            data = self._take()
+        except BlockingIOError:
+            return b"", ()
+        if not data:
+            raise ConnectionResetError(errno.ECONNRESET, "the peer has gone")
+        return data, ()
+
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
+        """Send to everybody: to the only peer."""
+        return self.write(frames, ())
+
+    def write(self, frames: bytes, _peer: Peer, /) -> bool:
+        """Send all of it, or nothing if there is no room; return whether it went."""
+        self.flush()
+        if self._rest:
+            return False
+        self._rest = frames
+        self.flush()
+        return True
+
+    def flush(self) -> None:
+        """Send what waits, as far as there is room."""
+        if not self._rest:
+            self._moved_s = time.monotonic()
+            return
+        try:
+            n_sent = self._give(self._rest)
+        except BlockingIOError:
+            n_sent = 0
+        if n_sent:
+            self._rest = self._rest[n_sent:]
+            self._moved_s = time.monotonic()
+        elif time.monotonic() - self._moved_s > _STALLED_S:
+            raise TimeoutError(errno.ETIMEDOUT, "the peer takes nothing any more")
+
+    def _take(self) -> bytes:
+        raise NotImplementedError
+
+    def _give(self, data: bytes) -> int:
+        raise NotImplementedError
+
+
+class _TcpPort(StreamPort):
+    """A TCP connection to a server."""
+
+    def __init__(self, address: NetAddress) -> None:
+        super().__init__()
+        self._socket = socket.create_connection((address.host, address.port), _CONNECT_S)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # What waits longer than this holds is too old to be sent.
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+
+    def fileno(self) -> int:
+        """Return the number to wait on."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Free the port at once; what waits is lost."""
+        self._socket.close()
+
+    def _take(self) -> bytes:
+        return self._socket.recv(_CHUNK)
+
+    def _give(self, data: bytes) -> int:
+        return self._socket.send(data)
+
+
+def why(fault: Exception) -> str:
+    """Return the cause of a fault in a few words."""
+    return (fault.strerror if isinstance(fault, OSError) else None) or str(fault)
+
+
+_BITS_PER_BYTE = 10
+_COMMON = (9600, 38400, 57600, 115200, 230400, 460800, 921600, 1500000)
+
+
+def speed_of(address: SerialAddress) -> int:
+    """Return the system's code of a speed.
+
+    Raises
+    ------
+    OptionError
+        If it knows no such speed.
+    """
+    code: int | None = getattr(termios, f"B{address.baud}", None)
+    if not code:
+        known = ", ".join(str(baud) for baud in _COMMON if hasattr(termios, f"B{baud}"))
+        raise OptionError(
+            f"MAVLink connection {address.device}: speed {address.baud} baud is unknown here; "
+            f"use one of {known}"
+        )
+    return code
+
+
+class SerialPort(StreamPort):
+    """A serial port with eight bits, no parity, one stop bit and no flow control.
+
+    Parameters
+    ----------
+    address : SerialAddress
+
+    Raises
+    ------
+    OSError
+        If it is not there, not a serial port, or not ours to open.
+    """
+
+    def __init__(self, address: SerialAddress) -> None:
+        super().__init__()
+        self._bytes_per_s = address.baud / _BITS_PER_BYTE
+        self._number = os.open(address.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            _make_raw(self._number, speed_of(address))
+        except termios.error as fault:
+            os.close(self._number)
+            raise OSError(fault.args[0], "this is no serial port") from fault
+
+    @property
+    def lag_s(self) -> float:
+        """How long the driver is going to send what it holds already."""
+        answer = fcntl.ioctl(self._number, termios.TIOCOUTQ, b"\0\0\0\0")
+        return float(struct.unpack("i", answer)[0]) / self._bytes_per_s
+
+    def fileno(self) -> int:
+        """Return the number to wait on."""
+        return self._number
+
+    def close(self) -> None:
+        """Free the port at once; what waits is lost."""
+        if self._number < 0:
+            return
+        number, self._number = self._number, -1
+        try:
+            # Without this, closing waits until the driver has sent what it holds.
+            termios.tcflush(number, termios.TCOFLUSH)
+        except termios.error:
+            pass
+        finally:
+            os.close(number)
+
+    def _take(self) -> bytes:
+        return os.read(self._number, _CHUNK)
+
+    def _give(self, data: bytes) -> int:
+        return os.write(self._number, data)
+
+
+def _make_raw(number: int, speed: int) -> None:
+    """Pass bytes through as they are."""
+    state = termios.tcgetattr(number)
+    state[0] = termios.IGNBRK
+    state[1] = 0
+    state[2] = termios.CS8 | termios.CREAD | termios.CLOCAL
+    state[3] = 0
+    state[4] = state[5] = speed
+    # With a minimum of 1 an idle port says "not now"; an empty read then means that it has gone.
+    state[6][termios.VMIN], state[6][termios.VTIME] = 1, 0
+    termios.tcsetattr(number, termios.TCSANOW, state)

@@ -1,0 +1,263 @@
+"""From the words of the command line to the outputs of a live run.
+
+The vehicle file: who the vehicle is on MAVLink, how it is steered, and who must be there.
+
+From the words of the command line to a vehicle on MAVLink.
+
+The pilot's page of `aqualvs live` and `follow`, where its packages are installed.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from aqualvs.control.gains_file import Part, Positive, load_settings
+from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.errors import OptionError
+from aqualvs.live.mavlink.ardusub import ArduSubOptions
+from aqualvs.live.mavlink.ardusub_commands import Command
+from aqualvs.live.mavlink.link import LinkOptions
+from aqualvs.live.mavlink.peers import load_key
+from aqualvs.live.outputs.base import Output
+from aqualvs.optics.rig import Rig
+from aqualvs.recording import RecorderSwitch
+
+VERSION = 1
+"""Version of the format that is read."""
+_KEY = "aqualvs_vehicle"
+
+SystemId = Annotated[int, Field(ge=1, le=255)]
+
+
+class VehicleFile(Part):
+    """A whole vehicle file."""
+
+    aqualvs_vehicle: int
+    system: SystemId = 1
+    component: SystemId = 191
+    ground_station: SystemId = 255
+    station_timeout_s: Positive | None = 3.0
+    command: Literal["sticks", "guided"] = "sticks"
+    modes: list[str] = Field(default_factory=list)
+    stick_dead_band: Positive = 0.1
+    speed_m_s: Positive = 0.3
+    turning_rate_deg_s: Positive = 30.0
+    peers: list[str] = Field(default_factory=list)
+    key: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleSetup:
+    """What a vehicle file says.
+
+    Attributes
+    ----------
+    link : LinkOptions
+        Of the connection.
+    steering : ArduSubOptions
+    """
+
+    link: LinkOptions = field(default_factory=LinkOptions)
+    steering: ArduSubOptions = field(default_factory=ArduSubOptions)
+
+
+def load_vehicle(path: Path) -> VehicleSetup:
+    """Return what a vehicle file says; its key file is looked for beside it.
+
+    Raises
+    ------
+    OptionError
+        One line: file, place, value, remedy.
+    """
+    content = load_settings(path, VehicleFile, _KEY, VERSION)
+    try:
+        key = None if content.key is None else load_key(path.parent / content.key)
+        link = LinkOptions(
+            system=content.system,
+            component=content.component,
+            peers=tuple(content.peers),
+            key=key,
+        )
+        steering = ArduSubOptions(
+            command=Command(content.command),
+            modes=tuple(content.modes),
+            ground_station=content.ground_station,
+            station_timeout_s=content.station_timeout_s,
+            stick_dead_band=content.stick_dead_band,
+            speed=content.speed_m_s,
+            turning_rate=math.radians(content.turning_rate_deg_s),
+        )
+    except OptionError as fault:
+        raise OptionError(f"{path}: {fault}") from None
+    return VehicleSetup(link=link, steering=steering)
+
+
+def vehicle_setup(file: Path | None, peers: Sequence[str] | None, key: Path | None) -> VehicleSetup:
+    """Return who the vehicle is and how it is steered.
+
+    Parameters
+    ----------
+    file : Path or None
+        `--vehicle-file`; defaults if left out.
+    peers : sequence of str or None
+        `--mavlink-peer`; instead of those of the file.
+    key : Path or None
+        `--mavlink-key`; instead of the file's.
+
+    Raises
+    ------
+    OptionError
+        If a file cannot be used, or a peer is no address.
+    """
+    setup = VehicleSetup() if file is None else load_vehicle(file)
+    link = setup.link
+    if peers:
+        link = replace(link, peers=tuple(peers))
+    if key is not None:
+        link = replace(link, key=load_key(key))
+    return replace(setup, link=link)
+
+
+FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputRequest:
+    """Which outputs a live run has; all are off by default.
+
+    Attributes
+    ----------
+    mavlink, json : tuple of str
+        Addresses; one output for each.
+    link : LinkOptions
+        Of every MAVLink connection.
+    ros2, ros1 : bool
+    foxglove : str or None
+        Address HOST:PORT to listen on.
+    """
+
+    mavlink: tuple[str, ...] = ()
+    json: tuple[str, ...] = ()
+    link: LinkOptions = field(default_factory=LinkOptions)
+    ros2: bool = False
+    ros1: bool = False
+    foxglove: str | None = None
+
+
+def make_outputs(request: OutputRequest) -> list[Output]:
+    """Make the outputs that were asked for.
+
+    Raises
+    ------
+    OptionError
+        If an address cannot be understood, or the extra that an output needs is not installed; the
+        outputs made before it are closed.
+    """
+    makers: list[Callable[[], Output]] = [
+        partial(_mavlink, url, request.link) for url in request.mavlink
+    ]
+    if request.json:
+        makers.append(partial(_json, request.json))
+    if request.ros2:
+        makers.append(_ros2)
+    if request.ros1:
+        makers.append(_ros1)
+    if request.foxglove is not None:
+        makers.append(partial(_foxglove, request.foxglove))
+    with ExitStack() as made:
+        outputs = []
+        for make in makers:
+            outputs.append(make())
+            made.callback(outputs[-1].close)
+        made.pop_all()
+    return outputs
+
+
+def host_and_port(text: str, default_port: int, option: str) -> tuple[str, int]:
+    """Return host and port of `HOST:PORT`, `HOST`, `:PORT` or "" (127.0.0.1).
+
+    Raises
+    ------
+    OptionError
+        If there is no such port.
+    """
+    host, _, port = text.rpartition(":") if ":" in text else (text, "", "")
+    if port and not (port.isdecimal() and 0 <= int(port) < 2**16):
+        raise OptionError(f"{option} {text}: port {port}; give HOST:PORT with a port up to 65535")
+    return host.strip("[]") or "127.0.0.1", int(port) if port else default_port
+
+
+def _mavlink(url: str, options: LinkOptions) -> Output:
+    from aqualvs.live.outputs.mavlink import MavlinkOutput
+
+    return MavlinkOutput(url, options)
+
+
+def _json(receivers: tuple[str, ...]) -> Output:
+    from aqualvs.live.outputs.udp_json import UdpJsonOutput
+
+    return UdpJsonOutput(receivers)
+
+
+def _ros2() -> Output:
+    from aqualvs.live.outputs.dds import DdsOutput
+
+    return DdsOutput()
+
+
+def _ros1() -> Output:
+    from aqualvs.live.outputs.ros1 import Ros1Output
+
+    return Ros1Output()
+
+
+def _foxglove(address: str) -> Output:
+    from aqualvs.live.outputs.foxglove import FoxgloveOutput
+
+    host, port = host_and_port(address, FOXGLOVE_PORT, "--foxglove-address")
+    return FoxgloveOutput(host, port)
+
+
+def serve_page(
+    address: str,
+    token: str | None,
+    rig: Rig,
+    holder: SetpointHolder,
+    recorder: RecorderSwitch | None,
+    tell: Callable[[str], object],
+) -> Output:
+    """Serve the page and tell its address.
+
+    Parameters
+    ----------
+    address : str
+        HOST:PORT.
+    token : str or None
+        Its password; a new one if left out.
+    rig : Rig
+    holder : SetpointHolder
+        Where the page puts what is to be held.
+    recorder : RecorderSwitch or None
+        What its record button moves; None where nothing can be recorded.
+    tell : callable
+        Takes one line.
+
+    Raises
+    ------
+    OptionError
+        If a part is not installed, the token is too short, or the address cannot be used.
+    """
+    try:
+        from aqualvs.live.dashboard.output import start_dashboard
+    except ImportError as fault:
+        raise OptionError(
+            f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
+        ) from fault
+    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
+    return start_dashboard(host, port, token, rig, holder, recorder, tell)

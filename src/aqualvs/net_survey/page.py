@@ -1,0 +1,471 @@
+"""`net_change.html`: what changed, on one page that opens anywhere, without a network.
+
+The map of what changed: growth by colour, holes by what became of them.
+
+Drawn without a display; Matplotlib is loaded only when a map is drawn.
+"""
+
+import base64
+import math
+import re
+from collections.abc import Mapping
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs import __version__
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.net_survey.comparison import Comparison, OnWall
+from aqualvs.net_survey.growth import Growth
+from aqualvs.net_survey.hole_sites import HoleState, Site
+from aqualvs.net_survey.tables import (
+    bearing_deg,
+    by_state,
+    place_words,
+    rate_words,
+    size_words,
+    state_title,
+    summary_lines,
+    verdict,
+)
+from aqualvs.report import html
+from aqualvs.report.findings import Card
+from aqualvs.results.files import replace_text
+from aqualvs.results.run_request import now
+from aqualvs.text import signed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+
+
+_DPI = 200
+_WIDTH_IN, _PANEL_IN, _AROUND_IN, _ROW_GAP_IN = 11.0, 9.2, 1.7, 0.45
+_TALLEST_IN, _LEAST_RATIO, _MOST_ROWS = 7.0, 0.16, 6
+_WEEK = 7.0
+# From green (less) over white to brown (more); told apart by colour-blind eyes.
+_COLOURS = "BrBG_r"
+_LEAST_SCALE = 1.0
+_INK, _GREY, _SEA = "#1c2a33", "#d5dade", "#ffffff"
+_LABELLED = 24
+_MARKS: dict[HoleState, dict[str, Any]] = {
+    HoleState.NEW: {"marker": "o", "markerfacecolor": "#d7191c", "markersize": 10},
+    HoleState.GROWN: {"marker": "^", "markerfacecolor": "#f28e2b", "markersize": 10},
+    HoleState.SMALLER: {"marker": "v", "markerfacecolor": "#9ecae1", "markersize": 9},
+    HoleState.SAME: {"marker": "o", "markerfacecolor": "#4a5560", "markersize": 7},
+    HoleState.GONE: {"marker": "X", "markerfacecolor": "#ffffff", "markersize": 10},
+    HoleState.FIRST_LOOK: {"marker": "D", "markerfacecolor": "#f7c6c7", "markersize": 8},
+    HoleState.NOT_PASSED: {"marker": "s", "markerfacecolor": "#c9ced3", "markersize": 8},
+}
+_NAMES = {
+    HoleState.NEW: "new hole",
+    HoleState.GROWN: "grown",
+    HoleState.SMALLER: "smaller",
+    HoleState.SAME: "same",
+    HoleState.GONE: "gone",
+    HoleState.FIRST_LOOK: "not looked at before",
+    HoleState.NOT_PASSED: "not looked at now",
+}
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.edgecolor": "#8796a0",
+    "axes.linewidth": 0.7,
+    "text.color": _INK,
+    "axes.labelcolor": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "hatch.linewidth": 0.5,
+}
+
+
+def draw_change(result: Comparison, path: Path) -> None:
+    """Draw the map; where places cannot be compared, the means date by date.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    import matplotlib as mpl
+
+    with mpl.rc_context(_STYLE):
+        figure = _dates(result) if result.wall is None else _map(result.wall)
+        figure.savefig(path, dpi=_DPI)
+
+
+def _map(wall: OnWall) -> "Figure":
+    from matplotlib.figure import Figure
+
+    raster = wall.history.raster
+    columns = _columns(wall)
+    low = raster.low[1] - 0.3 * raster.size[1]
+    high = raster.low[1] + (raster.shape[1] + 0.3) * raster.size[1]
+    length, tall = len(columns) * float(raster.size[0]), float(high - low)
+    n_rows = min(max(math.ceil(math.sqrt(_LEAST_RATIO * length / tall)), 1), _MOST_ROWS)
+    per_row = math.ceil(len(columns) / n_rows)
+    span = per_row * float(raster.size[0])
+    height = min(_PANEL_IN * tall / span, _TALLEST_IN)
+    size = (_WIDTH_IN, n_rows * (height + _ROW_GAP_IN) + _AROUND_IN)
+    figure = Figure(figsize=size, facecolor="white", layout="constrained")
+    axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
+    shades = _shades(wall)
+    for row, one in enumerate(axes):
+        _cells(one, wall, columns, shades)
+        one.set_xlim(row * span, (row + 1) * span)
+        one.set_ylim(high, low)
+        _sites(one, wall, columns)
+        _axis(one, wall, columns, last=row == n_rows - 1)
+    bar = figure.colorbar(shades, ax=list(axes), shrink=min(1.0, 2.6 / size[1] + 0.3), pad=0.015)
+    bar.set_label("change of solidity,\n% of the net's area a week")
+    figure.suptitle(_title(wall), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    _legend(figure, wall)
+    return figure
+
+
+def _columns(wall: OnWall) -> IntArray:
+    """Return the columns of cells in the order in which they are drawn.
+
+    Round a net the widest gap that nothing was seen in is cut out.
+    """
+    n = wall.history.raster.shape[0]
+    known = np.asarray(wall.history.known.any(axis=1))
+    seen = np.flatnonzero(known.reshape(n, -1).any(axis=1))
+    if not len(seen) or not wall.frame.round:
+        return np.arange(n)
+    gaps = np.diff(np.append(seen, seen[0] + n))
+    widest = int(np.argmax(gaps))
+    count = n - int(gaps[widest]) + 1
+    return np.asarray((seen[(widest + 1) % len(seen)] + np.arange(count)) % n)
+
+
+def _shades(wall: OnWall) -> "ScalarMappable":
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    rates = [abs(100.0 * _WEEK * one.per_day.value) for one in wall.cells]
+    most = max(float(np.quantile(rates, 0.98)) if rates else 0.0, _LEAST_SCALE)
+    return ScalarMappable(Normalize(-most, most), _COLOURS)
+
+
+def _cells(axes: "Axes", wall: OnWall, columns: IntArray, shades: "ScalarMappable") -> None:
+    from matplotlib.patches import Rectangle
+
+    raster, told = wall.history.raster, {one.cell: one for one in wall.cells}
+    known = np.asarray(wall.history.known.any(axis=1))
+    axes.set_facecolor(_SEA)
+    width, height = map(float, raster.size)
+    for x, column in enumerate(columns):
+        for row in range(raster.shape[1]):
+            cell = int(column) * raster.shape[1] + row
+            if not known[cell]:
+                continue
+            corner = (x * width, float(raster.low[1]) + row * height)
+            one = told.get(cell)
+            if one is None:
+                style: dict[str, Any] = {"facecolor": _GREY, "hatch": "////", "edgecolor": "white"}
+            else:
+                rate = np.array([100.0 * _WEEK * one.per_day.value])
+                style = {"facecolor": shades.to_rgba(rate)[0], "edgecolor": "white"}
+            axes.add_patch(Rectangle(corner, width, height, linewidth=0.4, **style))
+            if one is not None and one.changed:
+                middle = (corner[0] + 0.5 * width, corner[1] + 0.5 * height)
+                axes.plot(*middle, ".", color=_INK, markersize=2.2)
+
+
+def _sites(axes: "Axes", wall: OnWall, columns: IntArray) -> None:
+    low, high = axes.get_xlim()
+    many = len(wall.sites) > _LABELLED
+    for site in sorted(wall.sites, key=lambda one: one.state is not HoleState.SAME):
+        x = _drawn(site.place, wall, columns)
+        if not low <= x <= high:
+            continue
+        axes.plot(
+            x,
+            site.place[1],
+            linestyle="",
+            markeredgecolor=_INK,
+            markeredgewidth=0.9,
+            **_MARKS[site.state],
+        )
+        if many and site.state not in (HoleState.NEW, HoleState.GROWN):
+            continue
+        size = 1e3 * site.sizes[np.isfinite(site.sizes)][-1]
+        axes.annotate(
+            f"{size:.0f} mm",
+            (x, site.place[1]),
+            xytext=(0.0, 7.0),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7.5,
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.75},
+        )
+
+
+def _drawn(place: FloatArray, wall: OnWall, columns: IntArray) -> float:
+    """Return where along the drawn columns a place is."""
+    raster = wall.history.raster
+    size = float(raster.size[0])
+    at = (float(place[0]) - float(raster.low[0])) / size
+    if not wall.frame.round:
+        return size * at
+    return size * float(np.mod(at - columns[0] + 0.5, raster.shape[0]) - 0.5)
+
+
+def _axis(axes: "Axes", wall: OnWall, columns: IntArray, *, last: bool) -> None:
+    raster, frame = wall.history.raster, wall.frame
+    axes.set_ylabel("depth, m")
+    axes.set_aspect("equal")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    if frame.round:
+        start = float(columns[0] * raster.size[0])
+        low, high = axes.get_xlim()
+        ends = np.rad2deg(np.array([low + start, high + start]) / frame.radius)
+        step = next(s for s in (2.0, 5.0, 10.0, 15.0, 30.0, 45.0) if np.ptp(ends) / s < 14)
+        degrees = np.arange(np.ceil(ends[0] / step), np.floor(ends[1] / step) + 1) * step
+        at = np.deg2rad(degrees) * frame.radius - start
+        names = [f"{bearing_deg(x + start, frame):.0f}°" for x in at]
+        axes.set_xticks(at, names)
+    else:
+        low = float(raster.low[0])
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value + low:g}")
+    if last:
+        axes.set_xlabel("bearing of the net" if frame.round else "along the net to the right, m")
+
+
+def _title(wall: OnWall) -> str:
+    dates = wall.history.dates
+    words = f"What changed on the net from {dates[0]} to {dates[-1]}"
+    if wall.growth is None:
+        return words
+    return f"{words}\n{rate_words(wall.growth)}: {verdict(wall.growth)}"
+
+
+def _legend(figure: "Figure", wall: OnWall) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    states = {one.state for one in wall.sites}
+    shown: dict[str, Line2D | Patch] = {
+        _NAMES[state]: Line2D(
+            [], [], linestyle="", markeredgecolor=_INK, markeredgewidth=0.9, **style
+        )
+        for state, style in _MARKS.items()
+        if state in states
+    }
+    if any(one.changed for one in wall.cells):
+        shown["changed beyond chance"] = Line2D(
+            [], [], linestyle="", marker=".", color=_INK, markersize=4
+        )
+    known = wall.history.known.sum(axis=1)
+    if np.any(known == 1):
+        shown["seen on one date only"] = Patch(facecolor=_GREY, edgecolor="white", hatch="////")
+    if shown:
+        figure.legend(
+            list(shown.values()),
+            list(shown),
+            loc="outside lower left",
+            ncols=min(len(shown), 6),
+            frameon=False,
+        )
+
+
+def _dates(result: Comparison) -> "Figure":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.0), facecolor="white", layout="constrained")
+    axes = figure.subplots()
+    known = [(d, one) for d, one in zip(result.dates, result.whole, strict=True) if one]
+    days = [day.toordinal() for day, _ in known]
+    axes.errorbar(
+        days,
+        [100.0 * one.value for _, one in known],
+        [100.0 * one.sigma for _, one in known],
+        fmt="o-",
+        color=_INK,
+        capsize=4.0,
+    )
+    axes.set_xticks(days, [day.isoformat() for day, _ in known])
+    axes.margins(x=0.12)
+    axes.set_ylabel("solidity of all that was seen, %")
+    axes.grid(color="#dfe5e8", linewidth=0.6)
+    figure.suptitle(
+        "Whole dives: places on the net are not compared",
+        x=0.01,
+        ha="left",
+        fontsize=12,
+        fontweight="bold",
+    )
+    return figure
+
+
+_NONE = "–"
+_LONG = 30
+_MINUS = re.compile(r"(?<![\w-])-(?=\d)")
+
+
+def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[str, str]) -> None:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : Path
+    picture : Path
+        Of the map, which goes into the page.
+    result : Comparison
+    origins : mapping
+        Folder of a run to what told its date.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    first, last = result.dates[0], result.dates[-1]
+    template = files("aqualvs.net_survey").joinpath("assets", "net_change.html")
+    lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]
+    parts = {
+        "css": html.asset("report.css"),
+        "title": escape(f"The net from {first} to {last}"),
+        "subtitle": escape(f"{len(result.surveys)} dives on {len(result.dates)} dates"),
+        "cards": html.cards(_cards(result)),
+        "warnings": html.notice([_sentence(one) for one in result.warnings]),
+        "sentences": "\n".join(_paragraph(line) for line in lines),
+        "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
+        "holes": _holes(result),
+        "dates": _page_dates(result),
+        "dives": _dives(result, origins),
+        "footer": escape(f"Written {now()} by aqualvs {__version__}."),
+    }
+    text = Template(template.read_text(encoding="utf-8")).substitute(parts)
+    replace_text(path, text)
+
+
+def _cards(result: Comparison) -> list[Card]:
+    wall = result.wall
+    growth = result.rate if wall is None else wall.growth
+    found = []
+    if growth is not None:
+        week, sigma = 100.0 * _WEEK * growth.value, 100.0 * _WEEK * growth.sigma
+        value = signed(f"{week:+.1f} %")
+        found.append(Card("Fouling a week", value, f"± {sigma:.1f} %: {verdict(growth)}"))
+    if wall is None:
+        return found
+    counts = {state: len(some) for state, some in by_state(wall.sites).items()}
+    new, grown = counts.get(HoleState.NEW, 0), counts.get(HoleState.GROWN, 0)
+    first = counts.get(HoleState.FIRST_LOOK, 0)
+    found.append(Card("New holes", str(new), f"{grown} grown, {first} where none looked before"))
+    unseen = counts.get(HoleState.NOT_PASSED, 0)
+    gone = counts.get(HoleState.GONE, 0)
+    found.append(Card("Holes gone", str(gone), f"{unseen} more were not passed this time"))
+    return found
+
+
+def _sentence(words: str) -> str:
+    return words[:1].upper() + words[1:] + "."
+
+
+def _paragraph(line: str) -> str:
+    style = ' style="margin-left: 1.5em"' if line.startswith("  ") else ""
+    return f"<p{style}>{_typeset(line.strip())}</p>"
+
+
+def _typeset(words: str) -> str:
+    """Return a line of the summary as HTML: minus signs, but the hyphens of dates stay."""
+    return escape(_MINUS.sub("\u2212", words.replace("->", "\u2192")))
+
+
+def _holes(result: Comparison) -> str:
+    wall = result.wall
+    if wall is None:
+        return (
+            '<p class="note">Places are not compared, so no hole can be found again. All are in '
+            "holes_change.csv.</p>"
+        )
+    if not wall.sites:
+        return "<p>None was found on any date.</p>"
+    rows = [_hole_row(one, wall) for some in by_state(wall.sites).values() for one in some]
+    head = (
+        "what became of it",
+        "place",
+        "diameter",
+        "first seen",
+        "last seen",
+        "looked at before",
+        "looked at now",
+    )
+    table = html.table(head, rows, texts=2)
+    if len(rows) <= _LONG:
+        return table
+    return f"<details><summary>All {len(rows)} holes</summary>{table}</details>"
+
+
+def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
+    dates = wall.history.dates
+    seen = np.flatnonzero(np.isfinite(one.sizes))
+    return (
+        state_title(one.state),
+        place_words(one.place, wall.frame),
+        size_words(one).replace("->", "\u2192"),
+        dates[seen[0]].isoformat(),
+        dates[seen[-1]].isoformat(),
+        f"{100.0 * float(one.looked[:-1].max()):.0f} %",
+        f"{100.0 * float(one.looked[-1]):.0f} %",
+    )
+
+
+def _page_dates(result: Comparison) -> str:
+    wall = result.wall
+    on_wall: dict[object, Growth | None] = {}
+    if wall is not None:
+        on_wall = dict(zip(wall.history.dates, wall.means, strict=True))
+    rows = [
+        (day.isoformat(), _share(on_wall.get(day)), _share(whole))
+        for day, whole in zip(result.dates, result.whole, strict=True)
+    ]
+    head = ("date", "solidity of what was seen on all dates", "of all that was seen")
+    return html.table(head, rows)
+
+
+def _share(one: Growth | None) -> str:
+    return _NONE if one is None else f"{100.0 * one.value:.1f} ± {100.0 * one.sigma:.1f} %"
+
+
+def _dives(result: Comparison, origins: Mapping[str, str]) -> str:
+    shifts = {}
+    if result.wall is not None:
+        wall = result.wall
+        for one, shift in zip(wall.placed, wall.shifts, strict=True):
+            shifts[one.survey.folder] = (shift, wall.frame)
+    rows = []
+    for survey in result.surveys:
+        found = shifts.get(survey.folder)
+        words = [_NONE, _NONE]
+        if found is not None and not found[0].sigma.any():
+            words = ["as logged", "as logged"]
+        elif found is not None:
+            shift, frame = found
+            scale, unit = (np.rad2deg(1.0 / frame.radius), "°") if frame.round else (1.0, " m")
+            ends = ((scale, unit), (1.0, " m"))
+            words = [
+                signed(f"{k * value:+.2f} ± {k * sigma:.2f}{u}")
+                for (k, u), value, sigma in zip(ends, shift.value, shift.sigma, strict=True)
+            ]
+        rows.append(
+            (
+                str(survey.folder),
+                survey.date.isoformat(),
+                origins.get(str(survey.folder), ""),
+                str(len(survey.stretches.along)),
+                str(len(survey.holes.number)),
+                *words,
+            )
+        )
+    head = ("dive", "date", "told by", "stretches", "holes", "shifted along", "shifted down")
+    return html.table(head, rows, texts=3)

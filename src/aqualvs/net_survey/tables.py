@@ -1,0 +1,426 @@
+"""`net_change.csv` and `holes_change.csv`.
+
+What changed on a net, in sentences.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.net_survey.comparison import Comparison, OnWall
+from aqualvs.net_survey.frames import WallFrame
+from aqualvs.net_survey.growth import CellChange, Growth
+from aqualvs.net_survey.hole_sites import LOOKED, HoleState, Site
+from aqualvs.nets.tables import Cell, write_table
+
+_WEEK = 7.0
+_MOST_LISTED = 20
+_ORDER = (
+    HoleState.NEW,
+    HoleState.GROWN,
+    HoleState.GONE,
+    HoleState.FIRST_LOOK,
+    HoleState.NOT_PASSED,
+    HoleState.SMALLER,
+    HoleState.SAME,
+)
+_TITLES = {
+    HoleState.NEW: "new",
+    HoleState.GROWN: "grown",
+    HoleState.GONE: "gone, mended or missed this time",
+    HoleState.FIRST_LOOK: "seen now, where no earlier dive looked",
+    HoleState.NOT_PASSED: "seen before, where no dive looked now",
+    HoleState.SMALLER: "smaller, mended in part or seen in part",
+    HoleState.SAME: "the same",
+}
+# Beyond this many standard deviations a change is called one.
+_TOLD = 2.0
+
+
+def summary_lines(result: Comparison) -> list[str]:
+    """Return the whole comparison in lines."""
+    lines = [_span_line(result)]
+    wall = result.wall
+    if wall is None:
+        lines += [_whole_line(result), _hole_counts(result)]
+    else:
+        lines += [*_shift_lines(wall), _growth_line(wall), *_where_lines(wall)]
+        lines += [*_mean_lines(wall), *_hole_lines(wall), *_not_looked(wall)]
+    return lines + [f"warning: {one}" for one in result.warnings]
+
+
+def state_title(state: HoleState) -> str:
+    """Return how sentences call what became of a hole."""
+    return _TITLES[state]
+
+
+def place_words(place: FloatArray, frame: WallFrame) -> str:
+    """Return where on the net something is."""
+    if frame.round:
+        return f"{place[1]:.1f} m deep, bearing {bearing_deg(place[0], frame):.0f}°"
+    return f"{place[1]:.1f} m deep, {place[0]:.1f} m along"
+
+
+def bearing_deg(u: float, frame: WallFrame) -> float:
+    """Return the bearing of a place around a round net, in [0, 360)."""
+    return float(np.rad2deg(u / frame.radius)) % 360.0
+
+
+def rate_words(growth: Growth) -> str:
+    """Return growth as percent of the net's area a week."""
+    week, sigma = 100.0 * _WEEK * growth.value, 100.0 * _WEEK * growth.sigma
+    return f"{week:+.1f} ± {sigma:.1f} % of the net's area a week"
+
+
+def verdict(growth: Growth) -> str:
+    """Return whether a growth is beyond its uncertainty."""
+    if abs(growth.z) < _TOLD:
+        return "no change beyond the uncertainty"
+    return "fouling has grown" if growth.value > 0.0 else "fouling has become less"
+
+
+def by_state(sites: Sequence[Site]) -> dict[HoleState, list[Site]]:
+    """Return the holes by what became of them, what matters most first."""
+    found = {state: [one for one in sites if one.state is state] for state in _ORDER}
+    return {state: some for state, some in found.items() if some}
+
+
+def size_words(site: Site) -> str:
+    """Return a hole's diameter when last seen, after that before if it is still there."""
+    known = np.isfinite(site.sizes)
+    last = site.sizes[known][-2:] if known[-1] else site.sizes[known][-1:]
+    sizes = [f"{1e3 * size:.0f}" for size in last]
+    sigma = 1e3 * float(site.sigma_sizes[known][-1])
+    return f"{' -> '.join(sizes)} mm (± {sigma:.0f} mm)"
+
+
+def _span_line(result: Comparison) -> str:
+    days = (result.dates[-1] - result.dates[0]).days
+    return (
+        f"{len(result.surveys)} dives on {len(result.dates)} dates, {result.dates[0]} to "
+        f"{result.dates[-1]} ({days} days)"
+    )
+
+
+def _whole_line(result: Comparison) -> str:
+    means = ", ".join(
+        f"{day}: {100 * one.value:.1f} ± {100 * one.sigma:.1f} %"
+        for day, one in zip(result.dates, result.whole, strict=True)
+        if one
+    )
+    rate = f"; {rate_words(result.rate)}: {verdict(result.rate)}" if result.rate else ""
+    return f"solidity of all that each date's dives saw, perhaps other parts: {means}{rate}"
+
+
+def _hole_counts(result: Comparison) -> str:
+    counts = [
+        f"{day}: {sum(len(s.holes.number) for s in result.surveys if s.date == day)}"
+        for day in result.dates
+    ]
+    return f"holes: {', '.join(counts)}; which are the same cannot be told without places"
+
+
+def _shift_lines(wall: OnWall) -> Iterator[str]:
+    for one, shift in zip(wall.placed[1:], wall.shifts[1:], strict=True):
+        if not shift.told.any():
+            continue
+        parts = []
+        if shift.told[0] and wall.frame.round:
+            degrees, sigma = np.rad2deg([shift.value[0], shift.sigma[0]]) / wall.frame.radius
+            parts.append(f"bearing {degrees:+.1f} ± {sigma:.1f}°")
+        elif shift.told[0]:
+            parts.append(f"along {shift.value[0]:+.2f} ± {shift.sigma[0]:.2f} m")
+        if shift.told[1]:
+            parts.append(f"depth {shift.value[1]:+.2f} ± {shift.sigma[1]:.2f} m")
+        how = " and ".join(
+            name for name, told in (("growth", shift.by_pattern), ("holes", shift.by_holes)) if told
+        )
+        yield f"{one.survey.name}: laid on earlier dives by {how}: {', '.join(parts)}"
+
+
+def _growth_line(wall: OnWall) -> str:
+    if wall.growth is None:
+        return "no part of the net was seen on two dates: growth is not told"
+    area = len(wall.cells) * float(np.prod(wall.history.raster.size))
+    return (
+        f"fouling: {rate_words(wall.growth)}, on {area:.0f} m² seen on two dates or more: "
+        f"{verdict(wall.growth)}"
+    )
+
+
+def _where_lines(wall: OnWall) -> Iterator[str]:
+    n = len(wall.cells)
+    if not n:
+        return
+    counts = [
+        f"{word} in {sum(one.changed and sign * one.difference.value > 0.0 for one in wall.cells)}"
+        for word, sign in (("more", 1.0), ("less", -1.0))
+    ]
+    yield f"  beyond chance {' and '.join(counts)} of {n} cells"
+    yield f"  most at {_extreme(wall, max(wall.cells, key=lambda one: one.per_day.value))}"
+    apart = [one for one in wall.cells if one.apart]
+    if apart:
+        most = max(apart, key=lambda one: abs(one.excess.z))
+        words = "faster" if most.excess.value > 0.0 else "slower"
+        yield (
+            f"  {len(apart)} cells differ from the rest of the wall; surest at "
+            f"{_where(wall, most)}, {words} by {rate_words(_size(most.excess)).lstrip('+')}"
+        )
+    elif n > 1:
+        yield "  no cell differs from the rest of the wall beyond chance"
+
+
+def _size(growth: Growth) -> Growth:
+    return Growth(abs(growth.value), growth.sigma)
+
+
+def _extreme(wall: OnWall, cell: CellChange) -> str:
+    return f"{_where(wall, cell)}: {rate_words(cell.per_day)}"
+
+
+def _where(wall: OnWall, cell: CellChange) -> str:
+    return place_words(wall.history.raster.middle(np.array(cell.cell)), wall.frame)
+
+
+def _mean_lines(wall: OnWall) -> Iterator[str]:
+    known = [(d, m) for d, m in zip(wall.history.dates, wall.means, strict=True) if m is not None]
+    if not known:
+        yield "  no part of the net was seen on all dates"
+        return
+    n = int(np.count_nonzero(wall.history.known.all(axis=1)))
+    area = n * float(np.prod(wall.history.raster.size))
+    means = ", ".join(f"{day}: {100 * m.value:.1f} ± {100 * m.sigma:.1f} %" for day, m in known)
+    yield f"  solidity of the {area:.0f} m² seen on all dates: {means}"
+
+
+def _hole_lines(wall: OnWall) -> Iterator[str]:
+    if not wall.sites:
+        yield "holes: none on any date"
+        return
+    for state, sites in by_state(wall.sites).items():
+        yield f"holes {_TITLES[state]}: {len(sites)}"
+        if state is HoleState.SAME:
+            yield from _since(wall, sites)
+            continue
+        for one in sites[:_MOST_LISTED]:
+            yield f"  {size_words(one)}: {place_words(one.place, wall.frame)}{_doubt(one)}"
+        if len(sites) > _MOST_LISTED:
+            yield f"  and {len(sites) - _MOST_LISTED} more, see holes_change.csv"
+
+
+def _since(wall: OnWall, sites: Sequence[Site]) -> Iterator[str]:
+    """Tell which of the holes that stay are newer than the first look at their places."""
+    for v, day in enumerate(wall.history.dates[1:-1], start=1):
+        mine = [
+            one
+            for one in sites
+            if np.isfinite(one.sizes[v])
+            and not np.isfinite(one.sizes[:v]).any()
+            and (one.looked[:v] >= LOOKED).any()
+        ]
+        if mine:
+            yield f"  of these new on {day}: {len(mine)}"
+
+
+def _doubt(site: Site) -> str:
+    if site.state not in (HoleState.NEW, HoleState.GONE):
+        return ""
+    share = 100.0 * site.missed
+    if site.state is HoleState.NEW:
+        return f"; if it was there before, earlier dives would have missed it in {share:.0f} %"
+    return f"; if it is still there, the last date's dives miss it in {share:.0f} %"
+
+
+def _not_looked(wall: OnWall) -> Iterator[str]:
+    known, square = wall.history.known, float(np.prod(wall.history.raster.size))
+    missing = int(np.count_nonzero(known[:, :-1].any(axis=1) & ~known[:, -1]))
+    first = int(np.count_nonzero(~known[:, :-1].any(axis=1) & known[:, -1]))
+    if missing or first:
+        yield (
+            f"not looked at on {wall.history.dates[-1]}: {missing * square:.0f} m² that earlier "
+            f"dives saw; only then: {first * square:.0f} m²"
+        )
+
+
+_DATES = ("first_date", "last_date", "n_dates")
+NET_CHANGE_COLUMNS = (
+    *("cell", "depth_from_m", "depth_to_m", "bearing_from_deg", "bearing_to_deg"),
+    *("along_from_m", "along_to_m", *_DATES),
+    *("solidity_before", "sigma_before", "solidity_after", "sigma_after"),
+    *("difference", "sigma_difference", "z", "per_day", "sigma_per_day", "change"),
+    *("excess_per_day", "sigma_excess", "beside"),
+    *("seen_before_m", "seen_after_m"),
+)
+"""Columns of `net_change.csv`: one row for every cell seen on two dates; `cell` is `all` where
+places cannot be compared."""
+HOLES_CHANGE_COLUMNS = (
+    *("site", "state", "depth_m", "sigma_depth_m", "bearing_deg", "sigma_bearing_deg"),
+    *("along_m", "sigma_along_m", "diameter_before_mm", "sigma_before_mm"),
+    *("diameter_after_mm", "sigma_after_mm", "first_seen", "last_seen", "looked_before"),
+    *("looked_after", "missed", "holes"),
+)
+"""Columns of `holes_change.csv`: one row for every place with a hole on one date or more."""
+
+NOT_COMPARED = "not compared"
+_PLACES, _SHARES, _RATES = 3, 4, 6
+
+
+def cell_rows(result: Comparison) -> list[dict[str, Cell]]:
+    """Return the rows of `net_change.csv`."""
+    if result.wall is None:
+        return _whole_rows(result)
+    wall = result.wall
+    return [_cell_row(one, wall) for one in wall.cells]
+
+
+def hole_rows(result: Comparison) -> list[dict[str, Cell]]:
+    """Return the rows of `holes_change.csv`."""
+    if result.wall is not None:
+        wall = result.wall
+        return [_site_row(i, one, wall) for i, one in enumerate(wall.sites)]
+    rows: list[dict[str, Cell]] = []
+    for survey in result.surveys:
+        for number, diameter, sigma in zip(
+            survey.holes.number, survey.holes.diameter, survey.holes.sigma, strict=True
+        ):
+            row = dict.fromkeys(HOLES_CHANGE_COLUMNS, None) | {
+                "site": len(rows) + 1,
+                "state": NOT_COMPARED,
+                "first_seen": survey.date.isoformat(),
+                "last_seen": survey.date.isoformat(),
+                "holes": f"{survey.name}:{number}",
+            }
+            when = "before" if survey.date < result.dates[-1] else "after"
+            row |= {f"diameter_{when}_mm": _mm(diameter), f"sigma_{when}_mm": _mm(sigma)}
+            rows.append(row)
+    return rows
+
+
+def write_tables(folder: Path, result: Comparison, names: tuple[str, str]) -> None:
+    """Write both tables.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    write_table(folder / names[0], NET_CHANGE_COLUMNS, cell_rows(result))
+    write_table(folder / names[1], HOLES_CHANGE_COLUMNS, hole_rows(result))
+
+
+def _whole_rows(result: Comparison) -> list[dict[str, Cell]]:
+    known = [(d, one) for d, one in zip(result.dates, result.whole, strict=True) if one]
+    if len(known) < 2 or result.rate is None:
+        return []
+    (first, before), (last, after) = known[0], known[-1]
+    change = Growth(after.value - before.value, float(np.hypot(before.sigma, after.sigma)))
+    seen = [
+        sum(
+            float(s.stretches.seen[s.stretches.usable].sum()) for s in result.surveys if s.date == d
+        )
+        for d in (first, last)
+    ]
+    row = dict.fromkeys(NET_CHANGE_COLUMNS, None)
+    row |= {"cell": "all", "first_date": first.isoformat(), "last_date": last.isoformat()}
+    row |= {"n_dates": len(known), **_numbers(before, after, change, result.rate)}
+    row |= {"change": _change(change, abs(change.z) > 2.0)}
+    return [row | {"seen_before_m": round(seen[0], 1), "seen_after_m": round(seen[1], 1)}]
+
+
+def _cell_row(one: CellChange, wall: OnWall) -> dict[str, Cell]:
+    raster, dates = wall.history.raster, wall.history.dates
+    middle = raster.middle(np.array(one.cell))
+    low, high = middle - 0.5 * raster.size, middle + 0.5 * raster.size
+    row: dict[str, Cell] = dict.fromkeys(NET_CHANGE_COLUMNS, None)
+    row |= {"cell": one.cell, **_between("depth", "m", float(low[1]), float(high[1]))}
+    if wall.frame.round:
+        ends = (bearing_deg(float(at), wall.frame) for at in (low[0], high[0]))
+        row |= _between("bearing", "deg", *ends)
+    else:
+        row |= _between("along", "m", float(low[0]), float(high[0]))
+    row |= {"first_date": dates[one.first].isoformat(), "last_date": dates[one.last].isoformat()}
+    row |= {"n_dates": one.n_dates, **_numbers(one.before, one.after, one.difference, one.per_day)}
+    row |= {"change": _change(one.difference, one.changed)}
+    row |= {"excess_per_day": round(one.excess.value, _RATES)}
+    row |= {"sigma_excess": round(one.excess.sigma, _RATES), "beside": _beside(one)}
+    return row | {"seen_before_m": round(one.seen[0], 1), "seen_after_m": round(one.seen[1], 1)}
+
+
+def _between(name: str, unit: str, low: float, high: float) -> dict[str, Cell]:
+    return {
+        f"{name}_from_{unit}": round(low, _PLACES),
+        f"{name}_to_{unit}": round(high, _PLACES),
+    }
+
+
+def _numbers(before: Growth, after: Growth, change: Growth, rate: Growth) -> dict[str, Cell]:
+    return {
+        "solidity_before": round(before.value, _SHARES),
+        "sigma_before": round(before.sigma, _SHARES),
+        "solidity_after": round(after.value, _SHARES),
+        "sigma_after": round(after.sigma, _SHARES),
+        "difference": round(change.value, _SHARES),
+        "sigma_difference": round(change.sigma, _SHARES),
+        "z": round(change.z, 2),
+        "per_day": round(rate.value, _RATES),
+        "sigma_per_day": round(rate.sigma, _RATES),
+    }
+
+
+def _change(difference: Growth, beyond: bool) -> str:
+    if not beyond:
+        return "not told"
+    return "more" if difference.value > 0.0 else "less"
+
+
+def _beside(one: CellChange) -> str:
+    if not one.apart:
+        return "as the rest"
+    return "faster" if one.excess.value > 0.0 else "slower"
+
+
+def _site_row(i: int, one: Site, wall: OnWall) -> dict[str, Cell]:
+    dates = wall.history.dates
+    seen = np.flatnonzero(np.isfinite(one.sizes))
+    before = seen[seen < len(dates) - 1]
+    row: dict[str, Cell] = dict.fromkeys(HOLES_CHANGE_COLUMNS, None)
+    row |= {"site": i + 1, "state": one.state.value, **_place(one.place, one.sigma, wall.frame)}
+    if len(before):
+        k = before[-1]
+        row |= {"diameter_before_mm": _mm(one.sizes[k])}
+        row |= {"sigma_before_mm": _mm(one.sigma_sizes[k])}
+    if seen[-1] == len(dates) - 1:
+        row |= {"diameter_after_mm": _mm(one.sizes[-1]), "sigma_after_mm": _mm(one.sigma_sizes[-1])}
+    row |= {
+        "first_seen": dates[seen[0]].isoformat(),
+        "last_seen": dates[seen[-1]].isoformat(),
+        "looked_before": round(float(one.looked[:-1].max()), 2),
+        "looked_after": round(float(one.looked[-1]), 2),
+        "holes": " ".join(one.numbers),
+    }
+    if one.state in (HoleState.NEW, HoleState.GONE):
+        row |= {"missed": round(one.missed, 3)}
+    return row
+
+
+def _place(place: FloatArray, sigma: FloatArray, frame: WallFrame) -> dict[str, Cell]:
+    found: dict[str, Cell] = {
+        "depth_m": round(float(place[1]), _PLACES),
+        "sigma_depth_m": round(float(sigma[1]), _PLACES),
+    }
+    if not frame.round:
+        return found | {
+            "along_m": round(float(place[0]), _PLACES),
+            "sigma_along_m": round(float(sigma[0]), _PLACES),
+        }
+    degrees = float(np.rad2deg(sigma[0] / frame.radius))
+    return found | {
+        "bearing_deg": round(bearing_deg(float(place[0]), frame), 1),
+        "sigma_bearing_deg": round(degrees, 1),
+    }
+
+
+def _mm(metres: float) -> float:
+    return round(1e3 * float(metres), 1)

@@ -1,0 +1,323 @@
+"""The condition of a net, stretch by stretch: mesh size, twine, solidity, holes.
+
+Scans go in one by one. A stretch of net is evaluated as a whole when the vehicle has passed it, so
+that what is known of its lattice, its light and its twine serves all of its frames.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.nets.coverage import LaidView, Twine, dash_kinds, measure_solidity, measure_twine
+from aqualvs.nets.dashes import NetView, crossings_of, find_dashes
+from aqualvs.nets.holes import Hole, HoleMap, merge_holes
+from aqualvs.nets.lattice import (
+    START_FRAMES,
+    START_S,
+    LatticeFitter,
+    NetLattice,
+    NetTrack,
+    Start,
+    find_lattice,
+)
+from aqualvs.nets.lit_intervals import LineState, NetReader, NetSignal
+from aqualvs.nets.spectrum import Crossings, Mesh
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.scan import Scan
+
+# Frames before the first lattice that are kept, to look for holes in them once it is known.
+_MOST_WAITING = 1500
+# Ends of a laser's line that stay this much darker than the rest are beyond the laser's fan.
+_BIN_LINES, _DIM = 24, 0.25
+_LEAST_LOOKED_AT = 600
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetConditionOptions:
+    """How a dive is divided.
+
+    Attributes
+    ----------
+    stretch_s : float
+        A stretch of net ends after this time,
+    stretch : float
+        or after the vehicle has moved this far along the net, in metres.
+    twine : float or None
+        Diameter of the bare twine in metres, where it is known: makes solidity more accurate.
+    """
+
+    stretch_s: float = 5.0
+    stretch: float = 0.5
+    twine: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if not self.stretch_s > 0.0:
+            raise OptionError(f"stretch_s is {self.stretch_s:g}; use more than 0 s")
+        if not self.stretch > 0.0:
+            raise OptionError(f"stretch is {self.stretch:g}; use more than 0 m")
+        if self.twine is not None and not self.twine > 0.0:
+            raise OptionError(f"twine is {self.twine:g}; use more than 0 m, or leave it out")
+
+
+@dataclass(frozen=True, slots=True)
+class NetStretch:
+    """What a stretch of net looks like; what could not be measured is None.
+
+    Attributes
+    ----------
+    first_frame, last_frame : int
+        Frames that it was seen in.
+    begin_s, end_s : float
+        Their times.
+    n_frames : int
+        Frames with a posture.
+    range : float
+        Mean distance from the vehicle, in metres.
+    begin_place, place : array, shape (2,)
+        Where the vehicle's foot on the net (of the perpendicular from the dome's centre) was at its
+        beginning and its end: right and up of the track's start, in metres.
+    piece : int
+        Piece of track that `place` belongs to; where it differs from that of the stretch before,
+        the track was lost in between.
+    lattice : NetLattice or None
+        Shape and size of the mesh, directions of the strands.
+    twine : Twine or None
+        Thickness of the twine.
+    solidity, sigma_solidity : float or None
+        Share of the area that strands and growth cover, 0 to 1.
+    n_strands : float
+        Strands that a frame shows, on average.
+    seen_length : float
+        Metres of laser line that were looked at.
+    """
+
+    first_frame: int
+    last_frame: int
+    begin_s: float
+    end_s: float
+    n_frames: int
+    range: float
+    begin_place: FloatArray
+    place: FloatArray
+    piece: int
+    lattice: NetLattice | None
+    twine: Twine | None
+    solidity: float | None
+    sigma_solidity: float | None
+    n_strands: float
+    seen_length: float
+
+    @property
+    def clean_solidity(self) -> float | None:
+        """Solidity that the bare twine alone would have; what is more is growth."""
+        if self.lattice is None or self.twine is None:
+            return None
+        d, bar = self.twine.thickness, self.lattice.bar
+        if self.lattice.mesh is Mesh.SIX_SIDED:
+            return float(min(2.0 * d / (np.sqrt(3.0) * bar), 1.0))
+        a, b = d / self.lattice.pitch
+        return float(min(a + b - a * b, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the frames of a stretch show; n of each."""
+
+    views: list[NetView]
+    crossings: list[Crossings]
+    velocities: list[FloatArray | None]
+
+
+class NetCondition:
+    """Accumulates the condition of a net over a dive.
+
+    Parameters
+    ----------
+    rig : Rig
+        That the scans were made with.
+    options : NetConditionOptions, optional
+        Defaults if left out.
+    camera : Camera, optional
+        In place of `rig.camera()`.
+
+    Attributes
+    ----------
+    stretches : list of NetStretch
+        Those that are complete. Where the net's lattice shows only later, the places of earlier
+        ones are filled in then, and holes in them are found.
+    """
+
+    def __init__(
+        self, rig: Rig, options: NetConditionOptions | None = None, camera: Camera | None = None
+    ) -> None:
+        self.options = options or NetConditionOptions()
+        self.stretches: list[NetStretch] = []
+        self._reader = NetReader(rig, camera)
+        self._signals: list[NetSignal] = []
+        self._velocities: list[FloatArray | None] = []
+        # Stretches before the first lattice, by their number.
+        self._waiting: dict[int, _Seen] = {}
+        self._track = NetTrack()
+        self._map = HoleMap()
+        self._lattice: NetLattice | None = None
+        shape = (len(rig.lasers), self._reader.n_lines)
+        self._lit, self._looked = np.zeros(shape), np.zeros(shape)
+
+    @property
+    def holes(self) -> list[Hole]:
+        """Holes found so far, in the order in which they were passed."""
+        return merge_holes(self._map.holes)
+
+    @property
+    def area(self) -> float:
+        """Area of net that was looked at for holes, in square metres."""
+        return self._map.area
+
+    def add(self, scan: Scan, velocity: FloatArray | None = None) -> NetStretch | None:
+        """Add a scan; returns the stretch that it completes, if it does.
+
+        Parameters
+        ----------
+        scan : Scan
+            In the order of time. Frames without a posture, or without a net, are passed over.
+        velocity : array, shape (2,), optional
+            Of the vehicle along the net, right and up in m/s, if another sensor knows it.
+        """
+        finished = None
+        if self._signals and scan.time_s - self._signals[0].time_s >= self._length_s():
+            finished = self.finish()
+        signal = self._reader.read(scan)
+        if signal is not None and np.any(signal.state == LineState.LIT):
+            self._signals.append(signal)
+            self._velocities.append(velocity)
+        return finished
+
+    def add_all(self, scans: Iterable[Scan]) -> list[NetStretch]:
+        """Add a dive's scans and finish; returns all stretches."""
+        for scan in scans:
+            self.add(scan)
+        self.finish()
+        return self.stretches
+
+    def finish(self) -> NetStretch | None:
+        """Complete the stretch under way, also when it is short; None where nothing was seen."""
+        if not self._signals:
+            return None
+        seen = self._take()
+        lattice = find_lattice(seen.crossings, self._lattice)
+        if lattice is not None:
+            self._look_back(lattice)
+            self._lattice = lattice
+        stretch = self._evaluate(seen, lattice)
+        self.stretches.append(stretch)
+        if self._lattice is None:
+            self._waiting[len(self.stretches) - 1] = seen
+            while sum(len(one.views) for one in self._waiting.values()) > _MOST_WAITING:
+                del self._waiting[min(self._waiting)]
+        return stretch
+
+    def _take(self) -> _Seen:
+        """Cut the signals of the stretch under way into dashes."""
+        for signal in self._signals:
+            self._lit += signal.state == LineState.LIT
+            self._looked += signal.state != LineState.HIDDEN
+        usable = self._usable()
+        views = [find_dashes(signal, usable) for signal in self._signals]
+        seen = _Seen(views, [crossings_of(view) for view in views], self._velocities)
+        self._signals, self._velocities = [], []
+        return seen
+
+    def _look_back(self, lattice: NetLattice) -> None:
+        """Follow the net through the stretches in which its lattice was not seen yet."""
+        for i, seen in self._waiting.items():
+            begin = self._track.place
+            self._follow(lattice, seen)
+            self.stretches[i] = replace(
+                self.stretches[i],
+                begin_place=begin,
+                place=self._track.place,
+                piece=self._track.piece,
+            )
+        self._waiting.clear()
+
+    def _length_s(self) -> float:
+        """Time that the stretch under way takes at the speed of the last one."""
+        speed = float(np.hypot(*self._track.velocity))
+        return min(self.options.stretch_s, max(self.options.stretch / max(speed, 1e-6), 1.0))
+
+    def _evaluate(self, seen: _Seen, lattice: NetLattice | None) -> NetStretch:
+        views, begin = seen.views, self._track.place
+        twine, solidity, sigma, strands = None, None, None, 0.0
+        if self._lattice is not None:
+            # Where none was found most of it may be a hole: the net beside it is as before.
+            laid = self._follow(self._lattice, seen)
+            if lattice is not None and laid:
+                strands = float(np.mean([one.fit.n_strands for one in laid]))
+                twine = measure_twine(dash_kinds(lattice, laid), self.options.twine)
+                if twine is not None:
+                    solidity, sigma = measure_solidity(lattice, twine, laid) or (None, None)
+        return NetStretch(
+            first_frame=views[0].index,
+            last_frame=views[-1].index,
+            begin_s=views[0].time_s,
+            end_s=views[-1].time_s,
+            n_frames=len(views),
+            range=float(np.mean([view.range for view in views])),
+            begin_place=begin,
+            place=self._track.place,
+            piece=self._track.piece,
+            lattice=lattice,
+            twine=twine,
+            solidity=solidity,
+            sigma_solidity=sigma,
+            n_strands=strands,
+            seen_length=sum(view.seen_length for view in views),
+        )
+
+    def _follow(self, lattice: NetLattice, seen: _Seen) -> list[LaidView]:
+        """Lay the lattice onto every frame, keep track of the way and look for holes."""
+        fitter, laid = LatticeFitter(lattice), []
+        for i, view in enumerate(seen.views):
+            start = self._start(fitter, seen, i) if self._track.begins(view.time_s) else None
+            shift = self._track.step(
+                fitter, seen.crossings[i], view.time_s, seen.velocities[i], start
+            )
+            if shift is None:
+                continue
+            place = self._track.place
+            laid.append(LaidView(view, fitter.assign(view.dashes, shift.place), place))
+            self._map.add(lattice, view, shift.place, place, self._track.piece)
+        self._map.update(lattice)
+        return laid
+
+    def _start(self, fitter: LatticeFitter, seen: _Seen, first: int) -> Start | None:
+        """Look ahead where the track begins; not where another sensor tells the velocity."""
+        if seen.velocities[first] is not None:
+            return None
+        times = np.array([view.time_s for view in seen.views[first : first + START_FRAMES]])
+        times = times[times - times[0] < START_S]
+        return fitter.start(seen.crossings[first : first + len(times)], times)
+
+    def _usable(self) -> BoolArray:
+        """Search lines (L, J) that each laser's fan reaches, as the dive shows it so far."""
+        usable = np.ones(self._lit.shape, np.bool_)
+        edges = np.arange(0, self._lit.shape[1], _BIN_LINES)
+        lit = np.add.reduceat(self._lit, edges, axis=1)
+        looked = np.add.reduceat(self._looked, edges, axis=1)
+        for i in range(len(lit)):
+            known = looked[i] > _LEAST_LOOKED_AT
+            if not known.any():
+                continue
+            share = lit[i] / np.maximum(looked[i], 1.0)
+            bright = known & (share > _DIM * np.median(share[known]))
+            bright |= ~known
+            inside = np.flatnonzero(bright)
+            if len(inside):
+                usable[i, : edges[inside[0]]] = False
+                usable[i, edges[inside[-1]] + _BIN_LINES :] = False
+        return usable

@@ -1,0 +1,493 @@
+"""How much of the net its strands cover, and what dashes of one kind look like.
+
+The share of a line that is lit is, in expectation, the share of the area that strands cover
+(Delesse, C. R. Acad. Sci. 25 (1847) 544; Rosiwal, Verh. k. k. geol. Reichsanst. 1898, 143). What
+the detector adds to every dash is taken off, as `net_twine` says it.
+
+Thickness of twine, from how long and how wide the light is on strands that cross at angles.
+
+The light on a strand is where strand and laser sheet overlap: a parallelogram with rounded corners.
+Search lines meet it over a length that follows in quadrature from strand and sheet, and across the
+line it is as wide as the sheet or as the strand lets it be, whichever is less:
+
+    (length / b)² = (l / sin a)² + (w k)²,    width⁻ᵖ = (r w)⁻ᵖ + (k sin a / (d + e))ᵖ,
+
+with the silhouette d, its lit width l, the crossing angle a, the sheet's lit width w and the slant
+k, by which the strand runs away from the search lines on its way across the sheet. Dashes at
+several angles tell strand and sheet apart; r says how the sheet's width at half height compares
+with its lit one. A dash ends where its light falls below a share of its own peak (`net_dashes`), so
+that its length depends on brightness little, as b says: overexposed tops are cut off, and faint
+edges are lost. l is less than d, because round strands are dim at their edges, and more by blur.
+How much was measured in simulation; the uncertainty holds what it varied.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.nets.dashes import NetView
+from aqualvs.nets.lattice import Fit, NetLattice
+from aqualvs.nets.spectrum import Mesh
+
+# Lit width of a strand: so much of its silhouette, and so much more in metres and in steps of the
+# search lines; and the power of its height over the usual one, in grey levels, with which dashes
+# grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m whose twine was known.
+_SEEN, _HALO, _HALO_STEPS, _BRIGHTER = 0.82, 0.43e-3, 0.44, 0.25
+_LEAST_HEIGHT = 25.0
+USUAL_HEIGHT = np.array(100.0)
+"""Height of a dash at which `Twine.halo` holds, in grey levels."""
+# What that varies in steps; and as a share of the strand where there is no light at all, less up to
+# a height at which strands are no longer seen in part.
+_SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.07, 0.12, 90.0
+# The silhouette of twisted twine is on average narrower than its diameter.
+_SILHOUETTE = 0.95
+# Width of a strand at half height less its silhouette, in pixels; and the exponent p (same dives).
+_STRAND_MORE, _CORNER = 0.95, 2.5
+# Before any dash was seen: silhouette of a strand and lit width of the sheet in metres, the sheet's
+# width at half height over its lit one; and their spreads as logarithms.
+_USUAL, _SPREAD = np.log([2.2e-3, 2.8e-3, 0.95]), np.array([1.5, 0.2, 0.1])
+# Errors of a kind's length and width: relative, relative for one dash, and in search lines.
+_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.06, 0.115, 0.2, 0.2
+# Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
+_SPREAD_ERROR = 0.15
+# The model holds the less the more slanted the strand is.
+_SLANT_ERROR = 0.7
+# Uncertainty of what slant adds to a dash, as a share.
+_SLANT_TOLD = 0.1
+# True errors over those of the fit, which is cautious with single kinds.
+_TRUE_ERROR = 0.7
+_ROUNDS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class DashKind:
+    """Dashes of one laser on one family of strands, taken together.
+
+    Attributes
+    ----------
+    laser, family : int
+        Of the dashes.
+    across : float
+        Sine of the angle between the laser's line and the strands, 0 to 1.
+    slant : float
+        How far the strand gets along the line, measured by search lines, per metre across it.
+    length : float
+        Of a usual dash along the line, in metres.
+    width : float
+        Of its light at half height, square to the line, in metres.
+    height : float
+        Of its light, in grey levels.
+    step : float
+        Length of laser line that a search line stands for, in metres.
+    pixel : float
+        Size of a pixel on the net, in metres.
+    spread : float
+        Logarithm of long dashes over short ones: how much growth there is.
+    count : int
+        Dashes.
+    """
+
+    laser: int
+    family: int
+    across: float
+    slant: float
+    length: float
+    width: float
+    height: float
+    step: float
+    pixel: float
+    spread: float
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Twine:
+    """Thickness of twine.
+
+    Attributes
+    ----------
+    thickness, sigma : float
+        Diameter and its standard deviation, in metres.
+    body : float
+        Width of its silhouette, in metres.
+    sheet : float
+        Width within which the light sheet is seen, in metres.
+    halo, sigma_halo : float
+        How much wider than its body a strand looks lit where search lines are close, in metres, and
+        how well body and halo are told apart.
+    """
+
+    thickness: float
+    sigma: float
+    body: float
+    sheet: float
+    halo: float
+    sigma_halo: float
+
+    def usual(
+        self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
+    ) -> FloatArray:
+        """Length of dashes, in metres, by crossing angle, slant, step, height as in `DashKind`."""
+        return np.asarray(_bright(height) * np.hypot(self._lit(step) / across, self.sheet * slant))
+
+    def excess(
+        self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what of `usual` is not twine, in metres, and its standard deviation."""
+        usual = self.usual(across, slant, step, height)
+        straight = _bright(height) * self._lit(step) / across
+        sigma = np.hypot(self.sigma_halo / across, _SLANT_TOLD * (usual - straight))
+        return usual - self.body / across, np.asarray(sigma)
+
+    def _lit(self, step: FloatArray) -> FloatArray:
+        """Lit width at the usual height, in metres."""
+        return np.asarray(self.body + self.halo + _HALO_STEPS * step)
+
+
+def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twine | None:
+    """Fit twine and sheet to the dashes of several kinds; None without any.
+
+    Parameters
+    ----------
+    kinds : sequence of DashKind
+        The more different their angles and slants, the better.
+    known : float, optional
+        Diameter of the bare twine in metres, where somebody knows it: then the halo is measured.
+    """
+    if not kinds:
+        return None
+    at, covariance = _fit(kinds)
+    strand, sheet, _ = np.exp(at)
+    sigma_strand = _TRUE_ERROR * float(strand * np.sqrt(covariance[0, 0]))
+    if known is not None:
+        body = _SILHOUETTE * known
+        halo = _SEEN * float(strand) + _HALO - body
+        return Twine(known, 0.0, body, float(sheet), halo, _SEEN * sigma_strand)
+    step, height = np.median([[k.step, k.height] for k in kinds], axis=0)
+    faint = max(1.0 - float(height) / _FAINT, 0.0)
+    of_halo = math.hypot(_SIGMA_HALO * float(step), _SIGMA_FAINT * faint * float(strand)) / _SEEN
+    sigma = math.hypot(sigma_strand, of_halo)
+    body = float(strand)
+    return Twine(
+        thickness=body / _SILHOUETTE,
+        sigma=sigma / _SILHOUETTE,
+        body=body,
+        sheet=float(sheet),
+        halo=_HALO - (1.0 - _SEEN) * body,
+        sigma_halo=_SEEN * sigma,
+    )
+
+
+def _bright(height: FloatArray) -> FloatArray:
+    """How much longer dashes are than those of the usual height."""
+    return np.asarray((np.maximum(height, _LEAST_HEIGHT) / USUAL_HEIGHT) ** _BRIGHTER)
+
+
+def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
+    """Logarithms (3,) of silhouette, sheet and sheet's half-height ratio, and their covariance.
+
+    Gauss-Newton; lengths and widths far off count less (Huber's weights).
+    """
+    across, slant, length, width, step, pixel, height, count = np.array(
+        [[k.across, k.slant, k.length, k.width, k.step, k.pixel, k.height, k.count] for k in kinds],
+        np.float64,
+    ).T
+    blur = _HALO + _HALO_STEPS * step, _STRAND_MORE * pixel
+    seen = np.log(np.r_[length / _bright(height), width])
+    grown = _SPREAD_ERROR * np.array([k.spread for k in kinds])
+    of_length = np.hypot(np.hypot(_LENGTH_ERROR, grown), _ERROR_PX * step / length)
+    error = np.r_[of_length, np.full(len(kinds), _WIDTH_ERROR)]
+    error = np.hypot(error, np.tile(_DASH_ERROR / np.sqrt(count), 2))
+    error *= np.tile(1.0 + _SLANT_ERROR * slant, 2)
+    prior = np.diag(_SPREAD**-2)
+    at, normal = _USUAL.copy(), prior
+    at[0] = np.log(np.clip(np.min(length * across) - _HALO, 3e-4, 2e-2))
+    for _ in range(_ROUNDS):
+        expected, slope = _model(at, across, slant, *blur)
+        off = (seen - expected) / error
+        jacobian = slope / error[:, None]
+        weight = 1.0 / np.maximum(np.abs(off), 1.0)
+        normal = (jacobian * weight[:, None]).T @ jacobian + prior
+        move = np.linalg.solve(normal, jacobian.T @ (weight * off) - prior @ (at - _USUAL))
+        at = at + np.clip(move, -0.5, 0.5)
+        if float(np.abs(move).max()) < 1e-4:
+            break
+    return at, np.asarray(np.linalg.inv(normal), np.float64)
+
+
+def _model(
+    at: FloatArray, across: FloatArray, slant: FloatArray, halo: FloatArray, more: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Logarithms (2K,) of lengths, then widths, and their derivatives (2K, 3) by `at`."""
+    strand, sheet, ratio = np.exp(at)
+    lit = _SEEN * strand + halo
+    one, other = (lit / across) ** 2, (sheet * slant) ** 2
+    by_strand = one / (one + other)
+    wide = strand + more
+    full, clipped = (ratio * sheet) ** -_CORNER, (slant * across / wide) ** _CORNER
+    by_clip = clipped / (full + clipped)
+    slope = np.zeros((2, len(across), 3))
+    slope[0, :, 0], slope[0, :, 1] = by_strand * _SEEN * strand / lit, 1.0 - by_strand
+    slope[1, :, 0] = by_clip * strand / wide
+    slope[1, :, 1] = slope[1, :, 2] = 1.0 - by_clip
+    expected = np.r_[0.5 * np.log(one + other), -np.log(full + clipped) / _CORNER]
+    return expected, slope.reshape(-1, 3)
+
+
+# Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
+_LEAST_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
+_LEAST_DASHES = 6
+# Growth lengthens dashes, and makes them differ; up to this share of all light on a kind's dashes
+# they are bare still, falling with how much they differ by this scale. They also differ by noise,
+# which is so many grey levels, and where there is none. From simulated dives.
+_BARE_SHARE, _DIFFER, _LEAST_BARE = 0.45, 0.22, 0.08
+_NOISE, _NO_NOISE = 7.0, 0.03
+_SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
+_WIDTH_QUANTILE = 0.4
+# Sines of smaller angles say no more than that a strand runs along the line.
+_NEARLY_ALONG = 0.02
+# Dashes of more search lines may be lost (`segments`).
+_MOST_LINES = 20.0
+_BLOCKS = 6
+# Errors of solidity for dashes that run together or are not seen, as shares: of any net, and per
+# pixel in the distance of two strands (simulated dives).
+_SHARE_ERROR, _UNRESOLVED = 0.04, 1.5
+# And as a share of what growth adds: it stands out of the net, and is lit and seen askew.
+_GROWTH_ERROR = 0.25
+# Growth so far apart along the net, in metres, is independent.
+_ALIKE = 0.02
+# A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
+# bars long.
+_TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class LaidView:
+    """A frame on which the lattice was laid.
+
+    Attributes
+    ----------
+    view : NetView
+        What it shows.
+    fit : Fit
+        How its dashes lie on the lattice.
+    place : array, shape (2,)
+        Where the origin of `net` lies on the net itself, as `NetTrack.place`.
+    """
+
+    view: NetView
+    fit: Fit
+    place: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Angles:
+    """How a laser's line and search lines lie to strands; shapes alike.
+
+    Attributes
+    ----------
+    across : array
+        Sine of the angle between line and strand.
+    slant : array
+        As in `DashKind`.
+    square : array
+        Sine of the angle between line and search lines.
+    """
+
+    across: FloatArray
+    slant: FloatArray
+    square: FloatArray
+
+    @classmethod
+    def of(cls, line: FloatArray, search: FloatArray, normal: FloatArray) -> "_Angles":
+        beside = np.stack([-line[..., 1], line[..., 0]], axis=-1)
+        across = np.maximum(np.abs(np.sum(line * normal, axis=-1)), _NEARLY_ALONG)
+        square = np.maximum(np.abs(np.sum(search * beside, axis=-1)), _NEARLY_ALONG)
+        slant = np.abs(np.sum(search * normal, axis=-1)) / (across * square)
+        return cls(across, slant, square)
+
+
+def _angles(lattice: NetLattice, one: LaidView) -> _Angles:
+    """Of every dash."""
+    laser = one.view.dashes.laser
+    normal = lattice.normals[one.fit.family]
+    return _Angles.of(one.view.direction[laser], one.view.search[laser], normal)
+
+
+def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind]:
+    """Sort whole dashes that lie clearly on one strand by laser and family."""
+    rows = [_rows(lattice, one) for one in frames]
+    table = np.concatenate(rows) if rows else np.empty((0, 9))
+    kinds = np.unique(table[:, :2], axis=0)
+    each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
+    each = [mine for mine in each if len(mine) >= _LEAST_DASHES]
+    # Long dashes against short ones; on slanted strands the light sheet evens them out.
+    spreads = [
+        np.log(_length_at(mine, _LONG) / _length_at(mine, _SHORT))
+        for mine in each
+        if np.median(mine[:, 3]) < _SLANTED
+    ]
+    spread = float(np.median(spreads)) if spreads else _USUAL_SPREAD
+    return [_kind(mine, spread) for mine in each]
+
+
+def _kind(mine: FloatArray, spread: float) -> DashKind:
+    """Take dashes (rows as `_rows` makes them) together."""
+    across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
+    noise = np.hypot(_NOISE / max(height, 1.0), _NO_NOISE)
+    grown = np.sqrt(max(spread**2 - noise**2, 0.0))
+    share = float(max(_BARE_SHARE * np.exp(-grown / _DIFFER), _LEAST_BARE))
+    return DashKind(
+        laser=int(mine[0, 0]),
+        family=int(mine[0, 1]),
+        across=float(across),
+        slant=float(slant),
+        length=_length_at(mine, share),
+        width=float(np.quantile(mine[:, 5], _WIDTH_QUANTILE)),
+        height=float(height),
+        step=float(step),
+        pixel=float(pixel),
+        spread=spread,
+        count=len(mine),
+    )
+
+
+def _length_at(mine: FloatArray, share: float) -> float:
+    """Length up to which dashes have this share of all light; so fragments count little."""
+    ordered = np.sort(mine[:, 4])
+    light = np.cumsum(ordered)
+    return float(ordered[np.searchsorted(light, share * light[-1])])
+
+
+def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
+    """(laser, family, across, slant, length, width, height, step) of a frame's clear dashes."""
+    pitch, dashes, fit = lattice.pitch, one.view.dashes, one.fit
+    angles = _angles(lattice, one)
+    clear = dashes.whole & (fit.off < _ON_STRAND * pitch[fit.family])
+    clear &= angles.across > _LEAST_ACROSS
+    if lattice.mesh is Mesh.FOUR_SIDED:
+        clear &= fit.clear > _CLEAR * pitch.min()
+    step = one.view.step[dashes.laser]
+    # A search line stands for a whole number of pixels; it tells better than the range does how
+    # large they are on the net.
+    lines = np.maximum(np.rint(step * angles.square / one.view.pixel), 1.0)
+    pixel = step * angles.square / lines
+    columns = [
+        dashes.laser,
+        fit.family,
+        angles.across,
+        angles.slant,
+        dashes.length,
+        dashes.width * angles.square * pixel / one.view.pixel,
+        dashes.height,
+        step,
+        pixel,
+    ]
+    return np.stack([column[clear].astype(np.float64) for column in columns], axis=1)
+
+
+def measure_solidity(
+    lattice: NetLattice, twine: Twine, frames: Sequence[LaidView]
+) -> tuple[float, float] | None:
+    """Share of the sound net that strands and growth cover, and its standard deviation.
+
+    Of hexagons, whose strands every laser crosses in three directions, the lasers' lines as a
+    whole. Of meshes with four sides family by family, each from the lasers that cross it at an
+    angle at which no dash is lost.
+    """
+    counts = np.ones((len(frames[0].view.step), len(lattice.waves)), np.bool_)
+    if lattice.mesh is Mesh.FOUR_SIDED:
+        counts = _reliable(lattice, twine, frames[len(frames) // 2].view)
+    shape = (len(frames), *counts.shape)
+    body, error, seen = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
+    rows = []
+    for i, one in enumerate(frames):
+        dashes, family = one.view.dashes, one.fit.family
+        angles = _angles(lattice, one)
+        at = angles.across, angles.slant, one.view.step[dashes.laser], dashes.height
+        excess, sigma = twine.excess(*at)
+        # A dash that is cut off, or lies along the edge of the light, has its share of the halo.
+        share = np.minimum(dashes.length / twine.usual(*at), 1.0)
+        share = np.where(dashes.whole, share, 0.5 * share)
+        mine = dashes.length - excess * share
+        rows.append(np.c_[family, mine, dashes.place + one.place][counts[dashes.laser, family]])
+        np.add.at(body[i], (dashes.laser, family), mine)
+        np.add.at(error[i], (dashes.laser, family), sigma * share)
+        seen[i] = sound_length(lattice, one.view)
+    if not np.all(np.any(counts & (seen.sum(axis=0) > 0.0)[:, None], axis=0)):
+        return None
+    solidity = _family_sum(body, seen, counts)
+    blocks = np.array_split(np.arange(len(frames)), min(_BLOCKS, len(frames)))
+    parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
+    chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
+    unresolved = _UNRESOLVED * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
+    shares = [_spread_of_mean(np.concatenate(rows)), _SHARE_ERROR, unresolved]
+    bare = float(np.sum(twine.body * lattice.density / lattice.pitch))
+    grown = _GROWTH_ERROR * max(solidity - bare, 0.0)
+    sigmas = [chance, _family_sum(error, seen, counts), grown, *(solidity * one for one in shares)]
+    return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
+
+
+def _spread_of_mean(rows: FloatArray) -> float:
+    """How uncertain the mean of dashes (family, length, place) is for their spread, as a share.
+
+    Dashes near to one another show the same growth, in whatever frames.
+    """
+    variance, weight = 0.0, 0.0
+    for family in np.unique(rows[:, 0]):
+        mine = rows[rows[:, 0] == family, 1:]
+        total, mean = float(mine[:, 0].sum()), float(mine[:, 0].mean())
+        independent = len(np.unique(np.floor(mine[:, 1:] / _ALIKE), axis=0))
+        if mean > 0.0:
+            variance += (total * float(mine[:, 0].std()) / mean) ** 2 / independent
+            weight += total
+    return float(np.sqrt(variance) / weight) if weight > 0.0 else 1.0
+
+
+def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
+    """Lines of each family that the lasers' lines cross in a metre, shape (L, F)."""
+    known = np.isfinite(view.direction)
+    direction = np.where(known, view.direction, lattice.normals[0])
+    return np.asarray(np.abs(direction @ lattice.waves.T))
+
+
+def long_gaps(lattice: NetLattice, view: NetView) -> BoolArray:
+    """Mark the gaps of a frame that are longer than the lattice allows."""
+    longest = 1.0 / crossing_rates(lattice, view).max(axis=1)
+    if lattice.mesh is Mesh.SIX_SIDED:
+        longest = np.full(len(view.step), _HEXAGON_GAP * lattice.bar)
+    return np.asarray(view.gaps.length > _TOO_LONG * longest[view.gaps.laser])
+
+
+def sound_length(lattice: NetLattice, view: NetView) -> FloatArray:
+    """Metres of each laser's line (L,) that could be seen, without gaps that are too long."""
+    length, long = np.zeros(len(view.step)), long_gaps(lattice, view)
+    np.add.at(length, view.span_laser, view.span[:, 1] - view.span[:, 0])
+    np.subtract.at(length, view.gaps.laser[long], view.gaps.length[long])
+    return length
+
+
+def _family_sum(body: FloatArray, seen: FloatArray, counts: BoolArray) -> float:
+    """Covered share of the lines, added up over the families: (frames, lasers, families) in."""
+    covered = np.sum(body.sum(axis=0) * counts, axis=0)
+    looked = np.sum(seen.sum(axis=0)[:, None] * counts, axis=0)
+    return float(np.sum(covered / np.maximum(looked, 1e-9)))
+
+
+def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
+    """Which lasers (L) show all crossings of which families (F).
+
+    Light that runs along a strand for many search lines is taken for another laser's stripe. Where
+    no laser crosses a family well, the one that does so best counts.
+    """
+    line, search = np.nan_to_num(view.direction), np.nan_to_num(view.search)
+    angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
+    step = view.step[:, None]
+    lines = twine.usual(angles.across, angles.slant, step, USUAL_HEIGHT) / step
+    good: BoolArray = lines < _MOST_LINES
+    best = lines.argmin(axis=0)
+    good[best, np.arange(len(best))] = True
+    return good

@@ -1,0 +1,433 @@
+"""Dashes: the pieces of a laser's line that strands light, and the dark gaps between them.
+
+Cutting the lasers' lines into dashes, gaps and spans.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.nets.lit_intervals import LineState, NetSignal
+from aqualvs.nets.spectrum import Crossings
+
+# A dark gap of one search line does not end a dash: compression and specks make such gaps. Nor does
+# one of a few lines between two that are as bright as it gets on this laser's line, where the dash
+# begins fainter: light fades at the edge of a strand; a white, overexposed core is not laser green.
+_BRIDGED, _WHITE, _UNFADED = 1, 3, 0.85
+# A dash is as long as its light stands above this share of its peak, whatever the exposure; above
+# the greater one it is as wide as it gets.
+_LEVEL, _BRIGHT = 0.4, 0.8
+
+
+@kernel
+def cut_lines(
+    state: IntArray,
+    along: FloatArray,
+    step: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    beyond: BoolArray,
+    dash: FloatArray,
+    gap: FloatArray,
+    span: FloatArray,
+    usual: FloatArray,
+) -> tuple[int, int, int]:
+    """Write what the lines are cut into; the numbers of dashes, gaps and spans.
+
+    Parameters
+    ----------
+    state : uint8 array, shape (L, J)
+        `LineState` values.
+    along, step, height, width, beyond : arrays, shape (L, J)
+        As in `NetSignal`.
+    dash : array, shape (N, 6)
+        Rows laser, whole, middle, length, height, width as in `Dashes`; written.
+    gap : array, shape (K, 8)
+        Rows laser, ends, middles, closed, beyond as in `Gaps`; written.
+    span : array, shape (M, 3)
+        Rows laser, ends as in `NetView`; written.
+    usual : array, shape (L, 2)
+        `step` and `beyond` as in `NetView`; written.
+    """
+    n_lasers, n_lines = state.shape
+    n, k, m = 0, 0, 0
+    for i in range(n_lasers):
+        steps = step[i][step[i] > 0.0]
+        usual[i, 0] = np.median(steps) if len(steps) else 0.0
+        n_dark, n_beyond = 0, 0
+        # Gaps and dashes ascend along the line, whichever way the search lines run.
+        back = _descends(along[i])
+        begin = 0
+        while begin < n_lines:
+            end = begin
+            while end < n_lines and state[i, _turned(end, n_lines, back)] != 0:
+                j = _turned(end, n_lines, back)
+                dark = state[i, j] == 1
+                n_dark += dark
+                n_beyond += dark and beyond[i, j]
+                end += 1
+            if end == begin:
+                begin += 1
+                continue
+            span[m, 0] = i
+            span[m, 1], span[m, 2] = _ends(i, begin, end - 1, back, along, step)
+            n, k = _cut_span(
+                i, begin, end, back, state, along, step, height, width, beyond, dash, n, gap, k
+            )
+            m += 1
+            begin = end
+        usual[i, 1] = n_beyond / max(n_dark, 1)
+    return n, k, m
+
+
+@kernel
+def _cut_span(
+    i: int,
+    begin: int,
+    end: int,
+    back: bool,
+    state: IntArray,
+    along: FloatArray,
+    step: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    beyond: BoolArray,
+    dash: FloatArray,
+    n: int,
+    gap: FloatArray,
+    k: int,
+) -> tuple[int, int]:
+    """Append the dashes and gaps of one span; the new counts."""
+    n_lines = state.shape[1]
+    brightest = height[i].max()
+    j, dark_from, before = begin, begin, -1
+    while j < end:
+        if state[i, _turned(j, n_lines, back)] != 2:
+            j += 1
+            continue
+        first, last = j, j
+        bridged = _BRIDGED
+        if height[i, _turned(first, n_lines, back)] < _UNFADED * brightest:
+            bridged = _WHITE
+        while j < end and j - last <= bridged + 1:
+            b = _turned(j, n_lines, back)
+            if state[i, b] == 2:
+                ends = min(height[i, _turned(last, n_lines, back)], height[i, b])
+                if j - last > _BRIDGED + 1 and ends < _UNFADED * brightest:
+                    break
+                last = j
+            j += 1
+        j = last + 1
+        peak, wide, n_bright = 0.0, 0.0, 0
+        for a in range(first, last + 1):
+            peak = max(peak, height[i, _turned(a, n_lines, back)])
+        for a in range(first, last + 1):
+            b = _turned(a, n_lines, back)
+            if height[i, b] >= _BRIGHT * peak:
+                wide += width[i, b]
+                n_bright += 1
+        length = _length_above(i, first, last, back, _LEVEL * peak, step, height)
+        low, high = _ends(i, first, last, back, along, step)
+        dash[n, 0], dash[n, 1] = i, 1.0 if first > begin and last < end - 1 else 0.0
+        dash[n, 2], dash[n, 3] = 0.5 * (low + high), length
+        dash[n, 4], dash[n, 5] = peak, wide / n_bright
+        if first > dark_from:
+            _put_gap(i, dark_from, first - 1, back, along, step, beyond, gap, k, dash, before, n)
+            k += 1
+        dark_from, before = last + 1, n
+        n += 1
+    if end > dark_from:
+        _put_gap(i, dark_from, end - 1, back, along, step, beyond, gap, k, dash, before, -1)
+        k += 1
+    return n, k
+
+
+@kernel
+def _length_above(
+    i: int, first: int, last: int, back: bool, level: float, step: FloatArray, height: FloatArray
+) -> float:
+    """Metres of a run of search lines above a level; heights change evenly, beyond it is dark.
+
+    Bridged lines are as bright as the one before.
+    """
+    n_lines = step.shape[1]
+    length, before = 0.0, 0.0
+    for a in range(first, last + 1):
+        b = _turned(a, n_lines, back)
+        here = height[i, b] if height[i, b] > 0.0 else before
+        after = height[i, _turned(a + 1, n_lines, back)] if a < last else 0.0
+        if after == 0.0 and a < last:
+            after = here
+        if here >= level:
+            length += step[i, b]
+            if before < level:
+                length += step[i, b] * ((here - level) / (here - before) - 0.5)
+            if after < level:
+                length += step[i, b] * ((here - level) / (here - after) - 0.5)
+        before = here
+    return length
+
+
+@kernel
+def _put_gap(
+    i: int,
+    first: int,
+    last: int,
+    back: bool,
+    along: FloatArray,
+    step: FloatArray,
+    beyond: BoolArray,
+    gap: FloatArray,
+    k: int,
+    dash: FloatArray,
+    before: int,
+    behind: int,
+) -> None:
+    """Write gap k between two dashes by their rows; -1 where the span ends."""
+    seen = 0
+    for a in range(first, last + 1):
+        seen += beyond[i, _turned(a, along.shape[1], back)]
+    gap[k, 0] = i
+    gap[k, 1], gap[k, 2] = _ends(i, first, last, back, along, step)
+    gap[k, 3] = dash[before, 2] if before >= 0 else gap[k, 1]
+    gap[k, 4] = dash[behind, 2] if behind >= 0 else gap[k, 2]
+    gap[k, 5], gap[k, 6] = 1.0 if before >= 0 else 0.0, 1.0 if behind >= 0 else 0.0
+    gap[k, 7] = seen / (last - first + 1)
+
+
+@kernel
+def _ends(
+    i: int, first: int, last: int, back: bool, along: FloatArray, step: FloatArray
+) -> tuple[float, float]:
+    """Both ends of a run of search lines on the laser's line, ascending."""
+    a, b = _turned(first, along.shape[1], back), _turned(last, along.shape[1], back)
+    return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
+
+
+@kernel
+def _turned(j: int, n: int, back: bool) -> int:
+    return n - 1 - j if back else j
+
+
+@kernel
+def _descends(along: FloatArray) -> bool:
+    first, last = np.nan, np.nan
+    for value in along:
+        if np.isfinite(value):
+            if not np.isfinite(first):
+                first = value
+            last = value
+    return bool(last < first)
+
+
+# Dark pieces so many times longer than most (this quantile) are holes; a lattice is not looked for
+# there.
+_HOLE, _MOST = 2.5, 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Dashes:
+    """Lit pieces of the lasers' lines in one frame, N of them.
+
+    Attributes
+    ----------
+    laser : int array, shape (N,)
+        Index of the laser.
+    along : array, shape (N,)
+        Middle of the dash on the laser's line, in metres.
+    place : array, shape (N, 2)
+        The same in `net`.
+    length : array, shape (N,)
+        Length along the line within which its light is above a share of its peak, in metres.
+    height, width : array, shape (N,)
+        Peak height (grey levels) and, where it is bright, mean width across the search line (m).
+    whole : bool array, shape (N,)
+        Whether both ends were seen: what is cut off says nothing about length.
+    """
+
+    laser: IntArray
+    along: FloatArray
+    place: FloatArray
+    length: FloatArray
+    height: FloatArray
+    width: FloatArray
+    whole: BoolArray
+
+    def __len__(self) -> int:
+        """Return the number of dashes."""
+        return len(self.laser)
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """Dark pieces of the lasers' lines in one frame, K of them; ends ascend along the line.
+
+    Attributes
+    ----------
+    laser : int array, shape (K,)
+        Index of the laser.
+    ends : array, shape (K, 2)
+        On the laser's line, in metres.
+    middles : array, shape (K, 2)
+        Middles of the dashes at both ends; as `ends` where there is none.
+    closed : bool array, shape (K, 2)
+        Whether a dash is at that end; else the view ends there.
+    beyond : array, shape (K,)
+        Share of its search lines whose light is seen on something behind the net.
+    """
+
+    laser: IntArray
+    ends: FloatArray
+    middles: FloatArray
+    closed: BoolArray
+    beyond: FloatArray
+
+    @property
+    def length(self) -> FloatArray:
+        """Length in metres, shape (K,)."""
+        return np.asarray(self.ends[:, 1] - self.ends[:, 0])
+
+
+@dataclass(frozen=True, slots=True)
+class NetView:
+    """What one frame shows of the net, L lasers, without what single search lines said.
+
+    Attributes
+    ----------
+    index, time_s, range, origin, direction, search, pixel
+        As in the `NetSignal`.
+    step : array, shape (L,)
+        Length of laser line that a search line usually stands for, in metres.
+    beyond : array, shape (L,)
+        Share of each laser's dark search lines whose light is seen on something behind the net.
+    dashes : Dashes
+        Lit pieces.
+    gaps : Gaps
+        Dark pieces.
+    span_laser : int array, shape (M,)
+        Index of the laser of every span: a piece of line that was seen without interruption.
+    span : array, shape (M, 2)
+        Its two ends on the laser's line, ascending, in metres.
+    """
+
+    index: int
+    time_s: float
+    range: float
+    origin: FloatArray
+    direction: FloatArray
+    search: FloatArray
+    pixel: float
+    step: FloatArray
+    beyond: FloatArray
+    dashes: Dashes
+    gaps: Gaps
+    span_laser: IntArray
+    span: FloatArray
+
+    @property
+    def seen_length(self) -> float:
+        """Metres of laser line that could be seen."""
+        return float(np.sum(self.span[:, 1] - self.span[:, 0]))
+
+    def at(self, laser: IntArray, along: FloatArray) -> FloatArray:
+        """Places in `net`, shape (n, 2), of places on lasers' lines, shape (n,) each."""
+        return np.asarray(self.origin[laser] + along[:, None] * self.direction[laser])
+
+
+def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
+    """Cut the lasers' lines into dashes and gaps.
+
+    Parameters
+    ----------
+    signal : NetSignal
+        Of one frame.
+    usable : bool array, shape (L, J), optional
+        Search lines to look at; the others count as hidden.
+    """
+    state = signal.state if usable is None else np.where(usable, signal.state, LineState.HIDDEN)
+    n_lasers, n_lines = state.shape
+    most = n_lasers * n_lines
+    dash, gap, span = np.empty((most, 6)), np.empty((2 * most, 8)), np.empty((most, 3))
+    usual = np.empty((n_lasers, 2))
+    n, k, m = cut_lines(
+        np.ascontiguousarray(state, np.uint8),
+        signal.along,
+        signal.step,
+        signal.height,
+        signal.width,
+        signal.beyond,
+        dash,
+        gap,
+        span,
+        usual,
+    )
+    laser, along = dash[:n, 0].astype(np.int64), dash[:n, 2].copy()
+    return NetView(
+        index=signal.index,
+        time_s=signal.time_s,
+        range=signal.range,
+        origin=signal.origin,
+        direction=signal.direction,
+        search=signal.search,
+        pixel=signal.pixel,
+        step=np.where(usual[:, 0] > 0.0, usual[:, 0], signal.pixel),
+        beyond=usual[:, 1],
+        dashes=Dashes(
+            laser=laser,
+            along=along,
+            place=signal.origin[laser] + along[:, None] * signal.direction[laser],
+            length=dash[:n, 3].copy(),
+            height=dash[:n, 4].copy(),
+            width=dash[:n, 5].copy(),
+            whole=dash[:n, 1] == 1.0,
+        ),
+        gaps=Gaps(
+            laser=gap[:k, 0].astype(np.int64),
+            ends=gap[:k, 1:3].copy(),
+            middles=gap[:k, 3:5].copy(),
+            closed=gap[:k, 5:7] == 1.0,
+            beyond=gap[:k, 7].copy(),
+        ),
+        span_laser=span[:m, 0].astype(np.int64),
+        span=span[:m, 1:].copy(),
+    )
+
+
+def crossings_of(view: NetView) -> Crossings:
+    """Return a frame's crossings to find the lattice: no dash cut off, nothing like a hole."""
+    gaps, dashes = view.gaps, view.dashes
+    inner = gaps.length[gaps.closed.all(axis=1)]
+    longest = _HOLE * float(np.quantile(inner, _MOST)) if len(inner) else np.inf
+    long = gaps.length > longest
+    laser, ends = _without(view.span_laser, view.span, gaps.laser[long], gaps.ends[long])
+    seen = np.zeros(len(view.direction))
+    np.add.at(seen, laser, ends[:, 1] - ends[:, 0])
+    return Crossings(
+        place=dashes.place[dashes.whole],
+        laser=dashes.laser[dashes.whole],
+        begin=view.at(laser, ends[:, 0]),
+        end=view.at(laser, ends[:, 1]),
+        span_laser=laser,
+        direction=view.direction,
+        length=seen,
+        lit=float(np.sum(dashes.length)) / max(float(seen.sum()), 1e-9),
+    )
+
+
+def _without(
+    laser: IntArray, span: FloatArray, gap_laser: IntArray, gap: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Cut gaps out of spans; laser (n,) and ends (n, 2) of what remains."""
+    if not len(gap):
+        return laser, span
+    kept: list[tuple[int, float, float]] = []
+    for i, (first, last) in zip(laser, span, strict=True):
+        at = float(first)
+        for low, high in gap[(gap_laser == i) & (gap[:, 0] >= first) & (gap[:, 1] <= last)]:
+            kept.append((i, at, float(low)))
+            at = float(high)
+        kept.append((i, at, float(last)))
+    table = np.array([one for one in kept if one[2] > one[1]], np.float64).reshape(-1, 3)
+    return table[:, 0].astype(np.int64), table[:, 1:]

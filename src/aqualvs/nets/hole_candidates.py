@@ -1,0 +1,473 @@
+"""Strands that the lattice predicts, one by one: seen, missed, or not to be seen.
+
+Where the lattice lies in a frame is known, and so is where each laser's line crosses each strand.
+What is lit there is a strand seen; what is dark, with light enough to either side, one missed.
+
+Looks at strands that a net should have: what each says for a hole, and what they say together.
+
+A look finds a strand or misses it. How often strands that are there are missed, the dive itself
+tells. Looks of one laser at one small cell of the net are alike and count as one, however many.
+
+Round patches of the net in which strands are missing, by likelihood.
+
+Every place where a strand was looked for speaks for a hole there or against it. The evidence adds
+up over discs of many sizes around many middles; the discs that explain it, each with its
+likelihood, say where a hole is, how large, and how well that is known where its edge was not seen.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.nets.dashes import NetView
+from aqualvs.nets.lattice import NetLattice
+from aqualvs.nets.spectrum import Mesh
+
+# Pieces of strand that are always dark without a hole, as a share; light where the net has a hole
+# (a fish, a loose end); and how much the looks at one cell say at most against a hole.
+_DARK, _FALSE_LIGHT, _MOST_SOUND = 0.03, 0.03, 4.0
+# Of one laser's crossings with one family, so many count as seen beforehand: with few, the share
+# that is missed is not known. The same for a piece of its line.
+# Where this share takes turns, all that is missed there counts; where more is missed than the last
+# share, missing strands tell nothing.
+_BEFORE, _BEFORE_HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.12, 0.3
+# What hides the net for a while, and shows no light of its own, leaves some of the strands to be
+# seen; so many are in a hole, and it must not be less likely than the other by this logarithm.
+_LIT_IN_HOLE, _LEAST_OVER_HIDDEN = 0.05, -3.0
+# A hole that one laser alone tells of must stay so for so many frames: those in which a line sweeps
+# over three bars at the fastest pace at which the net can be followed.
+_ALONE_FRAMES = 8
+
+HERE = 0.1
+"""Length of a piece of a laser's line, in ranges."""
+
+LASERS = 1 << 5
+"""Keys of cells are multiples of this, and of two more for the outcome."""
+
+
+@dataclass(slots=True)
+class Looks:
+    """Looks at cells, each of one laser and one outcome; n of them.
+
+    Attributes
+    ----------
+    keys : int array, shape (n,)
+        Cell, laser, and whether the strands were missed.
+    sums : array, shape (n, 4)
+        Number of looks, sums of their places and of what they say for a hole.
+    frames : int array, shape (n, 2)
+        The first and the last that they are of.
+    """
+
+    keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    sums: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+    frames: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
+
+    def added(self, keys: IntArray, rows: FloatArray, frame: IntArray) -> "Looks":
+        """Return these and more of them."""
+        every, index = np.unique(np.concatenate([self.keys, keys]), return_inverse=True)
+        both = np.concatenate([self.sums, rows])
+        sums = [np.bincount(index, column, minlength=len(every)) for column in both.T]
+        frames = np.tile([np.iinfo(np.int64).max, -1], (len(every), 1))
+        np.minimum.at(frames[:, 0], index, np.concatenate([self.frames[:, 0], frame]))
+        np.maximum.at(frames[:, 1], index, np.concatenate([self.frames[:, 1], frame]))
+        return Looks(every, np.stack(sums, axis=1), frames)
+
+    def kept(self, mask: BoolArray) -> "Looks":
+        """Return some of them."""
+        return Looks(self.keys[mask], self.sums[mask], self.frames[mask])
+
+    @property
+    def places(self) -> FloatArray:
+        """Mean places, shape (n, 2)."""
+        return self.sums[:, 1:3] / self.sums[:, :1]
+
+    @property
+    def missed(self) -> BoolArray:
+        """Which are of missed strands (n,)."""
+        return np.asarray((self.keys & 1) == 1)
+
+    @property
+    def shares(self) -> FloatArray:
+        """Share of each among the looks of its laser at its cell (n,)."""
+        number = self.sums[:, 0]
+        _, index = np.unique(self.keys >> 1, return_inverse=True)
+        return np.asarray(number / np.bincount(index, number)[index])
+
+    def weights(self) -> FloatArray:
+        """Say how much each speaks for a hole (n,): as one look, less where both were seen."""
+        number = self.sums[:, 0]
+        margin = np.maximum(2.0 * self.shares - 1.0, 0.0)
+        mean = self.sums[:, 3] / number
+        says = np.where(self.missed, mean, np.maximum(mean * number, -_MOST_SOUND))
+        return np.asarray(says * margin)
+
+    def stays_dark(self, middle: FloatArray, radius: float) -> bool:
+        """Tell whether a round patch is a hole, not hidden for a while by what shows no light.
+
+        A hole is there for every laser and whenever it is looked at. What drifts or swims by hides
+        strands that are seen before and after, or by another laser from another side.
+        """
+        inside = np.hypot(*(self.places - middle).T) < radius
+        share, missed = self.shares[inside], self.missed[inside]
+        dark, lit = float(share[missed].sum()), float(share[~missed].sum())
+        if dark == 0.0:
+            return False
+        hidden = max(lit / (dark + lit), _LIT_IN_HOLE)
+        over_lit = lit * np.log(_LIT_IN_HOLE / hidden)
+        over = over_lit + dark * np.log((1.0 - _LIT_IN_HOLE) / (1.0 - hidden))
+        if over < _LEAST_OVER_HIDDEN:
+            return False
+        laser = (self.keys[inside] >> 1) % LASERS
+        balance = np.bincount(laser, np.where(missed, share, -share))
+        telling = np.flatnonzero(balance > 0.0)
+        frames = self.frames[inside][missed & np.isin(laser, telling)]
+        span = int(np.ptp(frames)) + 1 if len(frames) else 0
+        return len(telling) > 1 or span >= _ALONE_FRAMES
+
+
+def looks_say(
+    laser: IntArray, family: IntArray, here: FloatArray, missed: BoolArray, run: IntArray
+) -> FloatArray:
+    """Log-likelihood of a hole over sound net, of every crossing (N,).
+
+    Parameters
+    ----------
+    laser, family, missed, run
+        As in `Strands`.
+    here : array, shape (N,)
+        Number of the piece of the laser's line.
+    """
+    share = np.maximum(_missed_share(laser, family, missed, run), _missed_here(laser, here, missed))
+    dark = np.where(share < _TOO_MANY, -np.log(_DARK + share), 0.0)
+    return np.asarray(np.where(missed, dark, np.log(_FALSE_LIGHT / (1.0 - share))))
+
+
+def _missed_share(
+    laser: IntArray, family: IntArray, missed: BoolArray, run: IntArray
+) -> FloatArray:
+    """Share of strands that are missed though they are there, for every crossing (N,).
+
+    Told from single ones, between others that are seen, of the same laser and family.
+    """
+    kind = laser * (int(family.max(initial=0)) + 1) + family
+    seen = np.bincount(kind[~missed], minlength=int(kind.max(initial=0)) + 1)
+    single = np.bincount(kind[missed & (run == 1)], minlength=len(seen))
+    share = (single + _DARK * _BEFORE) / (seen + single + _BEFORE)
+    return np.asarray(share[kind])
+
+
+def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatArray:
+    """Share of strands that are missed on a piece of a laser's line, for every crossing (N,).
+
+    Where light is scarce, seen and missed take turns as the net passes by; where a hole passes by
+    they do so once or twice.
+    """
+    _, kind = np.unique(np.stack([laser, here.astype(np.int64)]), axis=1, return_inverse=True)
+    order = np.argsort(kind, kind="stable")
+    again = kind[order][1:] == kind[order][:-1]
+    turned = again & (missed[order][1:] != missed[order][:-1])
+    n = int(kind.max(initial=0)) + 1
+    pairs = np.bincount(kind[order][1:], again, minlength=n) + _BEFORE_HERE
+    turns = np.bincount(kind[order][1:], turned, minlength=n) + 2.0 * _DARK * _BEFORE_HERE
+    # Of two in random order, 2 p (1 - p) differ.
+    share = 0.5 - np.sqrt(np.maximum(0.25 - 0.5 * turns / pairs, 0.0))
+    every = np.bincount(kind, missed, minlength=n) / np.bincount(kind, minlength=n)
+    return np.asarray(np.where(share > _SCARCE, np.maximum(share, every), share)[kind])
+
+
+RIM = 0.8
+"""Evidence so far beyond a disc's edge, in bars, belongs to it still."""
+
+# Middles and radii that are tried, in bars: step of the middles, how far beyond missing strands
+# they lie, and the radii. With double the step a hole has this score at least.
+_STEP, _BESIDE, _COARSE_SCORE = 0.4, 2.4, 6.0
+_RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
+# Discs up to this radius are single strands that are cut, larger ones holes.
+_SINGLE = 0.8
+# Large holes are rarer than small ones, by this power of the radius.
+_RARER = 2.0
+# A hole's log-likelihood over sound net, and over a single strand that is cut.
+_LEAST_SCORE, _LEAST_LEAD = 12.0, 5.0
+# What the grid and the places of strands leave of a radius, in bars.
+_ROUGH = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """A round patch where strands are missing.
+
+    Attributes
+    ----------
+    middle : array, shape (2,)
+        In metres.
+    radius, sigma : float
+        Mean over all discs that explain what was seen, and standard deviation, in metres.
+    score : float
+        Log-likelihood over sound net.
+    """
+
+    middle: FloatArray
+    radius: float
+    sigma: float
+    score: float
+
+
+def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
+    """Find discs in which strands are missing, the most certain first.
+
+    Parameters
+    ----------
+    place : array, shape (N, 2)
+        Where strands were looked for, in metres.
+    weight : array, shape (N,)
+        Log-likelihood of a hole there over sound net.
+    bar : float
+        Length of the net's bars, in metres.
+    """
+    weight = weight.copy()
+    found: list[Disc] = []
+    while weight[weight > 0.0].sum() >= _LEAST_SCORE:
+        disc = _best(place, weight, bar)
+        if disc is None:
+            break
+        found.append(disc)
+        away = np.hypot(*(place - disc.middle).T)
+        weight[away < disc.radius + RIM * bar] = 0.0
+    return found
+
+
+@kernel
+def local_sums(place: FloatArray, weight: FloatArray, radius: float) -> FloatArray:
+    """Sum of the weights (N,) of places (N, 2) within a radius of each of them, shape (N,)."""
+    total = np.zeros(len(place))
+    for m in range(len(place)):
+        for k in range(len(place)):
+            x, y = place[k, 0] - place[m, 0], place[k, 1] - place[m, 1]
+            if x * x + y * y < radius * radius:
+                total[m] += weight[k]
+    return total
+
+
+def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
+    radii = _RADII * bar
+    rough = _scores(place, weight, _middles(place, weight, 2.0 * _STEP * bar, bar), radii)
+    if rough.max() < _COARSE_SCORE:
+        return None
+    middles = _middles(place, weight, _STEP * bar, bar)
+    score = _scores(place, weight, middles, radii)
+    total = score - _RARER * np.log(_RADII)
+    single = _RADII <= _SINGLE
+    total[:, single] = -np.inf
+    at, size = np.unravel_index(np.argmax(total), total.shape)
+    best = float(score[at, size])
+    if best < _LEAST_SCORE or best - max(float(score[:, single].max()), 0.0) < _LEAST_LEAD:
+        return None
+    # Discs that have the likeliest one's middle in them tell of the same hole.
+    away = np.hypot(*(middles - middles[at]).T)
+    share = np.exp(total - total[at, size]) * (away[:, None] < np.maximum(radii, radii[size]))
+    share /= share.sum()
+    radius = float(share.sum(axis=0) @ radii)
+    spread = float(share.sum(axis=0) @ (radii - radius) ** 2)
+    return Disc(
+        middle=share.sum(axis=1) @ middles,
+        radius=radius,
+        sigma=float(np.sqrt(spread + (_ROUGH * bar) ** 2)),
+        score=best,
+    )
+
+
+def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> FloatArray:
+    """Grid around the places where strands are missing, shape (C, 2)."""
+    missing, beside = place[weight > 0.0], _BESIDE * bar
+    low, high = missing.min(axis=0) - beside, missing.max(axis=0) + beside
+    sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+@kernel
+def _scores(
+    place: FloatArray, weight: FloatArray, middles: FloatArray, radii: FloatArray
+) -> FloatArray:
+    """Sum of the weights within each radius (R,) of each middle (C, 2), shape (C, R)."""
+    score = np.zeros((len(middles), len(radii)))
+    first, step = radii[0], radii[1] - radii[0]
+    for c in range(len(middles)):
+        for k in range(len(place)):
+            x, y = place[k, 0] - middles[c, 0], place[k, 1] - middles[c, 1]
+            away = np.sqrt(x * x + y * y)
+            r = max(int(np.ceil((away - first) / step)), 0)
+            if r < len(radii):
+                score[c, r] += weight[k]
+        for r in range(1, len(radii)):
+            score[c, r] += score[c, r - 1]
+    return score
+
+
+# A strand lies within this share of its pitch of where it is predicted, and at least within so many
+# steps of the search lines.
+_OFF, _OFF_STEPS = 0.2, 1.5
+# Strands that the line crosses at a smaller sine: where, is uncertain.
+_LEAST_ACROSS = 0.3
+# Bars of hexagons: farther from their ends than this share of a bar, there is one, or none.
+_KNOT = 0.2
+# Through a hole as much light is seen on what is behind the net as elsewhere, but for this share.
+_LET_THROUGH = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Strands:
+    """Crossings of one frame that the lattice predicts and that could be seen, N of them.
+
+    Attributes
+    ----------
+    place : array, shape (N, 2)
+        In `net`, in metres.
+    along : array, shape (N,)
+        The same on the laser's line, in metres.
+    laser, family : int array, shape (N,)
+        Laser, and family of the strand.
+    missed : bool array, shape (N,)
+        Whether it is dark there.
+    run : int array, shape (N,)
+        Crossings that are missed in the same dark piece; 0 for those seen.
+    closed : bool array, shape (N,)
+        Whether strands are seen at both ends of that piece; False for those seen.
+    """
+
+    place: FloatArray
+    along: FloatArray
+    laser: IntArray
+    family: IntArray
+    missed: BoolArray
+    run: IntArray
+    closed: BoolArray
+
+
+def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> Strands:
+    """Tell which of the strands that a frame's lines must cross are there.
+
+    Parameters
+    ----------
+    lattice : NetLattice
+        Of the net.
+    view : NetView
+        What the frame shows.
+    place : array, shape (2,)
+        Where the lattice lies in `net` (`Shift.place`), in metres.
+    """
+    gaps = view.gaps
+    # A hole lets light through; what is dark without is hidden by something.
+    open_ = gaps.beyond >= _LET_THROUGH * view.beyond[gaps.laser]
+    turns = np.abs(lattice.waves).sum(axis=0) @ np.ones(2)
+    most = int(np.sum(turns * (view.span[:, 1] - view.span[:, 0]) + len(lattice.waves) + 1.0))
+    row, gap = np.empty((most, 3)), np.empty((most, 3), np.int64)
+    n = _predict(
+        lattice.waves,
+        lattice.basis,
+        lattice.mesh is Mesh.SIX_SIDED,
+        lattice.bar,
+        np.asarray(place, np.float64),
+        view.origin,
+        view.direction,
+        _OFF_STEPS * view.step,
+        view.span_laser,
+        view.span,
+        gaps.laser,
+        gaps.ends,
+        open_,
+        row,
+        gap,
+    )
+    gap = gap[:n]
+    missed = gap[:, 2] >= 0
+    dark = gap[missed, 2]
+    run, closed = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    run[missed] = np.bincount(dark, minlength=len(gaps.laser))[dark]
+    closed[missed] = gaps.closed[dark].all(axis=1)
+    return Strands(row[:n, :2].copy(), row[:n, 2].copy(), gap[:, 0], gap[:, 1], missed, run, closed)
+
+
+@kernel
+def _predict(
+    waves: FloatArray,
+    basis: FloatArray,
+    six_sided: bool,
+    bar: float,
+    place: FloatArray,
+    origin: FloatArray,
+    direction: FloatArray,
+    least_off: FloatArray,
+    span_laser: IntArray,
+    span: FloatArray,
+    gap_laser: IntArray,
+    gap: FloatArray,
+    gap_open: BoolArray,
+    where: FloatArray,
+    row: NDArray[np.int64],
+) -> int:
+    """Write (place, along) and (laser, family, gap or -1) of every crossing told; their number."""
+    n = 0
+    for m in range(len(span)):
+        i = span_laser[m]
+        for f in range(len(waves)):
+            qx, qy = waves[f]
+            rate = qx * direction[i, 0] + qy * direction[i, 1]
+            size = np.sqrt(qx * qx + qy * qy)
+            if not abs(rate) > _LEAST_ACROSS * size:
+                continue
+            start = qx * (origin[i, 0] - place[0]) + qy * (origin[i, 1] - place[1])
+            off = max(_OFF / abs(rate), least_off[i])
+            a, b = start + rate * span[m, 0], start + rate * span[m, 1]
+            for number in range(int(np.ceil(min(a, b))), int(np.floor(max(a, b))) + 1):
+                s = (number - start) / rate
+                x = origin[i, 0] + s * direction[i, 0]
+                y = origin[i, 1] + s * direction[i, 1]
+                if s - off < span[m, 0] or s + off > span[m, 1]:
+                    continue
+                if six_sided and not _on_bar(x - place[0], y - place[1], basis, bar):
+                    continue
+                k = _gap_around(s, off, i, gap_laser, gap)
+                if k >= 0 and not gap_open[k]:
+                    continue
+                where[n, 0], where[n, 1], where[n, 2] = x, y, s
+                row[n, 0], row[n, 1], row[n, 2] = i, f, k
+                n += 1
+    return n
+
+
+@kernel
+def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArray) -> int:
+    """Row of the dark piece that reaches farther than `off` to both sides of s, or -1."""
+    for k in range(len(gap)):
+        if gap_laser[k] == i and gap[k, 0] < s - off and gap[k, 1] > s + off:
+            return k
+    return -1
+
+
+@kernel
+def _on_bar(x: float, y: float, basis: FloatArray, bar: float) -> bool:
+    """Whether a place on a line of bars of hexagons is on a bar, well within.
+
+    A bar is as far from the middles of the two openings beside it, and farther from all others.
+    """
+    det = basis[0, 0] * basis[1, 1] - basis[0, 1] * basis[1, 0]
+    u = np.floor(basis[0, 0] * x + basis[0, 1] * y)
+    v = np.floor(basis[1, 0] * x + basis[1, 1] * y)
+    first, second, third = np.inf, np.inf, np.inf
+    for p in range(-1, 3):
+        for q in range(-1, 3):
+            a, b = u + p, v + q
+            cx = (basis[1, 1] * a - basis[0, 1] * b) / det
+            cy = (basis[0, 0] * b - basis[1, 0] * a) / det
+            d = np.sqrt((x - cx) ** 2 + (y - cy) ** 2)
+            if d < first:
+                first, second, third = d, first, second
+            elif d < second:
+                second, third = d, second
+            elif d < third:
+                third = d
+    return bool(second - first < 0.05 * bar and third - second > _KNOT * bar)

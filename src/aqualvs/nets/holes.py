@@ -1,0 +1,327 @@
+"""Holes: places on the net where strands that the lattice predicts are missing.
+
+Every crossing of a laser's line with a strand that should be there is looked at: seen, or missed.
+Looks from many places are put together on a map that is fixed to the net. However often the same
+piece of strand was looked at from much the same place, it counts once; how often strands that are
+there are missed is told by the dive itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.nets.dashes import NetView
+from aqualvs.nets.hole_candidates import (
+    HERE,
+    LASERS,
+    RIM,
+    Disc,
+    Looks,
+    Strands,
+    find_discs,
+    local_sums,
+    looks_say,
+    predicted_strands,
+)
+from aqualvs.nets.lattice import NetLattice
+from aqualvs.nets.spectrum import Mesh
+
+# Side of the map's cells, in bars: looks of one laser at one cell are alike.
+_CELL = 0.4
+# Where more than this share is missed between strands that are seen, the lattice is not the net's.
+_MOST_MISSED = 0.3
+# Missing strands so near to each other, in bars, and with so much evidence, may be a hole; so far
+# around, strands tell where it ends.
+_NEAR, _LEAST_NEAR, _AROUND = 1.5, 9.0, 6.5
+# Discs no farther apart than this are one hole, in bars.
+_TOUCH = 1.2
+# A frame's foot is kept for every so many bars that the vehicle moves.
+_LOOK = 0.2
+# Cells farther from the vehicle than this are settled, in metres.
+_SETTLED = 2.0
+_ROW = 1 << 24
+# Squares of a side's 24th part measure the area of discs that overlap.
+_SQUARES = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Hole:
+    """A hole in the net.
+
+    Attributes
+    ----------
+    piece : int
+        Piece of track that `place` belongs to (`NetTrack.piece`).
+    place : array, shape (2,)
+        Its middle: right and up of the track's start on the net, in metres.
+    extent : (float, float)
+        Width and height, in metres.
+    diameter : float
+        Of a round hole of the same area, in metres.
+    sigma_diameter : float
+        Its standard deviation.
+    missing_meshes : float
+        Its area in openings of the net.
+    frame, time_s : int, float
+        Of the look nearest to its middle.
+    from_foot : array, shape (2,)
+        Where its middle was then, right and up of the vehicle's foot on the net (of the
+        perpendicular from the dome's centre), in metres.
+    n_looks : int
+        Looks through it.
+    """
+
+    piece: int
+    place: FloatArray
+    extent: tuple[float, float]
+    diameter: float
+    sigma_diameter: float
+    missing_meshes: float
+    frame: int
+    time_s: float
+    from_foot: FloatArray
+    n_looks: int
+
+
+@dataclass(slots=True)
+class HoleMap:
+    """The map of looks, fixed to the net, and the holes in it.
+
+    Attributes
+    ----------
+    holes : list of Hole
+        In the order in which they were found.
+    """
+
+    holes: list[Hole] = field(default_factory=list)
+    _bar: float = 0.0
+    _piece: int = -1
+    _looks: Looks = field(default_factory=Looks)
+    _meshes: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    _waiting: list[tuple[Strands, FloatArray, float, int]] = field(default_factory=list)
+    _feet: dict[tuple[int, int], tuple[int, float, FloatArray]] = field(default_factory=dict)
+    _last: FloatArray | None = None
+    _settled_meshes: int = 0
+    _mesh: float = 0.0
+
+    @property
+    def area(self) -> float:
+        """Area of the meshes that were looked at, in square metres."""
+        return (self._settled_meshes + len(self._meshes)) * self._mesh**2
+
+    def add(
+        self, lattice: NetLattice, view: NetView, knot: FloatArray, place: FloatArray, piece: int
+    ) -> None:
+        """Add a frame's looks.
+
+        Parameters
+        ----------
+        lattice : NetLattice
+            Of the stretch.
+        view : NetView
+            What the frame shows.
+        knot : array, shape (2,)
+            Where the lattice lies in `net` (`Shift.place`), in metres.
+        place : array, shape (2,)
+            Where the origin of `net` lies on the map, in metres.
+        piece : int
+            As `NetTrack.piece`: a new piece starts a new map.
+        """
+        if self._bar == 0.0:
+            self._bar, self._mesh = lattice.bar, float(np.sqrt(opening_area(lattice)))
+        if piece != self._piece:
+            # What the vehicle lost its way in may be a hole.
+            self.update(lattice)
+            self._start_over(piece)
+        self._last = place.copy()
+        strands = predicted_strands(lattice, view, knot)
+        self._waiting.append((strands, place.copy(), HERE * view.range, view.index))
+        column, row = np.floor(place / (_LOOK * self._bar)).astype(int)
+        self._feet.setdefault((int(column), int(row)), (view.index, view.time_s, place.copy()))
+
+    def update(self, lattice: NetLattice) -> None:
+        """Find the holes in what was added so far; earlier finds are corrected."""
+        if not self._waiting:
+            return
+        self._merge()
+        fresh = self._find(lattice)
+        live = [hole for hole in self.holes if hole.piece == self._piece and self._near(hole)]
+        settled = [hole for hole in self.holes if not any(hole is one for one in live)]
+        # A hole that the vehicle comes back to is the same one.
+        self.holes = [one for one in settled if not any(_same(one, hole) for hole in fresh)] + fresh
+        self._settle()
+
+    def _start_over(self, piece: int) -> None:
+        self._settled_meshes += len(self._meshes)
+        self._meshes = np.empty(0, np.int64)
+        self._looks, self._feet = Looks(), {}
+        self._piece, self._last = piece, None
+
+    def _merge(self) -> None:
+        if not self._waiting:
+            return
+        strands = [one for one, _, _, _ in self._waiting]
+        place = np.concatenate([one.place + foot for one, foot, _, _ in self._waiting])
+        here = np.concatenate([np.floor(one.along / part) for one, _, part, _ in self._waiting])
+        frame = np.concatenate([np.full(len(one.laser), k) for one, _, _, k in self._waiting])
+        laser, family, missed, run, closed = (
+            np.concatenate([getattr(one, name) for one in strands])
+            for name in ("laser", "family", "missed", "run", "closed")
+        )
+        self._waiting = []
+        between = float(np.sum(1.0 / run[closed]))
+        if between > _MOST_MISSED * (between + np.count_nonzero(~missed)):
+            return
+        says = looks_say(laser, family, here, missed, run)
+        column, row = np.floor(place / (_CELL * self._bar)).astype(np.int64).T
+        keys = ((column + _ROW * row) * LASERS + laser) * 2 + missed
+        self._looks = self._looks.added(keys, np.c_[np.ones(len(keys)), place, says], frame)
+        column, row = np.floor(place / self._mesh).astype(np.int64).T
+        self._meshes = np.unique(np.concatenate([self._meshes, column + _ROW * row]))
+
+    def _near(self, hole: Hole) -> bool:
+        """Whether a hole lies where the map is still open."""
+        if self._last is None:
+            return False
+        return bool(np.abs(hole.place - self._last).max() < _SETTLED)
+
+    def _find(self, lattice: NetLattice) -> list[Hole]:
+        places, weights = self._looks.places, self._looks.weights()
+        bar = lattice.bar
+        likely = np.flatnonzero(weights > 0.0)
+        near = local_sums(places[likely], weights[likely], _NEAR * bar)
+        likely = likely[near > _LEAST_NEAR]
+        found, left = [], weights.copy()
+        for group in _groups(places[likely], 2.0 * _NEAR * bar):
+            seeds = places[likely[group]]
+            low, high = seeds.min(axis=0) - _AROUND * bar, seeds.max(axis=0) + _AROUND * bar
+            around = np.all((places > low) & (places < high), axis=1)
+            discs = find_discs(places[around], left[around], bar)
+            # Of a hole that another group is in, a part only may lie in these surroundings.
+            discs = [one for one in discs if _holds_any(one, seeds)]
+            for disc in discs:
+                # Another group has this hole in its surroundings as well.
+                left[np.hypot(*(places - disc.middle).T) < disc.radius + RIM * bar] = 0.0
+            discs = [disc for disc in discs if self._looks.stays_dark(disc.middle, disc.radius)]
+            found += [
+                self._hole(lattice, some, places[around], weights[around])
+                for some in _touching(discs, _TOUCH * bar)
+            ]
+        return found
+
+    def _hole(
+        self, lattice: NetLattice, discs: list[Disc], places: FloatArray, weights: FloatArray
+    ) -> Hole:
+        """Put the discs of a hole together."""
+        middle, extent, area = _outline(discs)
+        nearest = min(self._feet.values(), key=lambda foot: float(np.hypot(*(foot[2] - middle))))
+        diameter = float(np.sqrt(4.0 * area / np.pi))
+        radius = np.array([disc.radius for disc in discs])
+        sigma = float(np.hypot.reduce([2.0 * disc.sigma * disc.radius for disc in discs]))
+        inside = np.zeros(len(places), np.bool_)
+        for disc in discs:
+            inside |= np.hypot(*(places - disc.middle).T) < disc.radius
+        return Hole(
+            piece=self._piece,
+            place=middle,
+            extent=extent,
+            diameter=diameter,
+            sigma_diameter=sigma / float(np.hypot.reduce(radius)),
+            missing_meshes=area / opening_area(lattice),
+            frame=nearest[0],
+            time_s=nearest[1],
+            from_foot=middle - nearest[2],
+            n_looks=int(np.count_nonzero(inside & (weights > 0.0))),
+        )
+
+    def _settle(self) -> None:
+        """Forget cells that the vehicle has left behind."""
+        if self._last is None or not len(self._looks.keys):
+            return
+        close = np.abs(self._looks.places - self._last).max(axis=1) < _SETTLED
+        self._looks = self._looks.kept(close)
+        row = np.floor_divide(self._meshes + _ROW // 2, _ROW)
+        at = np.stack([self._meshes - row * _ROW, row], axis=1) * self._mesh
+        close = np.abs(at - self._last).max(axis=1) < _SETTLED
+        self._settled_meshes += int(np.count_nonzero(~close))
+        self._meshes = self._meshes[close]
+        self._feet = {
+            key: one
+            for key, one in self._feet.items()
+            if np.abs(one[2] - self._last).max() < _SETTLED
+        }
+
+
+def opening_area(lattice: NetLattice) -> float:
+    """Area of one opening, from strand to strand, in square metres."""
+    if lattice.mesh is Mesh.SIX_SIDED:
+        return float(1.5 * np.sqrt(3.0) * lattice.bar**2)
+    a, b = lattice.waves
+    return float(1.0 / abs(a[0] * b[1] - a[1] * b[0]))
+
+
+def _groups(places: FloatArray, reach: float) -> list[IntArray]:
+    """Return the indices of groups of places that steps of up to `reach` connect."""
+    left = np.ones(len(places), np.bool_)
+    groups = []
+    while left.any():
+        group = np.flatnonzero(left)[:1]
+        fresh = group
+        left[group] = False
+        while len(fresh):
+            apart = np.hypot(*(places[left][:, None] - places[fresh]).transpose(2, 0, 1))
+            fresh = np.flatnonzero(left)[np.any(apart < reach, axis=1)]
+            left[fresh] = False
+            group = np.r_[group, fresh]
+        groups.append(group)
+    return groups
+
+
+def _holds_any(disc: Disc, places: FloatArray) -> bool:
+    """Whether some of the places (n, 2) are in a disc."""
+    return bool(np.any(np.hypot(*(places - disc.middle).T) < disc.radius))
+
+
+def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
+    """Put discs that touch together."""
+    groups: list[list[Disc]] = []
+    for disc in discs:
+        mine = [
+            group
+            for group in groups
+            if any(
+                np.hypot(*(disc.middle - one.middle)) < disc.radius + one.radius + apart
+                for one in group
+            )
+        ]
+        groups = [group for group in groups if not any(group is one for one in mine)]
+        groups.append([disc, *(one for group in mine for one in group)])
+    return groups
+
+
+def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], float]:
+    """Middle (2,), width and height, and area that discs cover together."""
+    middles, radii = np.array([d.middle for d in discs]), np.array([d.radius for d in discs])
+    low = (middles - radii[:, None]).min(axis=0)
+    high = (middles + radii[:, None]).max(axis=0)
+    size = high - low
+    if len(discs) == 1:
+        return middles[0], (float(size[0]), float(size[1])), float(np.pi * radii[0] ** 2)
+    share = (np.arange(_SQUARES) + 0.5) / _SQUARES
+    at = low + np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * size
+    inside = np.any(np.hypot(*(at[:, None] - middles).transpose(2, 0, 1)) < radii, axis=1)
+    area = float(np.mean(inside) * size[0] * size[1])
+    return at[inside].mean(axis=0), (float(size[0]), float(size[1])), area
+
+
+def _same(one: Hole, other: Hole) -> bool:
+    """Whether two holes on one map overlap by half."""
+    apart = float(np.hypot(*(one.place - other.place)))
+    return one.piece == other.piece and apart < 0.25 * (one.diameter + other.diameter)
+
+
+def merge_holes(holes: Sequence[Hole]) -> list[Hole]:
+    """Return holes in the order in which the vehicle passed them."""
+    return sorted(holes, key=lambda hole: (hole.time_s, hole.frame))

@@ -1,0 +1,567 @@
+"""The lattice of a net: how far apart its strands are and which way they run.
+
+Where the net's lattice lies in every frame, and so how the vehicle moved along the net.
+
+A lattice fixes the place of the net but for whole meshes; which one is taken follows from how the
+vehicle moved before (a Kalman filter with constant velocity). So the move from frame to frame must
+be foreseen to better than half a mesh: say how fast the vehicle goes where another sensor knows it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.nets.dashes import Dashes
+from aqualvs.nets.spectrum import (
+    Crossings,
+    Hypothesis,
+    Mesh,
+    Spectrum,
+    bar_of,
+    hypotheses,
+    refine,
+    score,
+    turned,
+)
+from aqualvs.nets.spectrum_kernels import wave_sums
+
+# Frames that a lattice is fitted to, and among them those in which it is searched for.
+_MOST_FRAMES, _SEARCHED_FRAMES = 30, 12
+# Likely lattices that are refined roughly, and the best of them well, before they are compared.
+_FOLLOWED, _COMPARED = 12, 4
+_FIRST_ROUNDS, _ROUNDS, _LAST_ROUNDS = 2, 5, 7
+# Fewer crossings in a frame say nothing.
+_LEAST_CROSSINGS = 5
+# Lattices with less log-likelihood per frame may as well be chance.
+_LEAST_SCORE = 0.3
+# The best lattice leads by as much before those with another length of bar.
+_LEAST_LEAD, _SAME_BAR = 0.2, 0.06
+# The lattice of the frames before holds on with this share of its score, turned by so many degrees.
+_AS_BEFORE, _TURNS = 0.6, (0.0, -4.0, 4.0)
+# Parts of the frames whose bars are compared, and what the search itself adds, as a share.
+_BLOCKS, _SEARCH_ERROR = 4, 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class NetLattice:
+    """A net's lattice in `net` directions.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Shape of the openings.
+    bar : float
+        Length of a side of an opening (half mesh), in metres.
+    sigma_bar : float
+        Its standard deviation.
+    waves : array, shape (F, 2)
+        Wave vector of every family of strands: normal to the strands, one over their distance.
+    score : float
+        Log-likelihood per frame over crossings at random.
+    density : array, shape (F,)
+        Share of each family's lines that is really there: 1, or 1/3 for the bars of hexagons.
+    """
+
+    mesh: Mesh
+    bar: float
+    sigma_bar: float
+    waves: FloatArray
+    score: float
+    density: FloatArray
+
+    @property
+    def basis(self) -> FloatArray:
+        """Two waves that span the lattice: its longest, shape (2, 2)."""
+        if self.mesh is Mesh.FOUR_SIDED:
+            return self.waves
+        first, second, third = self.waves
+        return np.array([first + third, first + second]) / 3.0
+
+    @property
+    def pitch(self) -> FloatArray:
+        """Distance between neighbouring strands of each family, in metres."""
+        return np.asarray(1.0 / np.linalg.norm(self.waves, axis=1), np.float64)
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit vectors across each family's strands, shape (F, 2)."""
+        return self.waves * self.pitch[:, None]
+
+    @property
+    def strand_angles(self) -> FloatArray:
+        """Direction of each family's strands, counter-clockwise from right, 0 to pi."""
+        return np.mod(np.arctan2(self.waves[:, 1], self.waves[:, 0]) + 0.5 * np.pi, np.pi)
+
+    def crossings_per_metre(self, direction: FloatArray) -> float:
+        """Crossings that a line of unit direction (2,) has with strands."""
+        return float(np.abs(self.waves @ direction) @ self.density)
+
+
+def find_lattice(
+    frames: Sequence[Crossings], before: NetLattice | None = None
+) -> NetLattice | None:
+    """Find the lattice of the net that some frames show, or None where there is none to be seen.
+
+    Parameters
+    ----------
+    frames : sequence of Crossings
+        The net may have moved between them in its plane, but not turned.
+    before : NetLattice, optional
+        What neighbouring frames showed; looked for first.
+    """
+    chosen = _choose(frames)
+    if not chosen:
+        return None
+    spectrum = Spectrum.of(chosen)
+    best = _known(before, spectrum) if before is not None else None
+    if best is None:
+        best = _searched(Spectrum.of(_spread(chosen, _SEARCHED_FRAMES)))
+        best = best and refine(best, spectrum, _LAST_ROUNDS)
+    # What few frames show by chance all of them do not.
+    if best is None or best.score < _LEAST_SCORE:
+        return None
+    return _lattice(best, _sigma(best, chosen))
+
+
+def _searched(spectrum: Spectrum) -> Hypothesis | None:
+    rough = [one.scored(score(spectrum, one)) for one in hypotheses(spectrum)]
+    rough.sort(key=lambda one: -one.score)
+    tried = [refine(one, spectrum, _FIRST_ROUNDS) for one in rough[:_FOLLOWED]]
+    tried.sort(key=lambda one: -one.score)
+    tried[:_COMPARED] = [refine(one, spectrum, _ROUNDS) for one in tried[:_COMPARED]]
+    best = max(tried, key=lambda one: one.score)
+    others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > _SAME_BAR]
+    if best.score < max([_LEAST_SCORE, *(score + _LEAST_LEAD for score in others)]):
+        return None
+    return best
+
+
+def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
+    """Return the lattice seen before, where it explains these frames nearly as well."""
+    enough = max(_LEAST_SCORE, _AS_BEFORE * before.score)
+    for angle in np.deg2rad(_TURNS):
+        found = refine(Hypothesis(before.mesh, before.basis @ turned(angle).T), spectrum, 3)
+        if found.score >= enough:
+            return refine(found, spectrum, 5)
+    return None
+
+
+def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
+    """Return some frames, evenly spread, of those with enough crossings to tell anything."""
+    useful = [one for one in frames if len(one.place) >= _LEAST_CROSSINGS]
+    return _spread(useful, _MOST_FRAMES)
+
+
+def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
+    """Return so many frames at most, evenly spread."""
+    if len(frames) <= most:
+        return list(frames)
+    index = np.linspace(0, len(frames) - 1, most).round().astype(int)
+    return [frames[i] for i in index]
+
+
+def _sigma(best: Hypothesis, frames: Sequence[Crossings]) -> float:
+    """Return the standard deviation of the bar: how far the quarters of the frames differ."""
+    size = bar_of(best)
+    blocks = [b for b in np.array_split(np.arange(len(frames)), _BLOCKS) if len(b)]
+    if len(blocks) < 2:
+        return 0.02 * size
+    bars = []
+    for block in blocks:
+        spectrum = Spectrum.of([frames[i] for i in block])
+        bars.append(bar_of(refine(best, spectrum, 3)))
+    return float(np.hypot(np.std(bars, ddof=1) / np.sqrt(len(bars)), _SEARCH_ERROR * size))
+
+
+def _lattice(best: Hypothesis, sigma_bar: float) -> NetLattice:
+    return NetLattice(
+        mesh=best.mesh,
+        bar=bar_of(best),
+        sigma_bar=sigma_bar,
+        waves=best.families(),
+        score=best.score,
+        density=best.density(),
+    )
+
+
+# Harmonics of each family's wave; the strands' spacing leaves this share of each amplitude.
+_HARMONICS, _REGULAR = 3, 0.92
+# Shifts by up to so many cells to each side are tried, in so many steps: the cell around what is
+# expected, whatever its shape.
+_REACH, _TRIED = 0.75, 18
+# Matched filter: as a share of what perfect crossings would give, and in deviations of random ones.
+_LEAST_SHARE, _LEAST_DEVIATIONS = 0.4, 3.0
+_TRACK_LEAST_CROSSINGS = 4
+# Newton's steps to the best shift, and what holds it where the crossings do not say (1/m²).
+_TRACK_ROUNDS, _STIFF = 4, 100.0
+# Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and the
+# foot of the perpendicular on the net in one frame (m): the posture trembles.
+_VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
+# Velocities at which a piece of track may begin (m/s): greatest, step, standard deviation before
+# and after it was found; and from so many frames at least.
+_FASTEST, _STEP, _USUAL, _FOUND = 0.45, 0.0125, 0.2, 0.04
+_LEAST_FRAMES = 4
+# By a whole mesh in every frame the net may move faster and look the same: the slowest velocity
+# with this share of the best match is taken, and the best one so near to it (m/s).
+_AS_GOOD, _SAME_VELOCITY = 0.9, 0.05
+# How well such a beginning knows the place, in metres.
+_PLACE = 2e-3
+# Where the place is not known to this any more, in metres, a new piece of track begins; after so
+# many seconds the velocity counts for nothing either.
+_LOST, _FORGOTTEN = 0.05, 3.0
+
+START_FRAMES, START_S = 8, 0.5
+"""A track begins with so many frames, within so many seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How a frame's dashes lie on the lattice.
+
+    Attributes
+    ----------
+    family : int array, shape (N,)
+        Family whose strand is nearest to each dash.
+    strand : int array, shape (N,)
+        Number of that strand.
+    off : array, shape (N,)
+        Distance of the dash from it, in metres.
+    clear : array, shape (N,)
+        Distance from the nearest strand of any other family, in metres.
+    """
+
+    family: IntArray
+    strand: IntArray
+    off: FloatArray
+    clear: FloatArray
+
+    @property
+    def n_strands(self) -> int:
+        """Strands that the frame shows."""
+        return len(np.unique(np.stack([self.family, self.strand]), axis=1).T)
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """Where the lattice lies in one frame.
+
+    Attributes
+    ----------
+    place : array, shape (2,)
+        Of a knot (four-sided) or the middle of an opening (six-sided) in `net`, in metres; any
+        other one would serve as well.
+    information : array, shape (2, 2)
+        Inverse of its covariance; may be singular.
+    """
+
+    place: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How some frames, one after another, lie on a lattice.
+
+    Attributes
+    ----------
+    place : array, shape (2,)
+        Where the lattice lies in the first, as `Shift.place`.
+    velocity : array, shape (2,)
+        Of the vehicle along the net, in m/s.
+    """
+
+    place: FloatArray
+    velocity: FloatArray
+
+
+class LatticeFitter:
+    """Lays a lattice onto frames.
+
+    Parameters
+    ----------
+    lattice : NetLattice
+        Of the frames.
+    """
+
+    def __init__(self, lattice: NetLattice) -> None:
+        self.lattice = lattice
+        self._waves, self._amplitude, step = _pattern(lattice)
+        share = np.arange(-_TRIED, _TRIED + 1) * (_REACH / _TRIED)
+        self._away = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) @ step
+        self._swings = np.exp(-2j * np.pi * (self._away @ self._waves.T))
+
+    def shift(
+        self,
+        crossings: Crossings,
+        expected: FloatArray | None = None,
+        precision: FloatArray | None = None,
+    ) -> Shift | None:
+        """Find where the lattice lies in a frame; None where its crossings do not show it.
+
+        Parameters
+        ----------
+        crossings : Crossings
+            Of the frame.
+        expected : array, shape (2,), optional
+            Where the lattice is expected; one shift of many alike is chosen by it.
+        precision : array, shape (2, 2), optional
+            How well that is known: inverse of its covariance.
+        """
+        if len(crossings.place) < _TRACK_LEAST_CROSSINGS:
+            return None
+        expected = np.zeros(2) if expected is None else expected
+        precision = np.zeros((2, 2)) if precision is None else precision
+        sums = self._amplitude * _sums(crossings, self._waves)
+        here = sums * np.exp(-2j * np.pi * (self._waves @ expected))
+        prior = np.sum((self._away @ precision) * self._away, axis=1)
+        score = 2.0 * (self._swings @ here).real - 0.5 * prior
+        place = expected + self._away[np.argmax(score)]
+        for _ in range(_TRACK_ROUNDS):
+            _, slope, information = self._about(sums, place)
+            place = place + np.linalg.solve(information + _STIFF * np.eye(2), slope)
+        match, _, information = self._about(sums, place)
+        full = len(crossings.place) * float(np.sum(self._amplitude**2))
+        if match < max(_LEAST_SHARE * full, _LEAST_DEVIATIONS * np.sqrt(0.5 * full)):
+            return None
+        return Shift(place, information)
+
+    def start(self, crossings: Sequence[Crossings], times_s: FloatArray) -> Start | None:
+        """Find place and velocity that some frames have in common; None where they are too few.
+
+        A single frame may lie askew, and from frame to frame the net may move by nearly half a
+        mesh: together they tell the one from the other.
+
+        Parameters
+        ----------
+        crossings : sequence of Crossings
+            Of the frames; the velocity changes little meanwhile.
+        times_s : array, shape (n,)
+            Their times.
+        """
+        usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK_LEAST_CROSSINGS]
+        if len(usable) < _LEAST_FRAMES:
+            return None
+        size = np.hypot(*self._waves.T)
+        longest = size < 1.2 * size.min()
+        waves, share = self._waves[longest], np.arange(-_FASTEST, _FASTEST + _STEP, _STEP)
+        velocity = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
+        rate = velocity @ waves.T
+        total = np.zeros(rate.shape, np.complex128)
+        for i in usable:
+            sums = self._amplitude[longest] * _sums(crossings[i], waves)
+            total += sums * np.exp(2j * np.pi * rate * (times_s[i] - times_s[0]))
+        speed = np.hypot(*velocity.T)
+        score = 2.0 * np.abs(total).sum(axis=1) - speed**2 / (2.0 * _USUAL**2)
+        slowest = np.argmin(np.where(score >= _AS_GOOD * score.max(), speed, np.inf))
+        near = np.hypot(*(velocity - velocity[slowest]).T) < _SAME_VELOCITY
+        best = int(np.argmax(np.where(near, score, -np.inf)))
+        match = (self._swings[:, longest] @ total[best]).real
+        return Start(self._away[np.argmax(match)], velocity[best])
+
+    def _about(
+        self, sums: NDArray[np.complex128], place: FloatArray
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Match at a shift; slope (2,) and information (2, 2) of the log-likelihood there."""
+        swung = sums * np.exp(-2j * np.pi * (self._waves @ place))
+        slope = 4.0 * np.pi * (swung.imag @ self._waves)
+        bend = np.maximum(swung.real, 0.0)
+        information = 8.0 * np.pi**2 * (self._waves.T * bend) @ self._waves
+        return float(swung.real.sum()), slope, information
+
+    def assign(self, dashes: Dashes, place: FloatArray) -> Fit:
+        """Give each dash to the nearest strand, the lattice lying at a place (2,)."""
+        lattice = self.lattice
+        turns = (dashes.place - place) @ lattice.waves.T
+        distance = np.abs(turns - np.rint(turns)) * lattice.pitch
+        rows = np.arange(len(dashes))
+        family = np.argmin(distance, axis=1)
+        off = distance[rows, family]
+        distance[rows, family] = np.inf
+        return Fit(
+            family=family,
+            strand=np.rint(turns[rows, family]).astype(np.int64),
+            off=off,
+            clear=distance.min(axis=1),
+        )
+
+
+def _sums(crossings: Crossings, waves: FloatArray) -> NDArray[np.complex128]:
+    """Return the sums of waves over crossings, less what evenly spread ones would give."""
+    seen = np.bincount(crossings.laser, minlength=len(crossings.length))
+    per_metre = seen / np.maximum(crossings.length, 1e-9)
+    length = np.hypot(*(crossings.end - crossings.begin).T)
+    real, imaginary = wave_sums(
+        crossings.place,
+        crossings.begin,
+        crossings.end,
+        length * per_metre[crossings.span_laser],
+        waves,
+    )
+    return np.asarray(real + 1j * imaginary)
+
+
+def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Plane waves that a lattice is made of, about a knot or the middle of a six-sided opening.
+
+    Returns
+    -------
+    waves : array, shape (Q, 2)
+        Wave vectors.
+    amplitude : array, shape (Q,)
+        Of one crossing.
+    step : array, shape (2, 2)
+        Rows take the lattice to itself.
+    """
+    basis = lattice.basis
+    step = _inverse(basis).T
+    if lattice.mesh is Mesh.FOUR_SIDED:
+        number = np.arange(1.0, _HARMONICS + 1.0)
+        waves = np.concatenate([number[:, None] * basis[0], number[:, None] * basis[1]])
+        return waves, 0.5 * np.tile(_REGULAR**number, 2), step
+    # The shells of the reciprocal lattice; of a wave and its mirror one.
+    first = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
+    second = np.array([[1.0, 1.0], [2.0, -1.0], [1.0, -2.0]])
+    waves = np.concatenate([first, second, 2.0 * first, 2.0 * second]) @ basis
+    # Bars stand half way between middles, square to the way from one to the other.
+    ways = np.array([step[0], step[1], step[0] + step[1]])
+    bars = np.stack([-ways[:, 1], ways[:, 0]], axis=1) / np.sqrt(3.0)
+    each = np.cos(np.pi * waves @ ways.T) * np.sinc(waves @ bars.T)
+    return waves, _REGULAR * each.mean(axis=1), step
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+def _at_first() -> FloatArray:
+    """Covariance of place and velocity where a piece of track begins."""
+    return np.diag([_FOOT**2, _FOOT**2, _VELOCITY**2, _VELOCITY**2])
+
+
+@dataclass(slots=True)
+class NetTrack:
+    """Keeps count of how far the net has moved past the vehicle.
+
+    Attributes
+    ----------
+    place : array, shape (2,)
+        Where the vehicle's foot on the net is now on the net itself: right and up of where it was
+        at first, in metres.
+    velocity : array, shape (2,)
+        Metres a second.
+    path : float
+        Metres passed in all.
+    piece : int
+        Counts up whenever the track was lost: places of different pieces have nothing in common.
+    """
+
+    path: float = 0.0
+    piece: int = 0
+    _state: FloatArray = field(default_factory=lambda: np.zeros(4))
+    _covariance: FloatArray = field(default_factory=_at_first)
+    _time_s: float = 0.0
+    _origin: FloatArray | None = None
+    _lattice: NetLattice | None = None
+
+    @property
+    def place(self) -> FloatArray:
+        """As above."""
+        return self._state[:2].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """As above."""
+        return self._state[2:].copy()
+
+    def begins(self, time_s: float) -> bool:
+        """Whether nothing is known of place and velocity at a time."""
+        return self._origin is None or time_s - self._time_s > _FORGOTTEN
+
+    def step(
+        self,
+        fitter: LatticeFitter,
+        crossings: Crossings,
+        time_s: float,
+        velocity: FloatArray | None = None,
+        start: Start | None = None,
+    ) -> Shift | None:
+        """Take the next frame; None where it does not tell where the net lies.
+
+        Parameters
+        ----------
+        fitter : LatticeFitter
+            With the stretch's lattice.
+        crossings : Crossings
+            Of the frame.
+        time_s : float
+            Of the frame.
+        velocity : array, shape (2,), optional
+            Of the vehicle along the net, right and up, if another sensor knows it.
+        start : Start, optional
+            What this frame and the next have in common, where the track begins.
+        """
+        state, covariance = self._ahead(time_s, velocity)
+        if self._origin is None or covariance[:2, :2].trace() > _LOST**2:
+            return self._begin(fitter, crossings, time_s, state, start)
+        if self._lattice is not fitter.lattice:
+            shift = fitter.shift(crossings)
+            if shift is not None:
+                # The same net, measured anew: it lies where it is expected.
+                self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
+                self._take(state, covariance, time_s)
+            return shift
+        precision = _inverse(covariance[:2, :2] + _FOOT**2 * np.eye(2))
+        shift = fitter.shift(crossings, self._origin - state[:2], precision)
+        if shift is not None:
+            told = np.zeros((4, 4))
+            told[:2, :2] = shift.information @ _inverse(np.eye(2) + _FOOT**2 * shift.information)
+            covariance = _inverse(_inverse(covariance) + told)
+            miss = np.r_[self._origin - shift.place - state[:2], 0.0, 0.0]
+            self._take(state + covariance @ told @ miss, covariance, time_s)
+        return shift
+
+    def _ahead(self, time_s: float, velocity: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """State and covariance at a later time."""
+        dt = time_s - self._time_s
+        state, covariance = self._state.copy(), self._covariance.copy()
+        if velocity is not None:
+            state[2:] = velocity
+            covariance[2:, :2] = covariance[:2, 2:] = 0.0
+            covariance[2:, 2:] = _TOLD_VELOCITY**2 * np.eye(2)
+        move = np.eye(4)
+        move[:2, 2:] = dt * np.eye(2)
+        noise = np.outer([0.5 * dt**2, dt], [0.5 * dt**2, dt]) * _ACCELERATION**2
+        return move @ state, move @ covariance @ move.T + np.kron(noise, np.eye(2))
+
+    def _begin(
+        self,
+        fitter: LatticeFitter,
+        crossings: Crossings,
+        time_s: float,
+        state: FloatArray,
+        start: Start | None,
+    ) -> Shift | None:
+        """Begin a piece of track, at the state to be expected if the one before is not long ago."""
+        if start is None:
+            shift = fitter.shift(crossings)
+        else:
+            shift = fitter.shift(crossings, start.place, np.eye(2) / _PLACE**2)
+        if shift is None:
+            return None
+        covariance = _at_first()
+        if self.begins(time_s):
+            state = np.r_[self.place, 0.0, 0.0]
+            if start is not None:
+                state[2:] = start.velocity
+                covariance[2:, 2:] = _FOUND**2 * np.eye(2)
+        self.piece += self._origin is not None
+        self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
+        self._take(state, covariance, time_s)
+        return shift
+
+    def _take(self, state: FloatArray, covariance: FloatArray, time_s: float) -> None:
+        self.path += float(np.hypot(*(state - self._state)[:2]))
+        self._state, self._covariance, self._time_s = state, covariance, time_s

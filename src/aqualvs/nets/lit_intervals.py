@@ -1,0 +1,350 @@
+"""What each laser shows of a net in one frame: where its line across it is lit, and where dark.
+
+A laser sheet cuts the target plane in a line. Every search line of the detector looks at one place
+of it, so a frame gives one signal per laser: dark, lit (a strand crosses there), or hidden, where
+nobody could tell.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+from aqualvs.nets.occlusion import LaserLines, hidden_lines, light_beyond
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import Sheet, sheets_of
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Label, Scan
+
+# Light farther off the net's plane than this share of the range is not on the net.
+_OFF_PLANE = 0.05
+# A line across the net is followed this far to each side, in ranges.
+_REACH = 1.3
+_SAMPLES = 129
+# A sheet whose plane is parallel to the net but for this sine has no line on it.
+_LEAST_SLOPE = 1e-3
+# The detector needs dark flanks: next to the border nothing can stand out.
+_BORDER_PX = 16.0
+# Near another laser's line the two stripes disturb each other: so many widths and pixels.
+_CROSSING_WIDTHS, _CROSSING_PX = 1.5, 4.0
+# Directions on the net are told from places that are so far apart in the picture.
+_AHEAD_PX = 30.0
+# Width of a stripe where none was measured, in pixels.
+_USUAL_WIDTH_PX = 5.0
+
+
+class LineState(IntEnum):
+    """What one search line says about the net."""
+
+    HIDDEN = 0
+    """Nothing: outside the picture, in a crossing zone, behind something."""
+    DARK = 1
+    """No strand."""
+    LIT = 2
+    """A strand."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetSignal:
+    """What the lasers show of the net in one frame; L lasers, J search lines (padded).
+
+    Attributes
+    ----------
+    index, time_s
+        As in the `Scan`.
+    range : float
+        Distance of the dome's centre from the net's plane, in metres.
+    origin, direction : array, shape (L, 2)
+        Each laser's line in `net`: the place where `along` is zero and a unit vector. `net` is
+        the target plane, x right and y up, its origin the foot of the perpendicular from the
+        dome's centre. NaN where a laser does not meet the net.
+    search : array, shape (L, 2)
+        Unit vector in `net` along which each laser's search lines run, where most is seen.
+    pixel : float
+        Size of a pixel on the net, in metres.
+    along : float array, shape (L, J)
+        Place on the laser's line in metres, ascending or descending; NaN where a search line
+        does not meet it.
+    step : float array, shape (L, J)
+        Length of laser line that a search line stands for, in metres.
+    state : uint8 array, shape (L, J)
+        `LineState` values.
+    height : array, shape (L, J)
+        Peak of the return above its background in grey levels where lit, else zero.
+    width : array, shape (L, J)
+        Full width at half height of the stripe, in metres on the net, where lit, else zero.
+    beyond : bool array, shape (L, J)
+        Where the light of a search line is seen on something behind the net.
+    """
+
+    index: int
+    time_s: float
+    range: float
+    origin: FloatArray
+    direction: FloatArray
+    search: FloatArray
+    pixel: float
+    along: FloatArray
+    step: FloatArray
+    state: NDArray[np.uint8]
+    height: FloatArray
+    width: FloatArray
+    beyond: BoolArray
+
+
+def net_from_dome(normal_in_dome: FloatArray, distance: float) -> SE3:
+    """Return the transform into `net`: x right and y up in the plane, z towards the vehicle.
+
+    Parameters
+    ----------
+    normal_in_dome : array, shape (3,)
+        Unit normal of the target plane, away from the vehicle.
+    distance : float
+        Of the dome's centre from the plane, in metres.
+    """
+    n = np.asarray(normal_in_dome, np.float64)
+    up = np.array([0.0, 0.0, 1.0]) - n[2] * n
+    up /= np.linalg.norm(up)
+    right = np.cross(n, up)
+    return SE3(np.stack([right, up, -n]), np.array([0.0, 0.0, distance]))
+
+
+class NetReader:
+    """Reads scans as signals along the lasers' lines.
+
+    Parameters
+    ----------
+    rig : Rig
+        Camera and lasers that the scans were made with.
+    camera : Camera, optional
+        In place of `rig.camera()`.
+    """
+
+    def __init__(self, rig: Rig, camera: Camera | None = None) -> None:
+        self.rig = rig
+        self._camera = camera or rig.camera()
+        self._searches = plan_searches(rig, self._camera)
+        self._sheets = sheets_of(rig)
+        self._planes = [sheet.best_plane(self._camera, rig.working_range) for sheet in self._sheets]
+        # Image axis along which each laser's search lines run.
+        self._axis = np.array([0 if s.axis is SearchAxis.ALONG_X else 1 for s in self._searches])
+        self._line_px = np.array([s.line_px for s in self._searches])
+        self.n_lines = max((len(one.lowest) for one in self._searches), default=0)
+        self._lowest, self._highest = self._bands()
+
+    def _bands(self) -> tuple[FloatArray, FloatArray]:
+        """First and last position (L, J) at which a stripe stands out on each search line."""
+        lowest = np.full((len(self._searches), self.n_lines), np.inf)
+        highest = np.full(lowest.shape, -np.inf)
+        for i, search in enumerate(self._searches):
+            axis = 0 if search.axis is SearchAxis.ALONG_X else 1
+            n, last = len(search.lowest), self.rig.size_px[axis] - 1
+            lowest[i, :n] = np.maximum(search.lowest, _BORDER_PX)
+            highest[i, :n] = np.minimum(search.highest, last - _BORDER_PX)
+        return lowest, highest
+
+    def read(self, scan: Scan) -> NetSignal | None:
+        """Return the signal of one frame, or None where its posture was refused."""
+        posture = scan.posture
+        if not posture:
+            return None
+        target = Plane(posture.normal_in_dome, posture.range)
+        net = net_from_dome(target.normal, target.offset)
+        return self._signal(scan, posture, net, self._lines(net))
+
+    def _lines(self, net: SE3) -> LaserLines:
+        """Follow every laser's line across the net's plane."""
+        n, n_lines = len(self._searches), self.n_lines
+        lines = [_line_on(plane, net) for plane in self._planes]
+        origin, direction = np.stack(lines, axis=1) if n else np.empty((2, 0, 2))
+        reach = _REACH * float(np.linalg.norm(net.translation))
+        s = np.linspace(-reach, reach, _SAMPLES)
+        flat = np.zeros((n, _SAMPLES, 3))
+        flat[..., :2] = origin[:, None] + s[:, None] * direction[:, None]
+        dome_from_net = net.inverse()
+        points = dome_from_net.apply(np.nan_to_num(flat))
+        for i, sheet in enumerate(self._sheets):
+            points[i] = _onto_sheet(points[i], sheet, dome_from_net)
+        pixels, valid = self._camera.project(points)
+        found = LaserLines(
+            origin=origin,
+            direction=direction,
+            along=np.full((n, n_lines), np.nan),
+            position=np.full((n, n_lines), np.nan),
+            step=np.zeros((n, n_lines)),
+        )
+        for i in np.flatnonzero(np.isfinite(direction[:, 0])).tolist():
+            search, axis = self._searches[i], int(self._axis[i])
+            _resample(
+                s,
+                (pixels[i, :, 1 - axis] + 0.5) / search.line_px - 0.5,
+                pixels[i, :, axis],
+                valid[i],
+                len(search.lowest),
+                found.along[i],
+                found.position[i],
+                found.step[i],
+            )
+        return found
+
+    def _signal(self, scan: Scan, posture: Posture, net: SE3, lines: LaserLines) -> NetSignal:
+        points, distance = scan.points, posture.range
+        in_net = net.apply(points.points_in_dome)
+        laser = points.laser.astype(np.int64)
+        every = np.arange(len(points))
+        position = points.pixels[every, self._axis[laser]]
+        row = points.pixels[every, 1 - self._axis[laser]]
+        row = np.rint((row + 0.5) / self._line_px[laser] - 0.5).astype(np.int64)
+        off = _OFF_PLANE * distance
+        on_net = (np.abs(in_net[:, 2]) < off) & (points.label == Label.NET)
+        height, width = (np.zeros(lines.along.shape) for _ in range(2))
+        px = np.sqrt(np.sum(points.points_in_dome**2, axis=1)) / self.rig.focal_px
+        folded = (points.label == Label.NET) & ~on_net
+        lit = laser[on_net], row[on_net]
+        np.maximum.at(height, lit, points.intensity[on_net])
+        np.maximum.at(width, lit, (points.width * px)[on_net])
+        # The lasers stand beside the dome, where their sheets pass its centre.
+        sources = net.apply(np.array([one.normal * one.offset for one in self._planes]))
+        eye = net.apply(self.rig.dome_from_cam.translation)
+        hidden = hidden_lines(
+            points, in_net, row, position, self._line_px, eye, sources, lines, off
+        ) | self._near_crossings(lines, width, distance)
+        # Where the net leaves its plane nothing is known of the plane.
+        hidden[laser[folded], row[folded]] = True
+        with np.errstate(invalid="ignore"):
+            seen = (lines.position > self._lowest) & (lines.position < self._highest) & ~hidden
+        state = np.where(seen, np.where(height > 0.0, LineState.LIT, LineState.DARK), 0)
+        return NetSignal(
+            scan.index,
+            scan.time_s,
+            distance,
+            lines.origin,
+            lines.direction,
+            self._search_directions(net, lines, seen),
+            posture.slant_range / self.rig.focal_px,
+            lines.along,
+            lines.step,
+            state.astype(np.uint8),
+            height,
+            width,
+            light_beyond(points, in_net, sources, lines, off),
+        )
+
+    def _search_directions(self, net: SE3, lines: LaserLines, seen: BoolArray) -> FloatArray:
+        """Return unit vectors in `net` along the search lines in the middle of what is seen."""
+        middle = np.tile(0.5 * (np.array(self.rig.size_px) - 1.0), (len(seen), 1))
+        for i, axis in enumerate(self._axis):
+            j = np.flatnonzero(seen[i])
+            if len(j):
+                half_way = j[len(j) // 2]
+                middle[i, axis] = lines.position[i, half_way]
+                middle[i, 1 - axis] = (half_way + 0.5) * self._line_px[i] - 0.5
+        step = _AHEAD_PX * np.eye(2)[self._axis]
+        rays = self._camera.rays(np.stack([middle - step, middle + step]))
+        origins, ahead = net.apply(rays.origins), net.rotate(rays.directions)
+        on_net = origins[..., :2] - origins[..., 2:] / ahead[..., 2:] * ahead[..., :2]
+        along = on_net[1] - on_net[0]
+        directions: FloatArray = along / np.hypot(*along.T)[:, None]
+        return directions
+
+    def _near_crossings(self, lines: LaserLines, width: FloatArray, distance: float) -> BoolArray:
+        """Mark what lies near another laser's line."""
+        px = distance / self.rig.focal_px
+        wide = np.array([_typical(row, _USUAL_WIDTH_PX * px) for row in width])
+        margin = _CROSSING_WIDTHS * np.maximum(wide[:, None], wide) + _CROSSING_PX * px
+        near = np.zeros(lines.along.shape, np.bool_)
+        _mark_crossings(lines.origin, lines.direction, lines.along, margin, near)
+        return near
+
+
+def _line_on(sheet: Plane, net: SE3) -> tuple[FloatArray, FloatArray]:
+    """Return origin and unit direction, shape (2,) each, of a sheet's line on the net; or NaN."""
+    across = net.rotate(sheet.normal)
+    flat = across[:2]
+    size = float(np.hypot(*flat))
+    if size < _LEAST_SLOPE:
+        return np.full(2, np.nan), np.full(2, np.nan)
+    # A point of the net's plane X has n·(R^T (X - t)) = offset.
+    offset = sheet.offset + float(across @ net.translation)
+    normal = flat / size
+    return normal * (offset / size), np.array([normal[1], -normal[0]])
+
+
+def _onto_sheet(points: FloatArray, sheet: Sheet, dome_from_net: SE3) -> FloatArray:
+    """Slide points in the net's plane onto a bent sheet."""
+    if sheet.is_plane:
+        return points
+    normal = dome_from_net.rotation[:, 2]
+    for _ in range(2):
+        gradient = sheet.gradient(points)
+        gradient = gradient - (gradient @ normal)[:, None] * normal
+        share = sheet.signed_distance(points) / np.sum(gradient**2, axis=1)
+        points = points - share[:, None] * gradient
+    return points
+
+
+@kernel
+def _resample(
+    s: FloatArray,
+    line: FloatArray,
+    position: FloatArray,
+    valid: BoolArray,
+    n_lines: int,
+    along: FloatArray,
+    where: FloatArray,
+    step: FloatArray,
+) -> None:
+    """Write place, position and step at whole search lines, from samples along a laser's line.
+
+    Nothing is written where the picture folds the line back.
+    """
+    keep = np.flatnonzero(valid & (line > -n_lines) & (line < 2 * n_lines))
+    if len(keep) < 3:
+        return
+    if line[keep[-1]] < line[keep[0]]:
+        keep = keep[::-1]
+    for k in range(len(keep) - 1):
+        if not line[keep[k + 1]] > line[keep[k]]:
+            return
+    for k in range(len(keep) - 1):
+        a, b = keep[k], keep[k + 1]
+        low, high = max(np.ceil(line[a]), 0.0), min(np.floor(line[b]), n_lines - 1.0)
+        for j in range(int(low), int(high) + 1):
+            share = (j - line[a]) / (line[b] - line[a])
+            along[j] = s[a] + share * (s[b] - s[a])
+            where[j] = position[a] + share * (position[b] - position[a])
+            step[j] = abs((s[b] - s[a]) / (line[b] - line[a]))
+
+
+@kernel
+def _mark_crossings(
+    origin: FloatArray,
+    direction: FloatArray,
+    along: FloatArray,
+    margin: FloatArray,
+    near: BoolArray,
+) -> None:
+    """Mark the places on each laser's line that are nearer to another's than the margin (L, L)."""
+    for i in range(along.shape[0]):
+        for k in range(along.shape[0]):
+            if k == i:
+                continue
+            x, y = -direction[k, 1], direction[k, 0]
+            start = (origin[i, 0] - origin[k, 0]) * x + (origin[i, 1] - origin[k, 1]) * y
+            rate = direction[i, 0] * x + direction[i, 1] * y
+            for j in range(along.shape[1]):
+                # False where one of them does not meet the net.
+                if abs(start + rate * along[i, j]) < margin[i, k]:
+                    near[i, j] = True
+
+
+def _typical(widths: FloatArray, otherwise: float) -> float:
+    lit = widths[widths > 0.0]
+    return float(np.median(lit)) if len(lit) else otherwise

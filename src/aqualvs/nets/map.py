@@ -1,0 +1,301 @@
+"""A picture of the net wall, unrolled: fouling by colour, holes to scale, the vehicle's way.
+
+Drawn without a display; Matplotlib is loaded only when a map is drawn.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.nets.tables import METRES_PER_DEGREE, NetWall, fouling_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+
+
+_DPI = 160
+_WIDTH_IN, _PANEL_IN = 11.0, 9.0
+_ROW_GAP_IN, _AROUND_IN = 0.5, 1.0
+# A net that was passed up or down makes a narrower picture, not one as long as a towel.
+_TALLEST_IN, _NARROWEST_IN = 8.0, 6.5
+# The wall is cut into rows until a row is at least so high for its width, or there are so many.
+_LEAST_RATIO, _MOST_ROWS = 0.13, 8
+_MARGIN = 0.09
+# Runs through all kinds of colour vision alike, from dark blue (clean) to yellow.
+_COLOURS = "cividis"
+_LEAST_SCALE, _SCALE_STEP = 0.1, 0.05
+_GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
+_INK, _SEA = "#1c2a33", "#f4f7f8"
+# A bearing that changes less belongs into the title, in degrees.
+_ONE_BEARING = 4.0
+# The vehicle's way is drawn thinner where there are more stretches.
+_MANY, _THIN, _THICK = 40, 0.6, 1.2
+# Height of the scale of colours on a small map.
+_BAR_IN = 2.4
+# Bearings that are written above a row.
+_BEARINGS = 7
+# Its keys are a type of their own in some versions of Matplotlib.
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.edgecolor": "#8796a0",
+    "axes.linewidth": 0.7,
+    "text.color": _INK,
+    "axes.labelcolor": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    # Equal results give equal files.
+    "svg.hashsalt": "aqualvs",
+}
+
+
+def draw_map(wall: NetWall, paths: Sequence[Path]) -> None:
+    """Draw the map of a net.
+
+    Parameters
+    ----------
+    wall : NetWall
+        What to draw; without a stretch the picture says so.
+    paths : sequence of Path
+        Files to write; the suffix (`.png`, `.svg`, `.pdf`) tells how.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    import matplotlib as mpl
+
+    with mpl.rc_context(_STYLE):
+        figure = _figure(wall)
+        for path in paths:
+            # A date would make equal maps differ.
+            dated = {".svg": "Date", ".pdf": "CreationDate"}.get(path.suffix.lower())
+            figure.savefig(path, dpi=_DPI, metadata={dated: None} if dated else None)
+
+
+def _figure(wall: NetWall) -> "Figure":
+    from matplotlib.figure import Figure
+
+    if not wall.outlines:
+        figure = Figure(figsize=(_WIDTH_IN, 2.0), facecolor="white")
+        figure.text(0.5, 0.5, "no net was seen", ha="center", va="center")
+        return figure
+    low, high = _extent(wall)
+    n_rows = 1 if wall.by_bearing else _rows(high - low)
+    length = (high[0] - low[0]) / n_rows
+    ratio = 0.35 if wall.by_bearing else float((high[1] - low[1]) / length)
+    height = min(_PANEL_IN * ratio, _TALLEST_IN)
+    width = max(height / ratio + _WIDTH_IN - _PANEL_IN, _NARROWEST_IN)
+    size = (width, n_rows * (height + _ROW_GAP_IN) + _AROUND_IN)
+    figure = Figure(figsize=size, facecolor="white", layout="constrained")
+    axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
+    shades = _shades(wall)
+    for row, one in enumerate(axes):
+        _draw(one, wall, shades)
+        one.set_xlim(low[0] + row * length, low[0] + (row + 1) * length)
+        one.set_ylim(low[1], high[1])
+        _label_axes(one, wall, last=row == n_rows - 1)
+        _label_holes(one, wall)
+        _mark_bearings(one, wall, name=row == 0)
+    _scale_bar(axes[0], wall, length)
+    figure.suptitle(_title(wall), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    _legend(figure, wall)
+    if any(fouling_of(one) is not None for one in wall.stretches):
+        share = min(1.0, _BAR_IN / size[1] + 0.25)
+        bar = figure.colorbar(shades, ax=list(axes), shrink=share, pad=0.015)
+        bar.set_label("fouling: solidity\nbeyond the bare twine")
+    return figure
+
+
+def _extent(wall: NetWall) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of all that is drawn, with a margin."""
+    corners = np.concatenate([*wall.outlines, *wall.path])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = _MARGIN * (high - low)
+    if not wall.by_bearing:
+        margin[:] = margin.min()
+    return low - margin, high + margin
+
+
+def _rows(size: FloatArray) -> int:
+    """Return into how many rows a wall is cut, so that the rows are no thin lines."""
+    return min(max(math.ceil(_LEAST_RATIO * float(size[0] / size[1])), 1), _MOST_ROWS)
+
+
+def _shades(wall: NetWall) -> "ScalarMappable":
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    known = [value for value in map(fouling_of, wall.stretches) if value is not None]
+    most = max([*known, _LEAST_SCALE])
+    top = _SCALE_STEP * math.ceil(most / _SCALE_STEP - 1e-9)
+    return ScalarMappable(Normalize(0.0, top), _COLOURS)
+
+
+def _draw(axes: "Axes", wall: NetWall, shades: "ScalarMappable") -> None:
+    from matplotlib.patches import Ellipse, Polygon
+
+    axes.set_facecolor(_SEA)
+    # Where stretches overlap, the one that rests on more frames is seen.
+    pairs = zip(wall.stretches, wall.outlines, strict=True)
+    for stretch, outline in sorted(pairs, key=lambda pair: pair[0].n_frames):
+        fouling = fouling_of(stretch)
+        colour = _GREY if fouling is None else shades.to_rgba(np.array([fouling]))[0]
+        hatch = "////" if fouling is None else None
+        axes.add_patch(
+            Polygon(outline, facecolor=colour, edgecolor="white", linewidth=0.6, hatch=hatch)
+        )
+    width = _THIN if len(wall.stretches) > _MANY else _THICK
+    for line in wall.path:
+        axes.plot(*line.T, color=_INK, linewidth=2.0 * width, alpha=0.55, solid_capstyle="round")
+        axes.plot(*line.T, color=_PATH, linewidth=width, marker="o", markersize=2.0 * width)
+    start = wall.path[0][0]
+    axes.plot(*start, marker=">", color=_PATH, markeredgecolor=_INK, markersize=8)
+    for hole, middle in zip(wall.holes, wall.holes_xy, strict=True):
+        width, height = _drawn_size(wall, hole.extent)
+        axes.add_patch(
+            Ellipse(tuple(middle), width, height, facecolor="white", edgecolor=_HOLE, linewidth=1.8)
+        )
+
+
+def _drawn_size(wall: NetWall, extent: tuple[float, float]) -> tuple[float, float]:
+    """Return width and height of a hole in the units of the axes."""
+    width = extent[0] / METRES_PER_DEGREE if wall.by_bearing else extent[0]
+    return width, extent[1]
+
+
+def _label_axes(axes: "Axes", wall: NetWall, *, last: bool) -> None:
+    if not wall.by_bearing:
+        axes.set_aspect("equal")
+    if wall.by_depth:
+        axes.yaxis.set_major_formatter(lambda value, _: f"{-value:g}")
+    axes.set_ylabel("depth, m" if wall.by_depth else "up from the start, m")
+    if wall.by_bearing:
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value % 360.0:g}°")
+    if last:
+        axes.set_xlabel(
+            "bearing of the net" if wall.by_bearing else "along the net to the right, m"
+        )
+    axes.grid(color="#dfe5e8", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def _label_holes(axes: "Axes", wall: NetWall) -> None:
+    """Write the holes' sizes beside the band that they lie in, by turns above and below it."""
+    begins = np.array([one.begin_s for one in wall.stretches])
+    for i, (hole, middle) in enumerate(zip(wall.holes, wall.holes_xy, strict=True)):
+        sign = 1.0 if i % 2 == 0 else -1.0
+        band = wall.outlines[max(int(np.searchsorted(begins, hole.time_s, side="right")) - 1, 0)]
+        rim = sign * 0.5 * _drawn_size(wall, hole.extent)[1]
+        edge = sign * _to_the_edge(band, middle, sign)
+        axes.annotate(
+            f"{1e3 * hole.diameter:.0f} mm",
+            (middle[0], middle[1] + rim),
+            xytext=(middle[0], middle[1] + (edge if abs(edge) > abs(rim) else rim) + sign * 0.01),
+            ha="center",
+            va="bottom" if sign > 0.0 else "top",
+            fontsize=8.5,
+            fontweight="bold",
+            color=_HOLE,
+            arrowprops={"arrowstyle": "-", "color": _HOLE, "linewidth": 1.0, "shrinkA": 0.0},
+            annotation_clip=True,
+            zorder=5,
+        )
+
+
+def _to_the_edge(band: FloatArray, middle: FloatArray, sign: float) -> float:
+    """Return how far the edge of a band is above (sign 1) or below (-1) a place in it."""
+    begin, end = band, np.roll(band, -1, axis=0)
+    spans = (begin[:, 0] - middle[0]) * (end[:, 0] - middle[0]) < 0.0
+    share = (middle[0] - begin[spans, 0]) / (end[spans, 0] - begin[spans, 0])
+    height = begin[spans, 1] + share * (end[spans, 1] - begin[spans, 1])
+    return float((sign * (height - middle[1])).max(initial=0.0))
+
+
+def _mark_bearings(axes: "Axes", wall: NetWall, *, name: bool) -> None:
+    """Put the net's bearing above the axes, where it grows or falls all along."""
+    places = [one for one in wall.places.middle if one.bearing is not None]
+    if wall.by_bearing or len(places) < 2 or _single_bearing(wall) is not None:
+        return
+    along = np.array([one.along for one in places])
+    bearing = np.rad2deg(np.array([one.bearing for one in places], np.float64))
+    low, high = axes.get_xlim()
+    inside = np.flatnonzero((along >= low) & (along <= high))
+    if np.any(np.diff(along) <= 0.0) or not len(inside):
+        return
+    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _BEARINGS).round().astype(int))]
+    top = axes.secondary_xaxis("top")
+    top.set_xticks(along[chosen], [f"{bearing[i]:.0f}°" for i in chosen])
+    if name:
+        top.set_xlabel("bearing of the net", fontsize=8)
+    top.tick_params(labelsize=8, color="#8796a0")
+
+
+def _single_bearing(wall: NetWall) -> float | None:
+    """Return the bearing of a net that faces one way, in degrees."""
+    known = [one.bearing for one in wall.places.middle if one.bearing is not None]
+    if not known:
+        return None
+    turned = np.rad2deg(np.unwrap(known))
+    return float(np.mean(turned)) % 360.0 if np.ptp(turned) < _ONE_BEARING else None
+
+
+def _scale_bar(axes: "Axes", wall: NetWall, length: float) -> None:
+    if wall.by_bearing:
+        return
+    step = 10.0 ** math.floor(math.log10(length / 5.0))
+    size = max(share * step for share in (1.0, 2.0, 5.0) if share * step <= length / 5.0)
+    words = f"{size:g} m" if size >= 1.0 else f"{1e3 * size:.0f} mm"
+    (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    right, y = high - 0.015 * (high - low), bottom + 0.06 * (top - bottom)
+    axes.plot([right - size, right], [y, y], color=_INK, linewidth=3.0, solid_capstyle="butt")
+    axes.annotate(
+        words,
+        (right - 0.5 * size, y),
+        xytext=(0.0, 3.0),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        bbox={
+            "boxstyle": "round,pad=0.15",
+            "facecolor": "white",
+            "edgecolor": "none",
+            "alpha": 0.8,
+        },
+    )
+
+
+def _title(wall: NetWall) -> str:
+    bearing = _single_bearing(wall)
+    faces = "" if bearing is None else f", facing {bearing:.0f}°"
+    return f"Net wall unrolled{faces}, as seen from the vehicle"
+
+
+def _legend(figure: "Figure", wall: NetWall) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    path = Line2D([], [], color=_INK, marker="o", markersize=3.5, markerfacecolor=_PATH)
+    start = Line2D(
+        [], [], linestyle="", marker=">", color=_PATH, markeredgecolor=_INK, markersize=8
+    )
+    shown: dict[str, Line2D | Patch] = {"vehicle’s way": path, "its start": start}
+    if wall.holes:
+        shown["hole, to scale"] = Line2D(
+            [], [], linestyle="", marker="o", markersize=9, color="white", markeredgecolor=_HOLE
+        )
+    if any(fouling_of(one) is None for one in wall.stretches):
+        shown["not measured"] = Patch(facecolor=_GREY, edgecolor="white", hatch="////")
+    figure.legend(
+        list(shown.values()),
+        list(shown),
+        loc="outside lower left",
+        ncols=len(shown),
+        frameon=False,
+    )

@@ -1,0 +1,536 @@
+"""Where on the net what a dive saw is: the lattice's track and the vehicle's log put together.
+
+The track knows every step along the net, to a fraction of a mesh, as long as it lasts; where it
+breaks, its pieces have nothing in common. The log knows depth and heading all the time, but
+coarsely. So the track gives the places within a piece, and the log puts the pieces where they
+belong: depth pins their height, the bearing of the net their place along a round cage.
+
+What the vehicle's log says of the net that a dive looked at, moment by moment.
+
+The vehicle's log beside a dive: read it, and lay it on the dive's clock.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.nets.condition import NetStretch
+from aqualvs.nets.holes import Hole
+from aqualvs.vehicle_logs import (
+    OffsetRefusal,
+    PostureTrack,
+    TimeOffset,
+    VehicleLog,
+    VehiclePlaces,
+    dive_start_utc,
+    find_time_offset,
+    offset_from_clocks,
+    read_vehicle_log,
+)
+
+# What belongs to a moment is averaged over so many seconds before and after it.
+_MOMENT_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class DivePostures:
+    """Postures to the net over a dive, N of them, all valid.
+
+    Attributes
+    ----------
+    time_s : array, shape (N,)
+        Dive time, increasing.
+    range, pitch, yaw : array, shape (N,)
+        Metres and radians.
+    """
+
+    time_s: FloatArray
+    range: FloatArray
+    pitch: FloatArray
+    yaw: FloatArray
+
+    def track(self) -> PostureTrack:
+        """Return them as the search for a log's time offset takes them."""
+        return PostureTrack(self.time_s, self.yaw, self.pitch, np.isfinite(self.range))
+
+    def normals(self) -> FloatArray:
+        """Return the net's far unit normals in `dome`, shape (N, 3)."""
+        along = np.stack([np.tan(self.yaw), np.ones(len(self.yaw)), np.tan(self.pitch)], axis=-1)
+        normals: FloatArray = along / np.linalg.norm(along, axis=-1, keepdims=True)
+        return normals
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The net at the moments of a dive's postures; NaN where not known.
+
+    Attributes
+    ----------
+    time_s : array, shape (N,)
+        Dive time.
+    foot_depth : array, shape (N,)
+        Depth of the foot of the perpendicular on the net, in metres.
+    net, nose : array, shape (N,)
+        Bearing of the net and heading of the vehicle, in radians.
+    lean : array, shape (N,)
+        Elevation of the net's far normal, in radians; a level vehicle is assumed where the log
+        does not know better.
+    """
+
+    time_s: FloatArray
+    foot_depth: FloatArray
+    net: FloatArray
+    nose: FloatArray
+    lean: FloatArray
+
+    @classmethod
+    def of(cls, postures: DivePostures, vehicle: VehiclePlaces | None) -> "Seen":
+        """Look a dive's postures up in the log."""
+        normals = postures.normals()
+        level = np.arctan2(normals[:, 2], np.hypot(normals[:, 0], normals[:, 1]))
+        if vehicle is None:
+            nothing = np.full(len(postures.time_s), np.nan)
+            return cls(postures.time_s, nothing, nothing, nothing, level)
+        at = vehicle.at(postures.time_s, postures.yaw, postures.pitch)
+        lean = np.where(at.lean_valid, at.lean, level)
+        depth = np.where(at.depth_valid, at.depth, np.nan) - postures.range * np.sin(lean)
+        net = np.where(at.bearing_valid, at.bearing, np.nan)
+        nose = np.where(at.heading_valid, at.heading, np.nan)
+        return cls(postures.time_s, depth, net, nose, lean)
+
+    def upright(self) -> float:
+        """Return plumb metres per metre up in the net's plane."""
+        return float(np.cos(np.median(self.lean))) if len(self.lean) else 1.0
+
+    def depths(self, times: FloatArray) -> FloatArray:
+        """Return the depth of the foot at some times."""
+        return np.array([_mean(self._at(self.foot_depth, t, t)) for t in times])
+
+    def bearings(self, times: FloatArray) -> FloatArray:
+        """Return the bearing of the net at some times, in [0, 2 pi)."""
+        return np.array([_direction(self._at(self.net, t, t)) for t in times])
+
+    def bearing(self, begin_s: float, end_s: float | None = None) -> float | None:
+        """Return the net's mean bearing around a moment, or over a time; None if not known."""
+        return _or_none(_direction(self._at(self.net, begin_s, end_s)))
+
+    def heading(self, begin_s: float, end_s: float | None = None) -> float | None:
+        """Return the vehicle's mean heading around a moment, or over a time; None if not known."""
+        return _or_none(_direction(self._at(self.nose, begin_s, end_s)))
+
+    def _at(self, values: FloatArray, begin_s: float, end_s: float | None) -> FloatArray:
+        """Return what is known between two times, or around the first."""
+        last = begin_s if end_s is None else end_s
+        found = values[
+            slice(*np.searchsorted(self.time_s, (begin_s - _MOMENT_S, last + _MOMENT_S)))
+        ]
+        return np.asarray(found[np.isfinite(found)])
+
+
+def _mean(values: FloatArray) -> float:
+    return float(values.mean()) if len(values) else np.nan
+
+
+def _direction(angles: FloatArray) -> float:
+    """Return the mean of directions in [0, 2 pi); NaN without any."""
+    if not len(angles):
+        return np.nan
+    return float(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())) % (2.0 * np.pi)
+
+
+def _or_none(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+_DIGITS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class LaidLog:
+    """A log and how it lies on the dive's clock.
+
+    Attributes
+    ----------
+    log : VehicleLog
+        As it was read.
+    offset : TimeOffset or OffsetRefusal
+        Log time minus dive time, or why it is not known.
+    overlap : bool
+        Whether the log covers any of the dive.
+    """
+
+    log: VehicleLog
+    offset: TimeOffset | OffsetRefusal
+    overlap: bool
+
+    @property
+    def places(self) -> VehiclePlaces | None:
+        """The log's answers for dive times; None where it cannot be used."""
+        if isinstance(self.offset, OffsetRefusal) or not self.overlap:
+            return None
+        return VehiclePlaces(self.log, self.offset.offset_s)
+
+    def words(self) -> str:
+        """Return how the log lies, in one line."""
+        if isinstance(self.offset, OffsetRefusal):
+            return f"log {self.log.name} is not used: {self.offset.reason} (--log-offset-s)"
+        begins, ends = self.log.span_s
+        offset = f"{self.offset.offset_s:.2f} s"
+        if not self.overlap:
+            return (
+                f"log {self.log.name} is not used: it covers {begins:.1f} to {ends:.1f} s of its "
+                f"own clock, and none of the dive with an offset of {offset}; check --log-offset-s"
+            )
+        sigma = f" ± {self.offset.sigma_s:.2f} s" if self.offset.sigma_s else ""
+        how = self.offset.how
+        return f"log {self.log.name}: its clock minus the dive's is {offset}{sigma} ({how})"
+
+    def facts(self) -> dict[str, Any]:
+        """Return the same for `net.geojson`."""
+        found: dict[str, Any] = {"file": self.log.name, "used": self.places is not None}
+        if isinstance(self.offset, OffsetRefusal):
+            return found | {"refused": self.offset.reason}
+        return found | {
+            "offset_s": round(self.offset.offset_s, _DIGITS),
+            "sigma_offset_s": round(self.offset.sigma_s, _DIGITS),
+            "offset_from": self.offset.how,
+        }
+
+
+def open_log(path: Path | None, offset_s: float | None) -> VehicleLog | None:
+    """Read the log that the user names, if any.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read.
+    OptionError
+        If there is an offset without a log, or the log's format needs an extra.
+    """
+    if path is not None:
+        return read_vehicle_log(path)
+    if offset_s is not None:
+        raise OptionError(f"--log-offset-s {offset_s:g}: there is no log; add --log FILE")
+    return None
+
+
+def lay_log(
+    log: VehicleLog, postures: DivePostures, offset_s: float | None, video: Path | None
+) -> LaidLog:
+    """Lay a log on a dive's clock.
+
+    Parameters
+    ----------
+    log : VehicleLog
+        Of the same dive.
+    postures : DivePostures
+        Of the dive.
+    offset_s : float or None
+        Log time minus dive time, where the user knows it.
+    video : Path or None
+        Whose clock may help.
+
+    Notes
+    -----
+    Without an offset from the user the motion common to both decides; the clocks of video and log
+    help where it leaves a choice, and stand in where it says nothing.
+    """
+    offset = _given(offset_s) or _found(log, postures, video)
+    overlap = False
+    if not isinstance(offset, OffsetRefusal) and len(postures.time_s):
+        state = log.at(postures.time_s + offset.offset_s)
+        overlap = bool((state.depth_valid | state.heading_valid).any())
+    return LaidLog(log, offset, overlap)
+
+
+def _given(offset_s: float | None) -> TimeOffset | None:
+    return None if offset_s is None else TimeOffset(offset_s, 0.0, None, "given by the user")
+
+
+def _found(
+    log: VehicleLog, postures: DivePostures, video: Path | None
+) -> TimeOffset | OffsetRefusal:
+    clocks = offset_from_clocks(log, None if video is None else dive_start_utc(video))
+    start = clocks if isinstance(clocks, TimeOffset) else None
+    motion = find_time_offset(log, postures.track(), start=start)
+    return motion if isinstance(motion, TimeOffset) or start is None else start
+
+
+# Depth is averaged over this time before and after before it pins the track, in seconds: waves and
+# the sensor's noise are over by then, the track has hardly drifted.
+_PIN_S = 15.0
+# A round cage shows in how its bearing grows along the track: by how much it must change (standard
+# deviation), and how well the two must agree (coefficient of correlation).
+_LEAST_TURN, _LEAST_AGREEMENT = np.deg2rad(5.0), 0.9
+# Track and log disagree about the height when they differ by so many metres: waves do not.
+_LEAST_SLIP = 0.5
+
+
+class PlacedBy(StrEnum):
+    """What tells how far along the net something is."""
+
+    TRACK = "track"
+    """The lattice's own track, from the start of the dive on."""
+    BEARING = "bearing"
+    """The track since it was found again; the bearing of the net joins the pieces."""
+    SPEED = "speed"
+    """As before, but the speed before and after joins the pieces, where the track was lost."""
+    NOTHING = "nothing"
+    """There was no track at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetPlace:
+    """A place on the unrolled net; None where not known.
+
+    Attributes
+    ----------
+    along, up : float
+        Metres to the right and, plumb, above the start of the dive's track.
+    depth : float or None
+        Metres below the surface.
+    bearing, heading : float or None
+        Compass direction of the net's far normal, and of the vehicle's nose, in [0, 2 pi).
+    placed_by : PlacedBy
+        What `along` rests on.
+    """
+
+    along: float
+    up: float
+    depth: float | None
+    bearing: float | None
+    heading: float | None
+    placed_by: PlacedBy
+
+
+@dataclass(frozen=True, slots=True)
+class NetPlaces:
+    """Places of all that a dive saw.
+
+    Attributes
+    ----------
+    begin, middle, end : list of NetPlace
+        Of every stretch.
+    holes : list of NetPlace
+        Of the middle of every hole.
+    slip : float
+        Metres up or down that the track claims and the log's depth denies; 0 where they agree, or
+        there is no depth. A track that slipped has counted meshes wrongly: what it says of places
+        along the net and of sizes is wrong as well.
+    """
+
+    begin: list[NetPlace]
+    middle: list[NetPlace]
+    end: list[NetPlace]
+    holes: list[NetPlace]
+    slip: float
+
+
+def place_net(
+    stretches: Sequence[NetStretch],
+    holes: Sequence[Hole],
+    postures: DivePostures,
+    vehicle: VehiclePlaces | None = None,
+) -> NetPlaces:
+    """Place stretches and holes on the unrolled net.
+
+    Parameters
+    ----------
+    stretches, holes : sequence
+        As `NetCondition` gives them, in the order of time.
+    postures : DivePostures
+        Of the same dive.
+    vehicle : VehiclePlaces, optional
+        The vehicle's log, laid on the dive's clock.
+
+    Notes
+    -----
+    The net's depth at the foot of the perpendicular follows from the vehicle's depth and attitude
+    and from the posture; where the log has no attitude the vehicle counts as level. Its mean over
+    15 s before and after pins the track's height, so that neither the log's noise nor the track's
+    drift goes far.
+    """
+    if not stretches:
+        return NetPlaces([], [], [], [], 0.0)
+    seen = Seen.of(postures, vehicle)
+    nodes = _Nodes.of(stretches, seen)
+    ends = [nodes.place(i, seen) for i in range(len(nodes.time_s))]
+    middles = [
+        replace(
+            _middle(ends[i], ends[i + 1]),
+            bearing=seen.bearing(one.begin_s, one.end_s),
+            heading=seen.heading(one.begin_s, one.end_s),
+        )
+        for i, one in enumerate(stretches)
+    ]
+    of_holes = [nodes.place_hole(hole, seen) for hole in holes]
+    return NetPlaces(ends[:-1], middles, ends[1:], of_holes, nodes.slip(seen))
+
+
+def _middle(begin: NetPlace, end: NetPlace) -> NetPlace:
+    depths = [one.depth for one in (begin, end) if one.depth is not None]
+    return NetPlace(
+        along=0.5 * (begin.along + end.along),
+        up=0.5 * (begin.up + end.up),
+        depth=sum(depths) / len(depths) if depths else None,
+        bearing=None,
+        heading=None,
+        placed_by=end.placed_by,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Nodes:
+    """The start of the first stretch and the ends of all; one more than there are stretches.
+
+    Attributes
+    ----------
+    time_s, along, up : array, shape (n,)
+        On the unrolled net, all pieces joined.
+    raw : array, shape (n, 2)
+        Places as the track has them: right, and up in the net's plane.
+    piece, run : int array, shape (n,)
+        Piece of track; and stretch of nodes between which the track tells every step.
+    upright : float
+        Plumb metres per metre up in the net's plane.
+    depth : array, shape (n,)
+        Pinned to the log; NaN where it does not tell.
+    placed_by : list of PlacedBy
+    """
+
+    time_s: FloatArray
+    along: FloatArray
+    up: FloatArray
+    raw: FloatArray
+    piece: IntArray
+    run: IntArray
+    upright: float
+    depth: FloatArray
+    placed_by: list[PlacedBy]
+
+    @classmethod
+    def of(cls, stretches: Sequence[NetStretch], seen: Seen) -> "_Nodes":
+        """Join the pieces of track."""
+        time_s = np.array([stretches[0].begin_s, *(one.end_s for one in stretches)])
+        raw = np.array([stretches[0].begin_place, *(one.place for one in stretches)])
+        piece = np.array([0, *(one.piece for one in stretches)])
+        tracked = _tracked(stretches, raw, piece)
+        run = np.concatenate([[0], np.cumsum(~tracked)])
+        upright = seen.upright()
+        steps = _steps(np.diff(raw, axis=0) * [1.0, upright], np.diff(time_s), tracked)
+        along, up = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]).T
+        placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.SPEED for r in run]
+        if not tracked.any():
+            placed_by = [PlacedBy.NOTHING] * len(run)
+        turned = _along_a_cage(along, run, seen.bearings(time_s))
+        if turned is not None:
+            along = turned
+            placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.BEARING for r in run]
+        depth = _pinned(time_s, up, run, seen.depths(time_s))
+        return cls(time_s, along, up, raw, piece, run, upright, depth, placed_by)
+
+    def slip(self, seen: Seen) -> float:
+        """Return how far track and log part in height, at most, within a run; see `NetPlaces`."""
+        off = seen.depths(self.time_s) + self.up
+        known = np.isfinite(off)
+        spread = [np.ptp(off[known & (self.run == r)]) for r in np.unique(self.run[known])]
+        most = float(max(spread, default=0.0))
+        return most if most > _LEAST_SLIP else 0.0
+
+    def place(self, i: int, seen: Seen) -> NetPlace:
+        """Return the place of a node."""
+        return NetPlace(
+            along=float(self.along[i]),
+            up=float(self.up[i]),
+            depth=_known(self.depth[i]),
+            bearing=seen.bearing(self.time_s[i]),
+            heading=seen.heading(self.time_s[i]),
+            placed_by=self.placed_by[i],
+        )
+
+    def place_hole(self, hole: Hole, seen: Seen) -> NetPlace:
+        """Return the place of a hole: off the node of its piece of track that is nearest in time.
+
+        A piece that was lost before its first stretch ended has no node; then the hole is where
+        it was seen from the vehicle.
+        """
+        bearing, heading = seen.bearing(hole.time_s), seen.heading(hole.time_s)
+        mine = np.flatnonzero(self.piece == hole.piece)
+        if not len(mine):
+            right, up = hole.from_foot * [1.0, self.upright]
+            return NetPlace(
+                along=float(np.interp(hole.time_s, self.time_s, self.along) + right),
+                up=float(np.interp(hole.time_s, self.time_s, self.up) + up),
+                depth=_known(seen.depths(np.array([hole.time_s]))[0] - up),
+                bearing=bearing,
+                heading=heading,
+                placed_by=PlacedBy.SPEED,
+            )
+        i = int(mine[np.argmin(np.abs(self.time_s[mine] - hole.time_s))])
+        right, up = (hole.place - self.raw[i]) * [1.0, self.upright]
+        return NetPlace(
+            along=float(self.along[i] + right),
+            up=float(self.up[i] + up),
+            depth=_known(self.depth[i] - up),
+            bearing=bearing,
+            heading=heading,
+            placed_by=self.placed_by[i],
+        )
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _tracked(stretches: Sequence[NetStretch], raw: FloatArray, piece: IntArray) -> BoolArray:
+    """Return for every stretch whether the track tells how far it went."""
+    moved = np.any(np.diff(raw, axis=0) != 0.0, axis=1)
+    seen = np.array([one.lattice is not None for one in stretches])
+    return np.asarray((np.diff(piece) == 0) & (moved | seen), np.bool_)
+
+
+def _steps(steps: FloatArray, elapsed: FloatArray, tracked: BoolArray) -> FloatArray:
+    """Replace steps (n, 2) that the track does not tell by the speed of those beside them."""
+    found = steps.copy()
+    known = np.flatnonzero(tracked & (elapsed > 0.0))
+    for i in np.flatnonzero(~tracked):
+        beside = [*known[known < i][-1:], *known[known > i][:1]]
+        speeds = [steps[k] / elapsed[k] for k in beside]
+        found[i] = np.mean(speeds, axis=0) * elapsed[i] if speeds else 0.0
+    return found
+
+
+def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> FloatArray | None:
+    """Place the runs by the bearing of a round cage; None where it shows no roundness."""
+    known = np.isfinite(bearing)
+    if not run.any() or np.count_nonzero(known) < 3:
+        return None
+    turn = np.full(len(bearing), np.nan)
+    turn[known] = np.unwrap(bearing[known])
+    within = [known & (run == r) for r in np.unique(run[known])]
+    off_turn = np.concatenate([turn[mine] - turn[mine].mean() for mine in within])
+    off_along = np.concatenate([along[mine] - along[mine].mean() for mine in within])
+    spread = float(np.sqrt(off_turn @ off_turn * (off_along @ off_along)))
+    if np.std(off_turn) < _LEAST_TURN or abs(off_turn @ off_along) < _LEAST_AGREEMENT * spread:
+        return None
+    radius = float(off_turn @ off_along) / float(off_turn @ off_turn)
+    lag = np.array([np.mean((radius * turn - along)[mine]) for mine in within])
+    numbers = np.array([run[mine][0] for mine in within])
+    # A run without bearings goes with its neighbours.
+    return np.asarray(along + np.interp(run, numbers, lag) - np.interp(0, numbers, lag))
+
+
+def _pinned(time_s: FloatArray, up: FloatArray, run: IntArray, depth: FloatArray) -> FloatArray:
+    """Return depths that follow the track from node to node, and the log over longer times."""
+    found = np.full(len(time_s), np.nan)
+    for i in range(len(time_s)):
+        near = (run == run[i]) & (np.abs(time_s - time_s[i]) <= _PIN_S) & np.isfinite(depth)
+        if near.any():
+            found[i] = float(np.mean(depth[near] + up[near])) - up[i]
+    return found

@@ -1,0 +1,529 @@
+"""Power of plane waves in where lasers cross the strands of a net.
+
+Strands of one family are parallel and evenly spaced, so their crossings with the lasers' lines all
+have nearly one phase in a plane wave whose crests are the strands. The power of such waves, summed
+over frames, peaks at the families' wave vectors, wherever the net was in each frame. Uneven cover
+(the lasers' lines themselves) would peak as well; it is taken out by comparing with crossings
+spread evenly over what could be seen. Power spectra of point processes: Bartlett, J. R. Stat. Soc.
+B 25 (1963) 264, doi:10.1111/j.2517-6161.1963.tb00508.x.
+
+Lattices that a net may have, and how likely each is.
+
+Which lattice explains the peaks of a spectrum is decided by likelihood. How many crossings there
+are per metre of line tells a lattice from its multiples and fractions, and that the sides of a mesh
+are equally long tells it from chance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.nets.spectrum_kernels import (
+    HIGHEST,
+    MOST_HARMONICS,
+    REGULAR,
+    SHARE_OF_REST,
+    SHELL_1,
+    comb_power,
+    crest_phases,
+    expected_on,
+    families_gain,
+    free_gains,
+    miscount,
+    off_crests,
+    shell_gain,
+)
+
+LARGEST_PITCH = 0.09
+"""Distance between parallel strands up to which they are looked for, in metres."""
+N_ANGLES = 180
+"""Directions of waves in half a turn."""
+STEP = 0.9
+"""Step of the spectrum, in periods a metre."""
+
+_ALONG: FloatArray = np.arange(-HIGHEST, HIGHEST + STEP, STEP)
+_UPWARD: FloatArray = np.arange(-2.0 * STEP, HIGHEST + STEP, STEP)
+# On the grid evenly spread crossings are so far apart, in metres: their own period is beyond its
+# end. The grid shows where to look, so some of the frames are enough.
+_APART = 7.5e-3
+_MOST_ON_GRID = 12
+
+
+Swings: TypeAlias = NDArray[np.complex64]
+
+
+@dataclass(frozen=True, slots=True)
+class Crossings:
+    """Where one frame's lasers cross strands, and where they would have been seen.
+
+    Attributes
+    ----------
+    place : array, shape (N, 2)
+        Middles of the dashes in `net`, metres.
+    laser : int array, shape (N,)
+        Index of the laser.
+    begin, end : array, shape (M, 2)
+        Ends of the pieces of line that could be seen, in `net`, metres.
+    span_laser : int array, shape (M,)
+        Index of the laser of each of them.
+    direction : array, shape (L, 2)
+        Of the lasers' lines; NaN where there is none.
+    length : array, shape (L,)
+        Metres of line that could be seen.
+    lit : float
+        Share of it that is lit: so many crossings merge with others.
+    """
+
+    place: FloatArray
+    laser: IntArray
+    begin: FloatArray
+    end: FloatArray
+    span_laser: IntArray
+    direction: FloatArray
+    length: FloatArray
+    lit: float
+
+
+class Spectrum:
+    """Power of plane waves in the crossings of some frames; 1 is what random ones have.
+
+    Parameters
+    ----------
+    place, line, start : array, int array, int array
+        Crossings (N, 2), the number of the line that each lies on (N,), counted through all
+        frames, and where each frame's begin (F + 1,).
+    begin, end, span_line, span_start : array, array, int array, int array
+        The same for pieces of line that could be seen.
+    lines : array, shape (n, 3)
+        Direction and seen length of every line; zero where there is none.
+    laser : int array, shape (n,)
+        Its laser.
+    lit : float
+        Share of the lines that is lit.
+
+    Attributes
+    ----------
+    place, line, start, begin, end, span_line, span_start, lines, laser, lit
+        As given.
+    expected : array, shape (M,)
+        Crossings on every piece if those of its line were spread evenly.
+    n_frames, n_crossings : int
+        Frames and all crossings.
+    per_frame : float
+        Crossings in a frame, on average.
+    seen : array, shape (L,)
+        Crossings of each laser.
+    """
+
+    def __init__(
+        self,
+        place: FloatArray,
+        line: IntArray,
+        start: IntArray,
+        begin: FloatArray,
+        end: FloatArray,
+        span_line: IntArray,
+        span_start: IntArray,
+        lines: FloatArray,
+        laser: IntArray,
+        lit: float,
+    ) -> None:
+        self.place, self.line, self.start = place, line, start
+        self.begin, self.end = begin, end
+        self.span_line, self.span_start = span_line, span_start
+        self.lines, self.laser, self.lit = lines, laser, lit
+        self.n_frames = len(start) - 1
+        self.n_crossings = len(place)
+        self.per_frame = self.n_crossings / self.n_frames
+        seen = np.bincount(line, minlength=len(lines))
+        self.expected = expected_on(line, begin, end, span_line, len(lines))
+        self.seen = np.bincount(laser, seen, minlength=laser.max(initial=0) + 1)
+
+    @classmethod
+    def of(cls, frames: Sequence[Crossings]) -> "Spectrum":
+        """Join frames."""
+        n_lasers = len(frames[0].length)
+        return cls(
+            np.concatenate([f.place for f in frames]),
+            np.concatenate([f.laser + i * n_lasers for i, f in enumerate(frames)]),
+            np.cumsum([0, *(len(f.place) for f in frames)]),
+            np.concatenate([f.begin for f in frames]),
+            np.concatenate([f.end for f in frames]),
+            np.concatenate([f.span_laser + i * n_lasers for i, f in enumerate(frames)]),
+            np.cumsum([0, *(len(f.begin) for f in frames)]),
+            np.nan_to_num(np.concatenate([np.c_[f.direction, f.length] for f in frames])),
+            np.tile(np.arange(n_lasers), len(frames)),
+            float(np.mean([f.lit for f in frames])),
+        )
+
+    def without(self, wave: FloatArray) -> "Spectrum":
+        """Return the spectrum of what does not lie on the crests of a wave."""
+        phase = crest_phases(self.place, self.start, wave[0], wave[1])
+        kept, start, begin, end, origin, span_start = off_crests(
+            self.place,
+            self.start,
+            self.begin,
+            self.end,
+            self.span_start,
+            phase,
+            wave[0],
+            wave[1],
+        )
+        return Spectrum(
+            self.place[kept],
+            self.line[kept],
+            start,
+            begin,
+            end,
+            self.span_line[origin],
+            span_start,
+            self.lines,
+            self.laser,
+            self.lit,
+        )
+
+    def _on_grid(self, most: int) -> FloatArray:
+        """Power over the upper half plane, some rows more; the rest of the plane is its mirror."""
+        power = np.zeros((len(_ALONG), len(_UPWARD)), np.float32)
+        count = 0
+        every = max(1, -(-self.n_frames // most))
+        frames = list(zip(pairwise(self.start), pairwise(self.span_start), strict=True))
+        for (first, last), (from_, to) in frames[::every]:
+            even, weight = self._evenly_spread(from_, to)
+            place = np.concatenate([self.place[first:last], even])
+            x = _swings(place[:, 0], _ALONG[0], len(_ALONG))
+            x *= np.r_[np.ones(last - first), -weight].astype(np.float32)[:, None]
+            amplitude = x.T @ _swings(place[:, 1], _UPWARD[0], len(_UPWARD))
+            power += amplitude.real**2 + amplitude.imag**2
+            count += last - first
+        return power.astype(np.float64) / max(count, 1)
+
+    def _evenly_spread(self, first: int, last: int) -> tuple[FloatArray, FloatArray]:
+        """Places spread over some spans, and how many crossings each of them stands for."""
+        begin, end = self.begin[first:last], self.end[first:last]
+        length = np.hypot(*(end - begin).T)
+        pieces = np.maximum(np.ceil(length / _APART), 1.0).astype(np.int64)
+        number = np.repeat(np.arange(len(pieces)), pieces)
+        share = np.arange(len(number)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5
+        share /= pieces[number]
+        place = begin[number] + share[:, None] * (end - begin)[number]
+        return place, (self.expected[first:last] / pieces)[number]
+
+    def at(self, wave: FloatArray, n_harmonics: int = 1) -> FloatArray:
+        """Power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
+        power = np.zeros(n_harmonics)
+        comb_power(
+            self.place,
+            self.start,
+            self.begin,
+            self.end,
+            self.expected,
+            self.span_start,
+            wave[0],
+            wave[1],
+            power,
+        )
+        return power / max(self.n_crossings, 1)
+
+    def polar(self, most: int = _MOST_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Power at sizes (K,) and directions (A,) of waves, the highest nearby, shape (K, A).
+
+        So many frames at most are looked at, evenly spread.
+        """
+        highest: FloatArray = maximum_filter(self._on_grid(most), 3)
+        step = 0.5 * STEP
+        n_sizes = int((HIGHEST - 2.0 * STEP - 0.5 / LARGEST_PITCH) / step)
+        size: FloatArray = 0.5 / LARGEST_PITCH + step * np.arange(n_sizes, dtype=np.float64)
+        angle: FloatArray = np.arange(N_ANGLES, dtype=np.float64) * (np.pi / N_ANGLES)
+        x, y = np.outer(size, np.cos(angle)), np.outer(size, np.sin(angle))
+        i = np.rint((x - _ALONG[0]) / STEP).astype(int)
+        j = np.rint((y - _UPWARD[0]) / STEP).astype(int)
+        return size, angle, highest[i, j]
+
+
+def _swings(place: FloatArray, first: float, n: int) -> Swings:
+    """Waves of frequencies first, first + STEP and so on at places (N,), shape (N, n).
+
+    Each as a product of a coarse and a fine one, of which few are needed.
+    """
+    size = int(np.ceil(np.sqrt(n)))
+    turn = 2j * np.pi * place[:, None]
+    fine = np.exp(turn * (STEP * np.arange(size)))
+    coarse = np.exp(turn * (first + STEP * size * np.arange(size)))
+    both = coarse.astype(np.complex64)[:, :, None] * fine.astype(np.complex64)[:, None, :]
+    return np.asarray(both.reshape(len(place), -1)[:, :n])
+
+
+# Length of bars down to which lattices are looked for, in metres.
+_SHORTEST_BAR = 0.010
+# Waves looked at, and how many of the best that are not neighbours are followed up; for each of
+# them so many second families.
+_TRIED, _KEPT, _SECONDS = 1000, 6, 2
+# These are looked for in so many frames.
+_MOST_OF_REST = 6
+# How far apart in frequency two waves are at least.
+_HYPOTHESES_APART = 2.5
+# Spread of the logarithm of the ratio of the pitches of two families.
+_EVEN = 0.05
+# The strongest waves of a honeycomb look like a diamond whose families lie sixty degrees apart, and
+# few diamonds do so by chance: within this angle they are unlikely by as much.
+_AS_HONEYCOMB, _RARE = np.deg2rad(2.5), 1.0
+# Families that run more nearly alike than this have no mesh between them.
+_LEAST_ANGLE = np.deg2rad(25.0)
+
+
+class Mesh(StrEnum):
+    """Shape of the openings."""
+
+    FOUR_SIDED = "four-sided"
+    """Squares or diamonds: two families of strands."""
+    SIX_SIDED = "six-sided"
+    """Hexagons: three families of short bars."""
+
+
+# Coordinates in which lattices may differ: wave and axis.
+_COORDINATES = {
+    Mesh.FOUR_SIDED: ((0, 0), (0, 1), (1, 0), (1, 1)),
+    Mesh.SIX_SIDED: ((0, 0), (0, 1)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """Two wave vectors that span a lattice; of a honeycomb two of its first shell."""
+
+    mesh: Mesh
+    basis: FloatArray
+    score: float = -np.inf
+
+    def scored(self, score: float) -> "Hypothesis":
+        """Return the same with a score."""
+        return Hypothesis(self.mesh, self.basis, score)
+
+    def families(self) -> FloatArray:
+        """Wave vectors of the strands."""
+        a, b = self.basis
+        if self.mesh is Mesh.FOUR_SIDED:
+            return self.basis
+        return np.array([a + b, 2.0 * b - a, 2.0 * a - b])
+
+    def density(self) -> FloatArray:
+        """Share of each family's lines that is really there."""
+        return np.ones(2) if self.mesh is Mesh.FOUR_SIDED else np.full(3, 1.0 / 3.0)
+
+
+def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
+    """Log-likelihood per frame over random crossings, less what is unlikely beforehand."""
+    families = np.ascontiguousarray(hypothesis.families())
+    gain = families_gain(
+        spectrum.place,
+        spectrum.line,
+        spectrum.start,
+        spectrum.begin,
+        spectrum.end,
+        spectrum.expected,
+        spectrum.span_line,
+        spectrum.span_start,
+        len(spectrum.lines),
+        families,
+    )
+    if hypothesis.mesh is Mesh.SIX_SIDED:
+        basis = np.ascontiguousarray(hypothesis.basis)
+        gain += shell_gain(
+            spectrum.place,
+            spectrum.start,
+            spectrum.begin,
+            spectrum.end,
+            spectrum.expected,
+            spectrum.span_start,
+            basis,
+        )
+    off = miscount(
+        spectrum.lines,
+        spectrum.laser,
+        spectrum.seen,
+        spectrum.lit,
+        spectrum.n_frames,
+        families,
+        float(hypothesis.density()[0]),
+    )
+    return gain - off - _uneven(hypothesis)
+
+
+def _gain(power: FloatArray, mean: float) -> FloatArray:
+    """`gain_of` for many powers."""
+    gain: FloatArray = np.minimum(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean)
+    return gain
+
+
+def _uneven(hypothesis: Hypothesis) -> float:
+    """How unlikely two families are for their pitches and angle: sides are equally long."""
+    if hypothesis.mesh is Mesh.SIX_SIDED:
+        return 0.0
+    first, second = hypothesis.basis
+    a, b = np.hypot(*first), np.hypot(*second)
+    angle = np.arccos(min(abs(first @ second) / (a * b), 1.0))
+    rare = _RARE * np.exp(-0.5 * ((angle - np.pi / 3.0) / _AS_HONEYCOMB) ** 2)
+    return float(0.5 * (np.log(a / b) / _EVEN) ** 2 + rare)
+
+
+def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
+    """Lattices that the power at their peaks speaks for, most of them wrong."""
+    size, angle, power = spectrum.polar()
+    return [
+        *_four_sided(spectrum, size, angle, power),
+        *_six_sided(spectrum, size, angle, power),
+    ]
+
+
+def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: float) -> FloatArray:
+    """Gain (K, A) from a family's harmonics, the family's wave at every size and direction."""
+    gain = np.zeros_like(power)
+    for h in range(1, MOST_HARMONICS + 1):
+        k = np.rint((h * size - size[0]) / (size[1] - size[0])).astype(int)
+        inside = (k < len(size)) & ((h == 1) | (h * size < HIGHEST))
+        gain[inside] += _gain(power[k[inside]], 1.0 + per_frame * (share * REGULAR**h) ** 2)
+    return gain
+
+
+def _four_sided(
+    spectrum: Spectrum, size: FloatArray, angle: FloatArray, power: FloatArray
+) -> list[Hypothesis]:
+    """Pairs of families: likely waves of the stronger one, and the best in what each leaves."""
+    gain = _family_gain(power, size, spectrum.per_frame, 0.5)
+    found = []
+    for k, i in _best_waves(gain, size, angle, _KEPT):
+        a = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
+        rest = spectrum.without(a)
+        if rest.n_crossings == 0:
+            continue
+        left = _family_gain(rest.polar(_MOST_OF_REST)[2], size, rest.per_frame, SHARE_OF_REST)
+        between = np.abs((angle - angle[i] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
+        left = left - 0.5 * (np.log(size / size[k])[:, None] / _EVEN) ** 2
+        left[:, between < _LEAST_ANGLE] = -np.inf
+        for m, j in _best_waves(left, size, angle, _SECONDS):
+            b = size[m] * np.array([np.cos(angle[j]), np.sin(angle[j])])
+            found.append(Hypothesis(Mesh.FOUR_SIDED, np.array([a, b])))
+    return found
+
+
+def _best_waves(
+    gain: FloatArray, size: FloatArray, angle: FloatArray, n: int
+) -> list[tuple[int, int]]:
+    """Rows and columns of the best waves that are not neighbours, best first."""
+    gain = np.where(
+        ((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / _SHORTEST_BAR))[:, None], gain, -np.inf
+    )
+    order = np.argsort(gain, axis=None)[::-1][:_TRIED]
+    found: list[tuple[int, int]] = []
+    waves: list[FloatArray] = []
+    for k, i in zip(*np.unravel_index(order, gain.shape), strict=True):
+        wave = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
+        if all(_distance(wave, other) > _HYPOTHESES_APART for other in waves):
+            found.append((int(k), int(i)))
+            waves.append(wave)
+        if len(found) == n:
+            break
+    return found
+
+
+def _six_sided(
+    spectrum: Spectrum, size: FloatArray, angle: FloatArray, power: FloatArray
+) -> list[Hypothesis]:
+    bars = _family_gain(power, size, spectrum.per_frame, 1.0 / 3.0)
+    shell = _gain(power, 1.0 + spectrum.per_frame * SHELL_1**2)
+    # The first shell's waves are 1 / (1.5 bar) long.
+    rows = np.flatnonzero((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / (1.5 * _SHORTEST_BAR)))
+    double = np.rint((2.0 * size[rows] - size[0]) / (size[1] - size[0])).astype(int)
+    longer = np.rint((np.sqrt(3.0) * size[rows] - size[0]) / (size[1] - size[0])).astype(int)
+    inside = double < len(size)
+    sixth = N_ANGLES // 6
+    total = np.zeros((len(rows), 2 * sixth))
+    for turn in range(3):
+        at = (np.arange(2 * sixth) + 2 * sixth * turn) % N_ANGLES
+        total += shell[rows][:, at]
+        total[inside] += free_gains(power[double[inside]][:, at], spectrum.per_frame)
+        beside = (at + sixth) % N_ANGLES
+        near = longer < len(size)
+        total[near] += bars[longer[near]][:, beside]
+    order = np.argsort(total, axis=None)[::-1][:_TRIED]
+    found = []
+    for k, i in zip(*np.unravel_index(order, total.shape), strict=True):
+        a = size[rows[k]] * np.array([np.cos(angle[i]), np.sin(angle[i])])
+        found.append(Hypothesis(Mesh.SIX_SIDED, np.array([a, turned(np.pi / 3.0) @ a])))
+    return _spread_out(found)
+
+
+def _spread_out(ordered: list[Hypothesis]) -> list[Hypothesis]:
+    """Return the best of each group of neighbours."""
+    kept: list[Hypothesis] = []
+    for one in ordered:
+        if len(kept) == _KEPT:
+            break
+        if all(_apart(one, other) > _HYPOTHESES_APART for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _apart(one: Hypothesis, other: Hypothesis) -> float:
+    """How far the farther of the waves of two lattices of one kind is from its like."""
+    distance = np.array([[_distance(a, b) for b in other.families()] for a in one.families()])
+    return float(distance.min(axis=1).max())
+
+
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    """Distance between two waves; a wave and its opposite are the same."""
+    return float(min(np.hypot(*(a - b)), np.hypot(*(a + b))))
+
+
+def turned(angle: float) -> FloatArray:
+    """Return the matrix (2, 2) that turns counter-clockwise by an angle in radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def refine(start: Hypothesis, spectrum: Spectrum, rounds: int) -> Hypothesis:
+    """Climb to the highest score near a hypothesis: pattern search with shrinking steps.
+
+    In each round every coordinate is tried to either side.
+    """
+    best = start.scored(score(spectrum, start))
+    step = 0.5 * STEP
+    for _ in range(rounds):
+        before = best
+        for wave, axis in _COORDINATES[best.mesh]:
+            for shift in (-step, step):
+                moved = _moved(best, wave, axis, shift)
+                found = score(spectrum, moved)
+                if found > best.score:
+                    best = moved.scored(found)
+                    break
+        if best is before:
+            step *= 0.5
+    return best
+
+
+def _moved(at: Hypothesis, wave: int, axis: int, shift: float) -> Hypothesis:
+    """Return a lattice a step away: with another wave, or a regular honeycomb as a whole."""
+    basis = at.basis.copy()
+    basis[wave, axis] += shift
+    if at.mesh is Mesh.SIX_SIDED:
+        basis[1] = turned(np.pi / 3.0) @ basis[0]
+    return Hypothesis(at.mesh, basis)
+
+
+def bar_of(hypothesis: Hypothesis) -> float:
+    """Length of a side of the openings, in metres."""
+    a, b = hypothesis.basis
+    size_a, size_b = np.hypot(*a), np.hypot(*b)
+    if hypothesis.mesh is Mesh.SIX_SIDED:
+        return float(1.0 / (0.75 * (size_a + size_b)))
+    sine = abs(a[0] * b[1] - a[1] * b[0]) / (size_a * size_b)
+    return float(0.5 * (1.0 / size_a + 1.0 / size_b) / sine)

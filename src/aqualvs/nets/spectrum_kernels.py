@@ -1,0 +1,470 @@
+"""Kernels of `net_spectrum`: sums of plane waves over places and over pieces of line.
+
+A piece of line of length l with ends b and e adds l sinc(q·(e - b)) exp(2 pi i q·(b + e)/2), times
+the crossings per metre that are expected on it.
+
+How much likelier a lattice makes the crossings that were seen: kernels of `net_hypotheses`.
+
+Powers of plane waves (`net_spectrum`) are exponentially distributed about their mean: 1 where
+crossings lie at random, more on the waves that a lattice is made of.
+"""
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import inline_kernel, kernel
+
+# So near to a crest, in periods, a crossing belongs to the wave's family.
+_ON_CREST = 0.12
+_TURN = 2.0 * np.pi
+# Lengths that differ by no more, in metres, and half a span's phase that counts as none.
+_SAME, _SHORT = 1e-10, 1e-6
+
+
+@kernel
+def comb_power(
+    place: FloatArray,
+    start: IntArray,
+    begin: FloatArray,
+    end: FloatArray,
+    expected: FloatArray,
+    span_start: IntArray,
+    qx: float,
+    qy: float,
+    power: FloatArray,
+) -> None:
+    """Add up the power of a wave's harmonics over frames.
+
+    Parameters
+    ----------
+    place, start
+        As `Spectrum`.
+    begin, end, expected, span_start
+        As `Spectrum`, with the crossings expected on each span, shape (M,).
+    qx, qy : float
+        The wave, in periods a metre.
+    power : array, shape (n,)
+        Of n harmonics; added to in place.
+    """
+    n = power.shape[0]
+    real, imaginary, share = np.zeros(n), np.zeros(n), np.zeros(n)
+    for g in range(start.shape[0] - 1):
+        real[:] = 0.0
+        imaginary[:] = 0.0
+        for i in range(start[g], start[g + 1]):
+            angle = _TURN * (qx * place[i, 0] + qy * place[i, 1])
+            c, s = np.cos(angle), np.sin(angle)
+            x, y = 1.0, 0.0
+            for h in range(n):
+                x, y = x * c - y * s, x * s + y * c
+                real[h] += x
+                imaginary[h] += y
+        _add_spans(
+            begin, end, expected, span_start[g], span_start[g + 1], qx, qy, real, imaginary, share
+        )
+        for h in range(n):
+            power[h] += real[h] ** 2 + imaginary[h] ** 2
+
+
+@inline_kernel
+def _add_spans(
+    begin: FloatArray,
+    end: FloatArray,
+    expected: FloatArray,
+    from_: int,
+    to: int,
+    qx: float,
+    qy: float,
+    real: FloatArray,
+    imaginary: FloatArray,
+    share: FloatArray,
+) -> None:
+    """Take what is expected on some spans off the sums of a wave's harmonics.
+
+    Pieces of one line that follow one another evenly turn by the same angle: that saves most of
+    the sines.
+    """
+    n = real.shape[0]
+    c, s, turn_c, turn_s, ch, sh = 1.0, 0.0, 1.0, 0.0, 1.0, 0.0
+    middle_x, middle_y, step_x, step_y, half_x, half_y = 0.0, 0.0, np.inf, 0.0, np.inf, 0.0
+    for i in range(from_, to):
+        x, y = 0.5 * (begin[i, 0] + end[i, 0]), 0.5 * (begin[i, 1] + end[i, 1])
+        u, v = 0.5 * (end[i, 0] - begin[i, 0]), 0.5 * (end[i, 1] - begin[i, 1])
+        if abs(x - middle_x - step_x) + abs(y - middle_y - step_y) < _SAME:
+            c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
+        else:
+            angle = _TURN * (qx * x + qy * y)
+            before_c, before_s = c, s
+            c, s = np.cos(angle), np.sin(angle)
+            turn_c, turn_s = c * before_c + s * before_s, s * before_c - c * before_s
+            step_x, step_y = x - middle_x, y - middle_y
+        middle_x, middle_y = x, y
+        if abs(u - half_x) + abs(v - half_y) > _SAME:
+            half_x, half_y = u, v
+            half = _TURN * (qx * u + qy * v)
+            ch, sh = np.cos(half), np.sin(half)
+            xh, yh = 1.0, 0.0
+            for h in range(n):
+                xh, yh = xh * ch - yh * sh, xh * sh + yh * ch
+                share[h] = yh / ((h + 1) * half) if abs(half) > _SHORT else 1.0
+        a, b = 1.0, 0.0
+        for h in range(n):
+            a, b = a * c - b * s, a * s + b * c
+            real[h] -= expected[i] * share[h] * a
+            imaginary[h] -= expected[i] * share[h] * b
+
+
+@kernel
+def crest_phases(place: FloatArray, start: IntArray, qx: float, qy: float) -> FloatArray:
+    """Where each frame's crossings have their crests in a wave, in periods, shape (F,)."""
+    phase = np.zeros(start.shape[0] - 1)
+    for g in range(len(phase)):
+        real, imaginary = 0.0, 0.0
+        for i in range(start[g], start[g + 1]):
+            angle = _TURN * (qx * place[i, 0] + qy * place[i, 1])
+            real += np.cos(angle)
+            imaginary += np.sin(angle)
+        phase[g] = np.arctan2(imaginary, real) / _TURN
+    return phase
+
+
+@inline_kernel
+def _off(turns: float) -> float:
+    """Distance from the nearest whole number."""
+    return float(abs(turns - np.rint(turns)))
+
+
+@kernel
+def off_crests(
+    place: FloatArray,
+    start: IntArray,
+    begin: FloatArray,
+    end: FloatArray,
+    span_start: IntArray,
+    phase: FloatArray,
+    qx: float,
+    qy: float,
+) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, IntArray, IntArray]:
+    """Leave out what lies on the crests of a wave.
+
+    Parameters
+    ----------
+    place, start, begin, end, span_start
+        As `Spectrum`.
+    phase : array, shape (F,)
+        Of the crests in each frame.
+    qx, qy : float
+        The wave.
+
+    Returns
+    -------
+    kept : bool array, shape (N,)
+        Crossings between crests.
+    start : int array, shape (F + 1,)
+        Where each frame's begin among those.
+    begin, end : array, shape (m, 2)
+        Pieces of spans between crests.
+    origin : int array, shape (m,)
+        Spans that they are pieces of.
+    span_start : int array, shape (F + 1,)
+        Where each frame's pieces begin.
+    """
+    n_frames = start.shape[0] - 1
+    kept = np.zeros(place.shape[0], np.bool_)
+    new_start, new_span_start = np.zeros_like(start), np.zeros_like(span_start)
+    most = 0
+    for i in range(begin.shape[0]):
+        turns = qx * (end[i, 0] - begin[i, 0]) + qy * (end[i, 1] - begin[i, 1])
+        most += int(abs(turns)) + 3
+    low, high = np.empty((most, 2)), np.empty((most, 2))
+    origin = np.empty(most, np.int64)
+    n, m = 0, 0
+    for g in range(n_frames):
+        for i in range(start[g], start[g + 1]):
+            kept[i] = _off(qx * place[i, 0] + qy * place[i, 1] - phase[g]) > _ON_CREST
+            n += kept[i]
+        new_start[g + 1] = n
+        for i in range(span_start[g], span_start[g + 1]):
+            a = qx * begin[i, 0] + qy * begin[i, 1] - phase[g]
+            b = qx * end[i, 0] + qy * end[i, 1] - phase[g]
+            m = _between(i, a, b, begin, end, low, high, origin, m)
+        new_span_start[g + 1] = m
+    return kept, new_start, low[:m].copy(), high[:m].copy(), origin[:m].copy(), new_span_start
+
+
+@kernel
+def _between(
+    i: int,
+    a: float,
+    b: float,
+    begin: FloatArray,
+    end: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    origin: IntArray,
+    m: int,
+) -> int:
+    """Append the pieces of span i, whose phase runs from a to b, between crests."""
+    if abs(b - a) < 1e-9:
+        if _off(a) > _ON_CREST:
+            low[m], high[m], origin[m] = begin[i], end[i], i
+            m += 1
+        return m
+    least, greatest = min(a, b), max(a, b)
+    crest = np.floor(least)
+    while crest < greatest:
+        first, last = max(crest + _ON_CREST, least), min(crest + 1.0 - _ON_CREST, greatest)
+        if last > first:
+            s, t = (first - a) / (b - a), (last - a) / (b - a)
+            for k in range(2):
+                low[m, k] = begin[i, k] + s * (end[i, k] - begin[i, k])
+                high[m, k] = begin[i, k] + t * (end[i, k] - begin[i, k])
+            origin[m] = i
+            m += 1
+        crest += 1.0
+    return m
+
+
+@kernel
+def expected_on(
+    line: IntArray, begin: FloatArray, end: FloatArray, span_line: IntArray, n_lines: int
+) -> FloatArray:
+    """Crossings (M,) on every span if those of its line were spread evenly over what is seen."""
+    length, total, seen = np.empty(len(span_line)), np.zeros(n_lines), np.zeros(n_lines)
+    for i in range(len(span_line)):
+        length[i] = np.hypot(end[i, 0] - begin[i, 0], end[i, 1] - begin[i, 1])
+        total[span_line[i]] += length[i]
+    for one in line:
+        seen[one] += 1.0
+    for i in range(len(span_line)):
+        length[i] *= seen[span_line[i]] / max(total[span_line[i]], 1e-9)
+    return length
+
+
+@kernel
+def wave_sums(
+    place: FloatArray, begin: FloatArray, end: FloatArray, expected: FloatArray, waves: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the sums of waves over places, less what is expected over spans.
+
+    Parameters
+    ----------
+    place : array, shape (N, 2)
+        Crossings of one frame.
+    begin, end : array, shape (M, 2)
+        Of pieces of line that could be seen.
+    expected : array, shape (M,)
+        Crossings expected on each.
+    waves : array, shape (Q, 2)
+        Wave vectors.
+
+    Returns
+    -------
+    real, imaginary : array, shape (Q,)
+    """
+    real, imaginary = np.zeros(len(waves)), np.zeros(len(waves))
+    for k in range(len(waves)):
+        qx, qy = waves[k]
+        for i in range(len(place)):
+            angle = _TURN * (qx * place[i, 0] + qy * place[i, 1])
+            real[k] += np.cos(angle)
+            imaginary[k] += np.sin(angle)
+        for i in range(len(begin)):
+            first = _TURN * (qx * begin[i, 0] + qy * begin[i, 1])
+            last = _TURN * (qx * end[i, 0] + qy * end[i, 1])
+            middle, half = 0.5 * (first + last), 0.5 * (last - first)
+            share = np.sin(half) / half if abs(half) > 1e-6 else 1.0
+            real[k] -= expected[i] * share * np.cos(middle)
+            imaginary[k] -= expected[i] * share * np.sin(middle)
+    return real, imaginary
+
+
+HIGHEST = 125.0
+"""Waves are looked at up to so many periods a metre."""
+MOST_HARMONICS, REGULAR = 6, 0.92
+"""Harmonics of a family's wave that are looked at; each is this much weaker than the one before."""
+SHELL_1 = 0.37
+"""Amplitude of the waves in the first shell of a honeycomb's reciprocal lattice."""
+SHARE_OF_REST = 0.8
+"""Of what the crossings on a family's crests leave, the other family has this share."""
+# No crossings left at all is worth this much.
+_NOTHING_LEFT = 5.0
+# The double of a first shell's wave may be strong or weak, as the lines cut the net: worth its
+# likelihood, less this. Where a frame has few crossings, about as many as this, strong ones are not
+# to be expected: less is due.
+_FREEDOM, _FEW_CROSSINGS = 0.7, 15.0
+# Crossings seen over crossings that a lattice must have, less those that merge: spread of its
+# logarithm among lasers, variance of a frame's count of one, and spread of the mean towards fewer
+# (missing strands) and towards more.
+_SEEN_SPREAD, _COUNT_NOISE, _FEW_SEEN, _MANY_SEEN = 0.2, 0.3, 0.2, 0.12
+
+
+@inline_kernel
+def gain_of(power: float, mean: float) -> float:
+    """Log-likelihood of a power over random crossings, where a peak of a given mean should be.
+
+    A peak much higher than the model's proves no more than one twice as high.
+    """
+    return float(min(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean))
+
+
+@inline_kernel
+def free_gain_of(power: float, per_frame: float) -> float:
+    """Return the same where the mean is not known; freedom has its price."""
+    mean = max(power, 1.0)
+    price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
+    return float(mean - 1.0 - np.log(mean) - price)
+
+
+def free_gains(power: FloatArray, per_frame: float) -> FloatArray:
+    """`free_gain_of` for many powers."""
+    mean = np.maximum(power, 1.0)
+    price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
+    gain: FloatArray = mean - 1.0 - np.log(mean) - price
+    return gain
+
+
+@kernel
+def shell_gain(
+    place: FloatArray,
+    start: IntArray,
+    begin: FloatArray,
+    end: FloatArray,
+    expected: FloatArray,
+    span_start: IntArray,
+    basis: FloatArray,
+) -> float:
+    """Gain from the waves of a honeycomb that are longer than those of its bars' lines.
+
+    Parameters
+    ----------
+    place, start, begin, end, expected, span_start
+        As for `net_waves.comb_power`.
+    basis : array, shape (2, 2)
+        Two waves of the first shell.
+    """
+    per_frame = place.shape[0] / (start.shape[0] - 1)
+    gain, power = 0.0, np.empty(2)
+    for k in range(3):
+        qx = basis[k, 0] if k < 2 else basis[1, 0] - basis[0, 0]
+        qy = basis[k, 1] if k < 2 else basis[1, 1] - basis[0, 1]
+        power[:] = 0.0
+        comb_power(place, start, begin, end, expected, span_start, qx, qy, power)
+        power /= max(place.shape[0], 1)
+        gain += gain_of(power[0], 1.0 + per_frame * SHELL_1**2)
+        gain += free_gain_of(power[1], per_frame)
+    return gain
+
+
+@kernel
+def families_gain(
+    place: FloatArray,
+    line: IntArray,
+    start: IntArray,
+    begin: FloatArray,
+    end: FloatArray,
+    expected: FloatArray,
+    span_line: IntArray,
+    span_start: IntArray,
+    n_lines: int,
+    families: FloatArray,
+) -> float:
+    """Gain from the strongest family, from the next among what that leaves, and so on.
+
+    Parameters
+    ----------
+    place, start, begin, end, expected, span_start
+        As for `net_waves.comb_power`.
+    line, span_line : int array, shape (N,) and (M,)
+        Lines that crossings and spans lie on.
+    n_lines : int
+        Of all frames.
+    families : array, shape (F, 2)
+        Their waves.
+    """
+    n = families.shape[0]
+    strength = np.empty(n)
+    for k in range(n):
+        strength[k] = _comb_gain(
+            place, start, begin, end, expected, span_start, families[k], 1.0 / n
+        )
+    order = np.argsort(strength)[::-1]
+    gain = strength[order[0]]
+    for k in range(1, n):
+        before = families[order[k - 1]]
+        phase = crest_phases(place, start, before[0], before[1])
+        kept, start, begin, end, origin, span_start = off_crests(
+            place, start, begin, end, span_start, phase, before[0], before[1]
+        )
+        place, line, span_line = place[kept], line[kept], span_line[origin]
+        expected = expected_on(line, begin, end, span_line, n_lines)
+        # Crossings of the families that remain, less those that lie on a crest by chance.
+        share = SHARE_OF_REST / (n - k)
+        gain += _comb_gain(
+            place, start, begin, end, expected, span_start, families[order[k]], share
+        )
+    return float(gain)
+
+
+@kernel
+def _comb_gain(
+    place: FloatArray,
+    start: IntArray,
+    begin: FloatArray,
+    end: FloatArray,
+    expected: FloatArray,
+    span_start: IntArray,
+    wave: FloatArray,
+    share: float,
+) -> float:
+    """Gain from a family's harmonics that holds a share of the crossings."""
+    if place.shape[0] == 0:
+        return -_NOTHING_LEFT
+    per_frame = place.shape[0] / (start.shape[0] - 1)
+    size = np.hypot(wave[0], wave[1])
+    power = np.zeros(int(max(1.0, min(HIGHEST // size, MOST_HARMONICS))))
+    comb_power(place, start, begin, end, expected, span_start, wave[0], wave[1], power)
+    gain = 0.0
+    for h in range(len(power)):
+        mean = 1.0 + per_frame * (share * REGULAR ** (h + 1.0)) ** 2
+        gain += gain_of(power[h] / place.shape[0], mean)
+    return gain
+
+
+@kernel
+def miscount(
+    lines: FloatArray,
+    laser: IntArray,
+    seen: IntArray,
+    lit: float,
+    n_frames: int,
+    families: FloatArray,
+    density: float,
+) -> float:
+    """How unlikely the numbers of crossings are that the lasers have seen.
+
+    Parameters
+    ----------
+    lines, laser, seen, lit, n_frames
+        As attributes of `Spectrum`.
+    families : array, shape (F, 2)
+        Waves of the strands.
+    density : float
+        Share of each family's lines that is really there.
+    """
+    expected = np.zeros(len(seen))
+    for i in range(len(lines)):
+        rate = 0.0
+        for wave in families:
+            rate += abs(lines[i, 0] * wave[0] + lines[i, 1] * wave[1])
+        expected[laser[i]] += rate * density * lines[i, 2]
+    weight, mean, square = 0.0, 0.0, 0.0
+    for k in range(len(seen)):
+        if expected[k] > 0.0:
+            count = max(float(seen[k]), 0.5)
+            off = np.log(count / (expected[k] * max(1.0 - lit, 0.1)))
+            one = 1.0 / (_SEEN_SPREAD**2 + _COUNT_NOISE * n_frames / count)
+            weight, mean, square = weight + one, mean + one * off, square + one * off**2
+    mean /= weight
+    spread = _FEW_SEEN if mean < 0.0 else _MANY_SEEN
+    return float(0.5 * (square - weight * mean**2) + mean**2 / (2.0 * spread**2))

@@ -1,0 +1,489 @@
+"""`net.csv`, `holes.csv` and `net.geojson`: the state of a net as tables.
+
+The net wall unrolled into a plane: what the map and `net.geojson` are drawn in.
+
+x is metres along the net to the right, as seen from the vehicle, from where the dive began; y is
+minus the depth in metres, or, without a log, metres above the start. Where there is no track, x is
+the bearing of the net in degrees.
+
+The state of a net in a few words and numbers.
+"""
+
+import csv
+import io
+import itertools
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.nets.condition import NetStretch
+from aqualvs.nets.holes import Hole
+from aqualvs.nets.places import NetPlace, NetPlaces, PlacedBy
+from aqualvs.optics.rig import Rig
+from aqualvs.text import clock, hole_count
+
+# A stretch in which the vehicle moved less than this share of what the picture shows is no band.
+_LEAST_MOVE = 0.15
+# Bands meet in one edge where the cosine of the turn between them is above this.
+_SHARP = 0.5
+_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+METRES_PER_DEGREE = 0.17
+"""In which widths are drawn where x is a bearing: a cage of 10 m radius."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetWall:
+    """Stretches and holes on the unrolled net.
+
+    Attributes
+    ----------
+    stretches, holes : sequence
+        What was found.
+    places : NetPlaces
+        Where.
+    by_bearing : bool
+        Whether x is a bearing in degrees, for want of a track.
+    by_depth : bool
+        Whether y is minus a depth, or metres above the start.
+    outlines : list of array, shape (4, 2)
+        Of what the picture passed over in every stretch: x and y, counter-clockwise.
+    path : list of array, shape (n, 2)
+        Of the vehicle's foot on the net: one line for every piece in which the track holds.
+    holes_xy : array, shape (H, 2)
+        Middles of the holes.
+    """
+
+    stretches: Sequence[NetStretch]
+    holes: Sequence[Hole]
+    places: NetPlaces
+    by_bearing: bool
+    by_depth: bool
+    outlines: list[FloatArray]
+    path: list[FloatArray]
+    holes_xy: FloatArray
+
+
+def unroll(
+    stretches: Sequence[NetStretch], holes: Sequence[Hole], places: NetPlaces, rig: Rig
+) -> NetWall:
+    """Lay what was found into the plane of the unrolled net.
+
+    Parameters
+    ----------
+    stretches, holes : sequence
+        Of a dive.
+    places : NetPlaces
+        Theirs.
+    rig : Rig
+        Whose picture tells how much of the net is seen at a time.
+    """
+    nodes = [*places.begin[:1], *places.end]
+    by_bearing = all(one.placed_by is PlacedBy.NOTHING for one in nodes) and any(
+        one.bearing is not None for one in nodes
+    )
+    by_depth = any(one.depth is not None for one in nodes)
+    y = _heights([*nodes, *places.holes], by_depth)
+    x = _bearings(nodes) if by_bearing else np.array([one.along for one in nodes])
+    at_nodes = np.stack([x, y[: len(nodes)]], axis=-1) if nodes else np.empty((0, 2))
+    holes_x = np.array([one.along for one in places.holes])
+    if by_bearing:
+        when = [one.end_s for one in stretches]
+        holes_x = np.interp([hole.time_s for hole in holes], when, x[1:])
+    ranges = np.array([one.range for one in stretches])
+    half = 0.5 * np.array(rig.size_px) / rig.focal_px * ranges[:, None]
+    if by_bearing:
+        half[:, 0] /= METRES_PER_DEGREE
+    return NetWall(
+        stretches=stretches,
+        holes=holes,
+        places=places,
+        by_bearing=by_bearing,
+        by_depth=by_depth,
+        outlines=bands(at_nodes, half),
+        path=_path(at_nodes, stretches),
+        holes_xy=np.stack([holes_x, y[len(nodes) :]], axis=-1),
+    )
+
+
+def _heights(places: Sequence[NetPlace], by_depth: bool) -> FloatArray:
+    """Return minus the depth; where the log has a gap the track carries it on."""
+    up = np.array([one.up for one in places])
+    if not by_depth:
+        return up
+    minus = np.array([np.nan if one.depth is None else -one.depth for one in places])
+    level = float(np.nanmedian(minus - up))
+    return np.where(np.isfinite(minus), minus, up + level)
+
+
+def _bearings(nodes: Sequence[NetPlace]) -> FloatArray:
+    """Return bearings in degrees that do not jump by a full turn."""
+    found = np.array([np.nan if one.bearing is None else one.bearing for one in nodes])
+    known = np.isfinite(found)
+    turned = np.rad2deg(np.unwrap(found[known]))
+    return np.asarray(np.interp(np.arange(len(found)), np.flatnonzero(known), turned))
+
+
+def _path(nodes: FloatArray, stretches: Sequence[NetStretch]) -> list[FloatArray]:
+    """Cut the vehicle's path where the track was lost."""
+    pieces = np.array([one.piece for one in stretches])
+    parts = np.split(np.arange(len(nodes)), np.flatnonzero(np.diff(pieces)) + 2)
+    return [nodes[part] for part in parts if len(part)]
+
+
+def bands(nodes: FloatArray, half: FloatArray) -> list[FloatArray]:
+    """Return the outlines of what a picture passes over from node to node.
+
+    Parameters
+    ----------
+    nodes : array, shape (n + 1, 2)
+        Places of the picture's middle, in turn.
+    half : array, shape (n, 2)
+        Half its width and height on the way from each to the next.
+
+    Returns
+    -------
+    outlines : list of n arrays, shape (4, 2)
+        Counter-clockwise. Bands that follow each other meet in one edge, unless the way turns
+        sharply; where the picture hardly moves, it is the picture itself.
+    """
+    moves = np.diff(nodes, axis=0)
+    length = np.hypot(*moves.T)
+    still = length < _LEAST_MOVE * half.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        across = np.stack([-moves[:, 1], moves[:, 0]], axis=-1) / length[:, None]
+    # From the middle to the left edge: half of what the picture measures square to the way.
+    reach = across * np.sum(np.abs(across) * half, axis=1)[:, None]
+    reach[still] = np.nan
+    found = []
+    for i, (begin, end) in enumerate(itertools.pairwise(nodes)):
+        if still[i]:
+            found.append(0.5 * (begin + end) + _CORNERS * half[i])
+            continue
+        first = _edge(reach[i], reach[i - 1] if i else None)
+        last = _edge(reach[i], reach[i + 1] if i + 1 < len(reach) else None)
+        found.append(np.array([begin - first, end - last, end + last, begin + first]))
+    return found
+
+
+def _edge(reach: FloatArray, beside: FloatArray | None) -> FloatArray:
+    """Return the edge that two bands share, halfway between theirs; its own after a sharp turn."""
+    if beside is None or not np.isfinite(beside).all():
+        return reach
+    straight = float(reach @ beside) > _SHARP * float(np.hypot(*reach) * np.hypot(*beside))
+    return np.asarray(0.5 * (reach + beside)) if straight else reach
+
+
+Cell: TypeAlias = int | float | str | None
+
+_PLACE = ("along_m", "placed_by", "depth_m", "bearing_deg")
+NET_COLUMNS = (
+    *("stretch", "first_frame", "last_frame", "begin_s", "end_s", "n_frames"),
+    *("piece", "right_m", "up_m", *_PLACE, "heading_deg", "range_m"),
+    *("mesh", "bar_mm", "sigma_bar_mm", "twine_mm", "sigma_twine_mm"),
+    *("solidity", "sigma_solidity", "clean_solidity", "fouling", "n_strands", "seen_m"),
+)
+"""Columns of `net.csv`, one row for every stretch; empty where not measured or not known."""
+HOLE_COLUMNS = (
+    *("hole", "piece", "right_m", "up_m", *_PLACE),
+    *("width_mm", "height_mm", "diameter_mm", "sigma_diameter_mm", "missing_meshes"),
+    *("frame", "time_s", "n_looks"),
+)
+"""Columns of `holes.csv`, one row for every hole."""
+
+_DIGITS = {"s": 3, "m": 3, "deg": 1, "mm": 2}
+_SHARE_DIGITS = 4
+
+
+def stretch_rows(wall: NetWall) -> list[dict[str, Cell]]:
+    """Return the rows of `net.csv`."""
+    return [
+        _rounded(_stretch(i, one, place))
+        for i, (one, place) in enumerate(zip(wall.stretches, wall.places.middle, strict=True))
+    ]
+
+
+def hole_rows(wall: NetWall) -> list[dict[str, Cell]]:
+    """Return the rows of `holes.csv`."""
+    return [
+        _rounded(_hole(i, hole, place))
+        for i, (hole, place) in enumerate(zip(wall.holes, wall.places.holes, strict=True))
+    ]
+
+
+def fouling_of(stretch: NetStretch) -> float | None:
+    """Return the solidity beyond that of the bare twine; None where it was not measured."""
+    if stretch.solidity is None or stretch.clean_solidity is None:
+        return None
+    return stretch.solidity - stretch.clean_solidity
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Cell]]) -> None:
+    """Write a table as CSV.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, columns, lineterminator="\n")
+    table.writeheader()
+    table.writerows(
+        {key: "" if cell is None else cell for key, cell in row.items()} for row in rows
+    )
+    path.write_text(text.getvalue(), encoding="utf-8", newline="")
+
+
+def write_geojson(path: Path, wall: NetWall, facts: Mapping[str, Any]) -> None:
+    """Write stretches (Polygon) and holes (Point) in the plane of the unrolled net.
+
+    Parameters
+    ----------
+    path : Path
+        A FeatureCollection as in RFC 7946, but for its coordinates: they are local.
+    wall : NetWall
+        What to write; properties are the columns of the tables.
+    facts : mapping
+        What else belongs to it, for the foreign member `aqualvs_net`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    content = {
+        "type": "FeatureCollection",
+        "aqualvs_net": {"coordinates": coordinates(wall), **facts},
+        "features": [*_polygons(wall), *_points(wall)],
+    }
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def coordinates(wall: NetWall) -> dict[str, str]:
+    """Return what the coordinates in `net.geojson` are."""
+    return {
+        "system": "local: the net wall unrolled into a plane, as seen from the vehicle; "
+        "not longitude and latitude",
+        "x": "bearing of the net in degrees, clockwise from north; may pass 360 or 0"
+        if wall.by_bearing
+        else "metres along the net to the right, from where the dive began",
+        "y": "minus the depth in metres" if wall.by_depth else "metres above where the dive began",
+    }
+
+
+def _stretch(i: int, one: NetStretch, place: NetPlace) -> dict[str, Cell]:
+    lattice, twine, mm = one.lattice, one.twine, 1e3
+    cells: tuple[Cell, ...] = (
+        *(i + 1, one.first_frame, one.last_frame, one.begin_s, one.end_s, one.n_frames),
+        *(one.piece, *map(float, one.place), *_place_cells(place)),
+        *(_degrees(place.heading), one.range),
+        *(
+            (None,) * 3
+            if lattice is None
+            else (lattice.mesh, mm * lattice.bar, mm * lattice.sigma_bar)
+        ),
+        *((None,) * 2 if twine is None else (mm * twine.thickness, mm * twine.sigma)),
+        *(one.solidity, one.sigma_solidity, one.clean_solidity, fouling_of(one)),
+        *(None if lattice is None else one.n_strands, one.seen_length),
+    )
+    return dict(zip(NET_COLUMNS, cells, strict=True))
+
+
+def _hole(i: int, hole: Hole, place: NetPlace) -> dict[str, Cell]:
+    mm = 1e3
+    cells: tuple[Cell, ...] = (
+        *(i + 1, hole.piece, *map(float, hole.place), *_place_cells(place)),
+        *(mm * hole.extent[0], mm * hole.extent[1]),
+        *(mm * hole.diameter, mm * hole.sigma_diameter, hole.missing_meshes),
+        *(hole.frame, hole.time_s, hole.n_looks),
+    )
+    return dict(zip(HOLE_COLUMNS, cells, strict=True))
+
+
+def _place_cells(place: NetPlace) -> tuple[Cell, ...]:
+    return place.along, place.placed_by, place.depth, _degrees(place.bearing)
+
+
+def _degrees(angle: float | None) -> float | None:
+    return None if angle is None else float(np.rad2deg(angle)) % 360.0
+
+
+def _rounded(row: Mapping[str, Cell]) -> dict[str, Cell]:
+    """Return a row with no more digits than the numbers are worth, and plain types."""
+    return {name: _round(name, cell) for name, cell in row.items()}
+
+
+def _round(name: str, cell: Cell) -> Cell:
+    if isinstance(cell, str):
+        return str(cell)
+    if cell is None or isinstance(cell, int):
+        return cell
+    # Adding zero turns a negative zero into a plain one.
+    return round(float(cell), _DIGITS.get(name.rsplit("_", 1)[-1], _SHARE_DIGITS)) + 0.0
+
+
+def _polygons(wall: NetWall) -> Iterator[dict[str, Any]]:
+    for row, outline in zip(stretch_rows(wall), wall.outlines, strict=True):
+        ring = _corners(np.concatenate([outline, outline[:1]]))
+        yield _feature("stretch", row, {"type": "Polygon", "coordinates": [ring]})
+
+
+def _points(wall: NetWall) -> Iterator[dict[str, Any]]:
+    for row, middle in zip(hole_rows(wall), wall.holes_xy, strict=True):
+        yield _feature("hole", row, {"type": "Point", "coordinates": _corners(middle[None])[0]})
+
+
+def _feature(kind: str, row: Mapping[str, Cell], geometry: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "type": "Feature",
+        "id": f"{kind}-{row[kind]}",
+        "properties": {"kind": kind, **row},
+        "geometry": geometry,
+    }
+
+
+def _corners(places: FloatArray) -> list[list[float]]:
+    return [[round(float(x), 4) + 0.0, round(float(y), 4) + 0.0] for x, y in places]
+
+
+_MOST_LISTED = 20
+
+
+def net_facts(wall: NetWall, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
+    """Return the numbers that sum a dive up; None where not measured.
+
+    Parameters
+    ----------
+    wall : NetWall
+        What was found.
+    area : float
+        Looked at for holes, in square metres.
+    n_frames, n_net_frames : int
+        Frames of the dive, and those with a posture to a net.
+    """
+    stretches = wall.stretches
+    solidity = _mean(stretches, lambda one: one.solidity)
+    fouling = _mean(stretches, fouling_of)
+    shapes = Counter(one.lattice.mesh.value for one in stretches if one.lattice is not None)
+    return {
+        "n_frames": n_frames,
+        "n_net_frames": n_net_frames,
+        "n_stretches": len(stretches),
+        "n_holes": len(wall.holes),
+        "area_m2": round(area, 3),
+        "way_m": round(_way(wall), 3),
+        "mesh": shapes.most_common(1)[0][0] if shapes else None,
+        "bar_mm": _words_rounded(_mean(stretches, _bar_mm), 2),
+        "twine_mm": _words_rounded(_mean(stretches, _twine_mm), 2),
+        "solidity": _words_rounded(solidity, 4),
+        "fouling": _words_rounded(fouling, 4),
+        "track_slip_m": round(wall.places.slip, 2),
+        "largest_hole_mm": _words_rounded(
+            max((1e3 * h.diameter for h in wall.holes), default=None), 1
+        ),
+    }
+
+
+def net_lines(wall: NetWall, area: float, n_frames: int) -> list[str]:
+    """Return the summary in words, line by line."""
+    if not wall.stretches:
+        return [f"no net was seen in {n_frames} frames"]
+    facts = net_facts(wall, area, n_frames, n_frames)
+    lines = [_mesh_line(facts), *_fouling_lines(wall, facts), *_hole_lines(wall, facts)]
+    return lines if not wall.places.slip else [*lines, f"warning: {slip_words(wall.places.slip)}"]
+
+
+def slip_words(slip: float) -> str:
+    """Return what it means that track and log disagree about the height."""
+    return (
+        f"the track and the log's depth part by {slip:.1f} m: meshes were counted wrongly, so "
+        "places along the net and sizes of holes are not to be trusted"
+    )
+
+
+def place_words(place: NetPlace) -> str:
+    """Return where something is."""
+    words = [] if place.placed_by == "nothing" else [f"{place.along:.2f} m along"]
+    words.append(
+        f"{place.depth:.2f} m deep" if place.depth is not None else f"{place.up:+.2f} m up"
+    )
+    if place.bearing is not None:
+        words.append(f"bearing {np.rad2deg(place.bearing):.0f}°")
+    return ", ".join(words)
+
+
+def size_words(hole: Hole) -> str:
+    """Return how large a hole is."""
+    width, height = (1e3 * side for side in hole.extent)
+    return f"{1e3 * hole.diameter:.0f} mm ({width:.0f} x {height:.0f} mm)"
+
+
+def _mesh_line(facts: dict[str, Any]) -> str:
+    if facts["bar_mm"] is None:
+        return "net: its mesh could not be made out"
+    bar = facts["bar_mm"]
+    words = f"net: {facts['mesh']} meshes of {bar:.1f} mm bar ({2.0 * bar:.0f} mm stretched)"
+    return words if facts["twine_mm"] is None else f"{words}, twine {facts['twine_mm']:.1f} mm"
+
+
+def _fouling_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
+    if facts["fouling"] is None:
+        return ["solidity: not measured in any stretch"]
+    clean = facts["solidity"] - facts["fouling"]
+    fouling = [fouling_of(one) for one in wall.stretches]
+    worst = int(np.argmax([-np.inf if value is None else value for value in fouling]))
+    return [
+        f"solidity {facts['solidity']:.2f}, of bare twine {clean:.2f}: "
+        f"fouling {facts['fouling']:+.2f}; most at {place_words(wall.places.middle[worst])}: "
+        f"{fouling[worst]:+.2f}"
+    ]
+
+
+def _hole_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
+    n = len(wall.holes)
+    seen = (
+        f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {hole_count(n)}"
+    )
+    order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:_MOST_LISTED]
+    lines = [
+        f"  {size_words(hole)}, {hole.missing_meshes:.0f} meshes: {place_words(place)}, "
+        f"at {clock(hole.time_s)} (frame {hole.frame})"
+        for hole, place in ((wall.holes[i], wall.places.holes[i]) for i in sorted(order))
+    ]
+    if n > _MOST_LISTED:
+        lines.append(f"  and {n - _MOST_LISTED} smaller ones, see holes.csv")
+    return [seen, *lines]
+
+
+def _way(wall: NetWall) -> float:
+    """Return how far the vehicle moved along the net, in metres."""
+    pairs = zip(wall.places.begin, wall.places.end, strict=True)
+    return float(sum(np.hypot(b.along - a.along, b.up - a.up) for a, b in pairs))
+
+
+def _mean(
+    stretches: Sequence[NetStretch], value: Callable[[NetStretch], float | None]
+) -> float | None:
+    """Return the mean over stretches, weighed by how much of them was seen."""
+    pairs = [(value(one), one.seen_length) for one in stretches]
+    known = [(float(found), weight) for found, weight in pairs if found is not None]
+    total = sum(weight for _, weight in known)
+    return sum(found * weight for found, weight in known) / total if total > 0.0 else None
+
+
+def _bar_mm(stretch: NetStretch) -> float | None:
+    return None if stretch.lattice is None else 1e3 * stretch.lattice.bar
+
+
+def _twine_mm(stretch: NetStretch) -> float | None:
+    return None if stretch.twine is None else 1e3 * stretch.twine.thickness
+
+
+def _words_rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(float(value), digits)

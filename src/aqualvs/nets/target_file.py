@@ -1,0 +1,390 @@
+"""What the lasers hit, as a word or a short file (`net.yaml`).
+
+::
+
+    kind: net                 # auto, net or solid
+    net:                      # what the net is said to be; a run says if it looks otherwise
+      mesh: diamond           # diamond (default), square or hexagon
+      bar_mm: 25
+      twine_mm: 2
+    mesh_filter:              # only for --mesh-filter paper; its parameters, section 5.2
+      rd_theta_mm: 10
+      dd_mm: 1
+      r_min_mm: 15
+      r_max_mm: 35
+
+The adaptive filter needs none of this. Where the net is given, the paper's filter takes what
+`mesh_filter` leaves out from it.
+
+What a user wants to know of a net.
+
+Whether the net that is seen is the one that the target file describes.
+
+Along a laser's line strands follow one another at distances that depend on the way the mesh is
+turned; over three lasers and a dive their mean tells the bar. For parallel lines thrown at random
+on a net with a length L of twine on every square metre it is pi / (2 L) (Crofton); L is 2 / bar for
+square and diamond meshes and 2 / (sqrt(3) bar) for hexagons.
+"""
+
+import math
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Label, Scan
+from aqualvs.scanning.target import TargetKind
+from aqualvs.yamlfile import read_yaml
+
+if TYPE_CHECKING:
+    from aqualvs.nets.condition import NetConditionOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetRequest:
+    """What to find out about a net.
+
+    Attributes
+    ----------
+    twine_mm : float or None
+        Diameter of the bare twine, where it is known.
+    stretch_m : float
+        Length of a stretch of net.
+    log : Path or None
+        The vehicle's log.
+    log_offset_s : float or None
+        Its clock minus the dive's, where it is known.
+    """
+
+    twine_mm: float | None = None
+    stretch_m: float = 0.5
+    log: Path | None = None
+    log_offset_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be."""
+        for option, value in (("twine-mm", self.twine_mm), ("stretch-m", self.stretch_m)):
+            if value is not None and not 0.0 < value < math.inf:
+                raise OptionError(f"--{option} {value:g}: must be positive; correct it")
+        if self.log_offset_s is not None and not math.isfinite(self.log_offset_s):
+            raise OptionError(f"--log-offset-s {self.log_offset_s:g}: give a number of seconds")
+
+    def options(self) -> "NetConditionOptions":
+        """Return the options of the evaluation."""
+        from aqualvs.nets.condition import NetConditionOptions
+
+        twine = None if self.twine_mm is None else 1e-3 * self.twine_mm
+        return NetConditionOptions(stretch=self.stretch_m, twine=twine)
+
+    def facts(self) -> dict[str, Any]:
+        """Return them for the files that are written."""
+        return {"twine_mm": self.twine_mm, "stretch_m": self.stretch_m}
+
+
+def net_request(
+    *, wanted: bool, twine_mm: float | None, stretch_m: float | None
+) -> NetRequest | None:
+    """Return what a user wants to know, None if nothing.
+
+    Raises
+    ------
+    OptionError
+        If something is said about it all the same, or a value cannot be.
+    """
+    given = {"twine_mm": twine_mm, "stretch_m": stretch_m}
+    known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if wanted:
+        return NetRequest(**known)
+    if known:
+        option = next(iter(known)).replace("_", "-")
+        raise OptionError(f"--{option}: is about the state of the net; add --net")
+    return None
+
+
+_KINDS = ", ".join(kind.value for kind in TargetKind)
+_LENGTHS = ("rd_theta_mm", "dd_mm", "r_min_mm", "r_max_mm")
+_NET_KEYS = ("mesh", "bar_mm", "twine_mm")
+# Crossings with a line on a bar's length, on the mean of all directions (Crofton).
+_CROSSINGS = {
+    "diamond": 4.0 / math.pi,
+    "square": 4.0 / math.pi,
+    "hexagon": 4.0 / (math.sqrt(3.0) * math.pi),
+}
+# Least and greatest distance between strands in bars (paper, section 4.2): half a diagonal and a
+# diagonal of a square mesh, side and diameter of a hexagon.
+_DISTANCES = {
+    "diamond": (math.sqrt(0.5), math.sqrt(2.0)),
+    "square": (math.sqrt(0.5), math.sqrt(2.0)),
+    "hexagon": (1.0, 2.0),
+}
+# Reflection over twine, as for the paper's net (section 5.2).
+_REFLECTION = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class NetFacts:
+    """What the net is said to be.
+
+    Attributes
+    ----------
+    mesh : {"diamond", "square", "hexagon"}
+    bar : float
+        Length of one side of an opening, in metres.
+    twine : float or None
+        Diameter of the twine, in metres.
+    """
+
+    mesh: str
+    bar: float
+    twine: float | None = None
+
+    @property
+    def crossings_per_bar(self) -> float:
+        """Strands that a line crosses on the length of a bar, on the mean of all directions."""
+        return _CROSSINGS[self.mesh]
+
+    def filter_lengths(self) -> dict[str, float]:
+        """Return the lengths of `MeshFilterOptions` that follow from the net, in metres."""
+        least, greatest = (self.bar * share for share in _DISTANCES[self.mesh])
+        lengths = {"r_min": least, "r_max": greatest}
+        if self.twine is not None:
+            lengths["rd_theta"] = min(_REFLECTION * self.twine, least)
+        return lengths
+
+
+@dataclass(frozen=True, slots=True)
+class TargetFacts:
+    """What is known of the target beforehand.
+
+    Attributes
+    ----------
+    kind : TargetKind
+        What the posture is measured to.
+    mesh_filter : MeshFilterOptions
+        Parameters of the paper's mesh filter.
+    net : NetFacts or None
+        What the net is said to be, where the file says it.
+    """
+
+    kind: TargetKind = TargetKind.AUTO
+    mesh_filter: MeshFilterOptions = field(default_factory=MeshFilterOptions)
+    net: NetFacts | None = None
+
+
+def target_facts(text: str) -> TargetFacts:
+    """Return what a word (auto, net, solid) or the path of a target file says.
+
+    Raises
+    ------
+    OptionError
+        If it is neither, or the file says what cannot be.
+    """
+    if text in set(TargetKind):
+        return TargetFacts(TargetKind(text))
+    path = Path(text)
+    if not path.exists():
+        raise OptionError(f"--target {text}: neither a file nor one of {_KINDS}")
+    content = read_yaml(path, "a net.yaml", OptionError)
+    if not isinstance(content, dict):
+        raise OptionError(f"{path}: holds no keys; write for example 'kind: net'")
+    _refuse_unknown(path, "", content, ("kind", "mesh_filter", "net"))
+    kind = content.get("kind", TargetKind.AUTO.value)
+    if kind not in set(TargetKind):
+        raise OptionError(f"{path}: kind is {kind!r}; use one of {_KINDS}")
+    net = _net(path, content["net"]) if "net" in content else None
+    filtering = _mesh_filter(path, content.get("mesh_filter") or {}, net)
+    return TargetFacts(TargetKind(kind), filtering, net)
+
+
+def _net(path: Path, content: Any) -> NetFacts:
+    if not isinstance(content, dict) or "bar_mm" not in content:
+        raise OptionError(f"{path}: net holds no bar_mm; give it, or leave net out")
+    _refuse_unknown(path, "net.", content, _NET_KEYS)
+    mesh = content.get("mesh", "diamond")
+    if mesh not in _CROSSINGS:
+        raise OptionError(f"{path}: net.mesh is {mesh!r}; use one of {', '.join(_CROSSINGS)}")
+    twine = _metres(path, "net.twine_mm", content["twine_mm"]) if "twine_mm" in content else None
+    return NetFacts(mesh, _metres(path, "net.bar_mm", content["bar_mm"]), twine)
+
+
+def _metres(path: Path, place: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise OptionError(f"{path}: {place} is {value!r}; give millimetres")
+    if not (math.isfinite(value) and value > 0.0):
+        raise OptionError(f"{path}: {place} is {value:g}; it must be positive")
+    return 1e-3 * float(value)
+
+
+def _mesh_filter(path: Path, content: Any, net: NetFacts | None) -> MeshFilterOptions:
+    if not isinstance(content, dict):
+        raise OptionError(f"{path}: mesh_filter holds no keys; give {', '.join(_LENGTHS)}")
+    _refuse_unknown(path, "mesh_filter.", content, _LENGTHS)
+    lengths = {} if net is None else net.filter_lengths()
+    for name, value in content.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
+            raise OptionError(f"{path}: mesh_filter.{name} is {value!r}; give millimetres")
+        lengths[name.removesuffix("_mm")] = 1e-3 * value
+    try:
+        return MeshFilterOptions(**lengths)
+    except OptionError as fault:
+        raise OptionError(f"{path}: {fault}") from fault
+
+
+def _refuse_unknown(
+    path: Path, place: str, content: dict[Any, Any], known: tuple[str, ...]
+) -> None:
+    for name in content:
+        if name not in known:
+            raise OptionError(f"{path}: unknown key {place}{name}; known are {', '.join(known)}")
+
+
+# A frame now and then is enough, and costs the run nothing.
+_EVERY = 5
+_ENOUGH_FRAMES = 5
+# Light is one strand's up to gaps of this width; a strand has so many points, a stripe so many
+# strands, a frame so many stripes.
+_GAP = 3e-3
+_MIN_POINTS, _MIN_STRANDS, _MIN_LASERS = 3, 4, 2
+# Wider than so many usual distances is a hole, or what stands before the net.
+_HOLE = 2.5
+# Strands that meet at a knot count once and dim ones are missed: found on random simulated nets.
+_MISSED = 1.2
+# On those nets the bar comes out at 0.67 to 1.45 of what it is, frame by frame.
+_TOO_SHORT, _TOO_LONG = 0.62, 1.6
+
+
+@dataclass(slots=True)
+class NetCheck:
+    """Compares the distances between strands with those of the net that was announced.
+
+    Attributes
+    ----------
+    said : NetFacts
+        The target file's net.
+    source : str
+        The target file's name, for the sentence.
+    planes : sequence of Plane
+        Of the lasers, in `dome`.
+    bars : array of float
+        Bar of the frames that were looked at, in metres.
+    """
+
+    said: NetFacts
+    source: str
+    planes: Sequence[Plane]
+    bars: "array[float]" = field(default_factory=lambda: array("d"))
+    _n_seen: int = 0
+
+    def add(self, scan: Scan) -> None:
+        """Look at a frame, if its turn has come and it shows a net."""
+        self._n_seen += 1
+        if (self._n_seen - 1) % _EVERY == 0:
+            bar = bar_of(scan, self.planes, self.said)
+            if bar is not None:
+                self.bars.append(bar)
+
+    def bar(self) -> float | None:
+        """Return the bar as it looks over the dive, in metres; None where too little was seen."""
+        return float(np.median(self.bars)) if len(self.bars) >= _ENOUGH_FRAMES else None
+
+    def sentence(self) -> str:
+        """Return what is wrong with the file in one line, "" where nothing can be told."""
+        bar = self.bar()
+        if bar is None or _TOO_SHORT <= bar / self.said.bar <= _TOO_LONG:
+            return ""
+        return (
+            f"the net looks like one with a bar length of about {1e3 * bar:.2g} mm, where "
+            f"{self.source} says {1e3 * self.said.bar:g} mm; postures do not depend on it"
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """Return what `run.yaml` holds of it."""
+        bar = self.bar()
+        found: dict[str, Any] = {"bar_said_mm": round(1e3 * self.said.bar, 2)}
+        if bar is not None:
+            found["bar_seen_mm"] = round(1e3 * bar, 1)
+        found["n_frames"] = len(self.bars)
+        found["words"] = self.sentence()
+        return found
+
+
+def net_check(target: str, rig: Rig) -> NetCheck | None:
+    """Return the check of the net that a target file describes; None where it describes none.
+
+    Parameters
+    ----------
+    target : str
+        A word or the path of a target file, as `target_facts` takes it.
+    rig : Rig
+
+    Raises
+    ------
+    OptionError
+        As `target_facts`.
+    """
+    said = target_facts(target).net
+    if said is None:
+        return None
+    camera = rig.camera()
+    planes = [sheet.best_plane(camera, rig.working_range) for sheet in sheets_of(rig)]
+    return NetCheck(said, target, planes)
+
+
+def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
+    """Return the bar that the distances between strands in one frame make likely, in metres.
+
+    Parameters
+    ----------
+    scan : Scan
+        Its points labelled net are looked at.
+    planes : sequence of Plane
+        Of the lasers, in `dome`.
+    said : NetFacts
+        Its shape of mesh is taken as given.
+    """
+    posture = scan.posture
+    if not isinstance(posture, Posture):
+        return None
+    on_net = scan.points.label == Label.NET
+    densities = []
+    for index, plane in enumerate(planes):
+        along = np.cross(plane.normal, posture.normal_in_dome)
+        along /= np.linalg.norm(along)
+        mine = on_net & (scan.points.laser == index)
+        distance = strand_distance(scan.points.points_in_dome[mine] @ along)
+        if distance is not None:
+            densities.append(1.0 / distance)
+    if len(densities) < _MIN_LASERS:
+        return None
+    return float(said.crossings_per_bar / (_MISSED * np.mean(densities)))
+
+
+def strand_distance(along: FloatArray) -> float | None:
+    """Return the mean distance between the strands on one stripe, in metres.
+
+    Parameters
+    ----------
+    along : array, shape (N,)
+        Places of points on the net along the stripe, in metres, in any order.
+    """
+    if len(along) < _MIN_STRANDS * _MIN_POINTS:
+        return None
+    along = np.sort(along)
+    gaps = np.flatnonzero(np.diff(along) > _GAP)
+    first, last = np.append(0, gaps + 1), np.append(gaps, len(along) - 1)
+    strand = last - first + 1 >= _MIN_POINTS
+    if np.count_nonzero(strand) < _MIN_STRANDS:
+        return None
+    apart = np.diff(0.5 * (along[first] + along[last])[strand])
+    return float(np.mean(apart[apart <= _HOLE * np.median(apart)]))

@@ -1,0 +1,531 @@
+"""The topics of a recording and the definitions of their messages, in ROS 2's language.
+
+Pictures in a recording: JPEG, small; or PNG of the planes as they are, without loss.
+
+A rig and the scanner's options as a recording keeps them.
+
+ROS 2's encoding of messages (CDR, little endian) as far as our messages need it.
+
+Primitives lie at multiples of their size, counted from the end of the four bytes that every message
+begins with. A sequence is its length as uint32, then its elements; an empty one has no gap after
+its length.
+"""
+
+import json
+import struct
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.errors import RigError
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.rig import Laser, Rig, Window
+from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
+from aqualvs.scanner import ScannerOptions
+from aqualvs.scanning.paper.detector import ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+from aqualvs.scanning.posture_estimator import FitMethod
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
+from aqualvs.scanning.stripe import StripeOptions
+from aqualvs.scanning.target import TargetKind
+from aqualvs.sources.base import bgr_of
+from aqualvs.yamlfile import parse_yaml, rig_text
+
+# Noise leaves little to a search for what repeats: runs alone are smaller, and no slower.
+_PNG = [
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
+]
+
+
+class PictureFormat(StrEnum):
+    """How pictures are kept."""
+
+    JPEG = "jpeg"
+    PNG = "png"
+    """Luma as one grey picture, U above V as another: bit for bit, and large."""
+
+
+def jpeg_of(frame: Frame, quality: int) -> bytes:
+    """Return a frame as JPEG, in colour where it has any.
+
+    Parameters
+    ----------
+    frame : Frame
+    quality : int
+        1 to 100.
+    """
+    image = np.ascontiguousarray(frame.luma) if frame.chroma is None else bgr_of(frame)
+    return _encoded(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def png_of(frame: Frame) -> tuple[bytes, bytes | None]:
+    """Return luma and, where the frame has it, chroma as PNG."""
+    luma = _encoded(".png", np.ascontiguousarray(frame.luma), _PNG)
+    if frame.chroma is None:
+        return luma, None
+    return luma, _encoded(".png", np.concatenate(frame.chroma), _PNG)
+
+
+def frame_of(index: int, time_s: float, kind: str, picture: bytes, chroma: bytes | None) -> Frame:
+    """Return the frame that a recording's pictures show.
+
+    Raises
+    ------
+    ValueError
+        If they cannot be decoded.
+    """
+    image = _decoded(picture)
+    if kind == PictureFormat.JPEG:
+        return Frame(index, time_s, *planes_of_image(image))
+    if chroma is None:
+        return Frame(index, time_s, image)
+    both = _decoded(chroma)
+    rows = len(both) // 2
+    return Frame(index, time_s, image, (both[:rows], both[rows:]))
+
+
+def _encoded(suffix: str, image: ImagePlane, options: list[int]) -> bytes:
+    _, found = cv2.imencode(suffix, image, options)
+    return found.tobytes()
+
+
+def _decoded(data: bytes) -> ImagePlane:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR)
+    if image is None:
+        raise ValueError("a picture that cannot be decoded")
+    return cast(ImagePlane, image)
+
+
+def rig_yaml(rig: Rig) -> str:
+    """Return the text of a rig file."""
+    return rig_text(rig_to_mapping(rig))
+
+
+def rig_exact(rig: Rig) -> str:
+    """Return what a rig file rounds, as JSON, whose numbers lead back to the same bits."""
+    pose, dome = rig.dome_from_cam, rig.dome
+    found = {
+        "rotation": pose.rotation.tolist(),
+        "translation": pose.translation.tolist(),
+        "dome": None if dome is None else [dome.inner_radius, dome.thickness, dome.n_acrylic],
+        "n_air": rig.n_air,
+        "n_water": rig.n_water,
+        "lasers": [_laser_numbers(laser) for laser in rig.lasers],
+        "working_range": list(rig.working_range),
+    }
+    return json.dumps(found)
+
+
+def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
+    """Return the rig of a recording, to the last bit.
+
+    Parameters
+    ----------
+    text, exact : str
+        From `rig_yaml` and `rig_exact`.
+    source_name : str
+        How messages call the recording.
+
+    Raises
+    ------
+    RigError
+        If the text holds no rig.
+    ValueError
+        If the numbers do not belong to it.
+    """
+    content = parse_yaml(text, source_name, RigError)
+    rig = rig_from_mapping(content, source_name=source_name, need_lasers=False)
+    numbers = json.loads(exact)
+    return replace(
+        rig,
+        dome_from_cam=SE3(np.array(numbers["rotation"]), np.array(numbers["translation"])),
+        dome=None if numbers["dome"] is None else Dome(*numbers["dome"]),
+        n_air=numbers["n_air"],
+        n_water=numbers["n_water"],
+        lasers=tuple(
+            _with_numbers(laser, own)
+            for laser, own in zip(rig.lasers, numbers["lasers"], strict=True)
+        ),
+        working_range=tuple(numbers["working_range"]),
+    )
+
+
+def options_text(options: ScannerOptions) -> str:
+    """Return the scanner's options as JSON."""
+    found = asdict(options)
+    threshold = isinstance(options.detector, ThresholdOptions)
+    found["detector"]["kind"] = "threshold" if threshold else "ridge"
+    return json.dumps(found)
+
+
+def options_from_text(text: str) -> ScannerOptions:
+    """Return the scanner's options that `options_text` wrote.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If the text is none that this version knows.
+    """
+    found = json.loads(text)
+    detector = dict(found["detector"])
+    kind = {"ridge": StripeOptions, "threshold": ThresholdOptions}[detector.pop("kind")]
+    # Recordings of 0.1.0 name the gate on colour that likelihoods have replaced.
+    detector.pop("min_green_fall", None)
+    mesh = found["mesh_filter"]
+    return ScannerOptions(
+        detector=kind(**detector),
+        mesh_filter=None if mesh is None else MeshFilterOptions(**mesh),
+        target=TargetKind(found["target"]),
+        fit=FitMethod(found["fit"]),
+    )
+
+
+def _laser_numbers(laser: Laser) -> list[Any]:
+    window = laser.window
+    own = _plane_numbers(laser.plane)
+    return own if window is None else [*own, *_plane_numbers(window.face), window.source.tolist()]
+
+
+def _plane_numbers(plane: Plane) -> list[Any]:
+    return [plane.normal.tolist(), float(plane.offset)]
+
+
+def _with_numbers(laser: Laser, numbers: list[Any]) -> Laser:
+    plane = Plane(np.array(numbers[0]), numbers[1])
+    if len(numbers) == 2:
+        return replace(laser, plane=plane, window=None)
+    window = Window(Plane(np.array(numbers[2]), numbers[3]), np.array(numbers[4]))
+    return replace(laser, plane=plane, window=window)
+
+
+_HEAD = b"\x00\x01\x00\x00"
+_NS = 1_000_000_000
+
+
+class CdrWriter:
+    """Puts values together, in the order of the message's fields."""
+
+    def __init__(self) -> None:
+        self._content = bytearray(_HEAD)
+
+    def numbers(self, kind: str, *values: float) -> None:
+        """Append numbers of one kind (of `struct`), such as the fields of a fixed array."""
+        size = struct.calcsize("=" + kind)
+        self._align(size)
+        self._content += struct.pack(f"<{len(values)}{kind}", *values)
+
+    def text(self, words: str) -> None:
+        """Append a string."""
+        content = words.encode("utf-8") + b"\0"
+        self.numbers("I", len(content))
+        self._content += content
+
+    def array(self, values: NDArray[Any]) -> None:
+        """Append a sequence of numbers, as the array holds them."""
+        self.numbers("I", values.size)
+        if values.size:
+            self._align(values.itemsize)
+            kind = values.dtype.newbyteorder("<")
+            self._content += np.ascontiguousarray(values, kind).view(np.uint8).data
+
+    def blob(self, content: bytes) -> None:
+        """Append a sequence of bytes."""
+        self.numbers("I", len(content))
+        self._content += content
+
+    def header(self, stamp_ns: int, frame_id: str) -> None:
+        """Append a `std_msgs/Header`."""
+        self.numbers("i", stamp_ns // _NS)
+        self.numbers("I", stamp_ns % _NS)
+        self.text(frame_id)
+
+    def finish(self) -> bytes:
+        """Return the message."""
+        return bytes(self._content)
+
+    def _align(self, size: int) -> None:
+        self._content += bytes(-(len(self._content) - len(_HEAD)) % size)
+
+
+class CdrReader:
+    """Takes a message apart, in the order of its fields.
+
+    Parameters
+    ----------
+    content : bytes
+
+    Raises
+    ------
+    ValueError
+        From every method, if the message is cut short or not little-endian CDR.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        if content[: len(_HEAD)] != _HEAD:
+            raise ValueError("not little-endian CDR")
+        self._content, self._at = content, len(_HEAD)
+
+    def number(self, kind: str) -> Any:
+        """Take one number of a kind (of `struct`)."""
+        return self.numbers(kind, 1)[0]
+
+    def numbers(self, kind: str, n: int) -> tuple[Any, ...]:
+        """Take numbers of one kind."""
+        size = struct.calcsize("=" + kind)
+        self._align(size)
+        return struct.unpack(f"<{n}{kind}", self._take(n * size))
+
+    def text(self) -> str:
+        """Take a string."""
+        return self._take(self.number("I"))[:-1].decode("utf-8")
+
+    def array(self, kind: str) -> NDArray[Any]:
+        """Take a sequence of numbers of a NumPy kind; a copy."""
+        n, dtype = self.number("I"), np.dtype(kind).newbyteorder("<")
+        if n:
+            self._align(dtype.itemsize)
+        found = np.frombuffer(self._take(n * dtype.itemsize), dtype)
+        return found.astype(np.dtype(kind))
+
+    def blob(self) -> bytes:
+        """Take a sequence of bytes."""
+        return self._take(self.number("I"))
+
+    def header(self) -> tuple[int, str]:
+        """Take a `std_msgs/Header`: nanoseconds and the frame's name."""
+        seconds, nanoseconds = self.number("i"), self.number("I")
+        return seconds * _NS + nanoseconds, self.text()
+
+    def _align(self, size: int) -> None:
+        self._at += -(self._at - len(_HEAD)) % size
+
+    def _take(self, n: int) -> bytes:
+        end = self._at + n
+        if end > len(self._content):
+            raise ValueError(f"cut short: {len(self._content)} of {end} bytes")
+        found = self._content[self._at : end]
+        self._at = end
+        return found
+
+
+_TIME = "builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"
+_HEADER = "std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic.
+
+    Attributes
+    ----------
+    number : int
+        Of its channel and its schema in the file; from 1.
+    name : str
+    kind : str
+        Full name of its messages.
+    definition : str
+        Of its messages and of all that they hold.
+    """
+
+    number: int
+    name: str
+    kind: str
+    definition: str
+
+
+def _definition(own: str, *parts: tuple[str, str]) -> str:
+    """Return a definition with those of its parts, as ROS 2's recordings have them."""
+    line = 80 * "=" + "\n"
+    return "".join([own, *(f"{line}MSG: {name}\n{text}" for name, text in parts)])
+
+
+_POSTURE = """\
+# Vehicle relative to the target; NaN where there is no value.
+std_msgs/Header header
+int64 frame
+float64 time_s
+bool valid
+# Why there is no posture: one word, and in words.
+string reason
+string detail
+float64 range_m
+float64 pitch_deg
+float64 yaw_deg
+float64 sigma_range_m
+float64 sigma_pitch_deg
+float64 sigma_yaw_deg
+float64 slant_range_m
+float64 nearest_m
+float64 rms_m
+float64 n_water
+# Unit normal of the target in the frame dome, pointing away from the vehicle.
+float64[3] normal
+# Of range, pitch and yaw by the noise of the frame, in m and rad, row by row.
+float64[9] covariance
+# Of a curved net, along the horizontal and the vertical.
+float64[2] curvature_per_m
+float64[2] sigma_curvature_per_m
+int32 n_points
+int32 n_all_points
+# The time filter, where it is on.
+bool filtered
+bool filter_accepted
+float64 filtered_range_m
+float64 filtered_pitch_deg
+float64 filtered_yaw_deg
+float64 filtered_range_rate_m_per_s
+float64 filtered_pitch_rate_deg_per_s
+float64 filtered_yaw_rate_deg_per_s
+float64 filter_age_s
+# From the decoded picture to the measured one.
+float64 delay_s
+# By the uncertainty of the rig, which is common to all frames; and by both together.
+float64 sigma_range_rig_m
+float64 sigma_pitch_rig_deg
+float64 sigma_yaw_rig_deg
+float64 sigma_range_total_m
+float64 sigma_pitch_total_deg
+float64 sigma_yaw_total_deg
+float64[9] rig_covariance
+"""
+
+_STRIPES = """\
+# What the detector found in a picture, bit for bit.
+std_msgs/Header header
+int64 frame
+float64 time_s
+float64 n_water
+# Why the picture was not measured: one word, and in words; empty where it was.
+string refusal
+string detail
+aqualvs_msgs/Returns[] returns
+"""
+
+_RETURNS = """\
+# Axis that the search lines run along: y (columns) or x (rows).
+string axis
+uint32[] line
+float64[] position
+float64[] height
+float64[] width
+float64[] likelihood
+"""
+
+_HEALTH = """\
+# States: 0 off, 1 ok, 2 warn, 3 fault.
+std_msgs/Header header
+uint8 state
+float64 rate_hz
+float64 valid_share
+float64 quality
+float64 n_water
+float64 sigma_n_water
+int64 n_frames
+int64 n_dropped
+int64 n_lost
+aqualvs_msgs/Part[] parts
+aqualvs_msgs/Delay[] delays
+"""
+
+_PART = """\
+# source, laser or output
+string kind
+string name
+uint8 state
+string detail
+int64 n_dropped
+"""
+
+_DELAY = """\
+string name
+float64 median_s
+float64 p99_s
+"""
+
+_RIG = """\
+std_msgs/Header header
+# The rig file.
+string yaml
+# Its numbers to the last bit, and the scanner's options, as JSON.
+string exact
+string options
+"""
+
+_POINTS = """\
+std_msgs/Header header
+uint32 height
+uint32 width
+sensor_msgs/PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense
+"""
+
+_FIELD = """\
+uint8 INT8=1
+uint8 UINT8=2
+uint8 INT16=3
+uint8 UINT16=4
+uint8 INT32=5
+uint8 UINT32=6
+uint8 FLOAT32=7
+uint8 FLOAT64=8
+string name
+uint32 offset
+uint8 datatype
+uint32 count
+"""
+
+_IMAGE = """\
+std_msgs/Header header
+string format
+uint8[] data
+"""
+
+POSTURE = Topic(
+    1, "/aqualvs/posture", "aqualvs_msgs/msg/Posture", _definition(_POSTURE, _HEADER, _TIME)
+)
+STRIPES = Topic(
+    2,
+    "/aqualvs/stripes",
+    "aqualvs_msgs/msg/Stripes",
+    _definition(_STRIPES, _HEADER, _TIME, ("aqualvs_msgs/Returns", _RETURNS)),
+)
+POINTS = Topic(
+    3,
+    "/aqualvs/points",
+    "sensor_msgs/msg/PointCloud2",
+    _definition(_POINTS, _HEADER, _TIME, ("sensor_msgs/PointField", _FIELD)),
+)
+HEALTH = Topic(
+    4,
+    "/aqualvs/health",
+    "aqualvs_msgs/msg/Health",
+    _definition(
+        _HEALTH, _HEADER, _TIME, ("aqualvs_msgs/Part", _PART), ("aqualvs_msgs/Delay", _DELAY)
+    ),
+)
+RIG = Topic(5, "/aqualvs/rig", "aqualvs_msgs/msg/Rig", _definition(_RIG, _HEADER, _TIME))
+PICTURE = Topic(
+    6,
+    "/aqualvs/picture",
+    "sensor_msgs/msg/CompressedImage",
+    _definition(_IMAGE, _HEADER, _TIME),
+)
+CHROMA = Topic(
+    7,
+    "/aqualvs/picture/chroma",
+    "sensor_msgs/msg/CompressedImage",
+    _definition(_IMAGE, _HEADER, _TIME),
+)
+TOPICS = (POSTURE, STRIPES, POINTS, HEALTH, RIG, PICTURE, CHROMA)
+"""All of them; a recording without pictures has no messages on the last two."""

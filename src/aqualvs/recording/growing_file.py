@@ -1,0 +1,374 @@
+"""An MCAP file that is complete after every single step of writing it.
+
+The format ends in a summary and a footer, so a file that is merely appended to cannot be read until
+it has been closed. This one always has them. Its size runs ahead of the data:
+
+::
+
+    header, schemas, chunks | padding ........ | data end, summary | padding ..... | footer
+                            ^ frontier                             ^ tail
+
+What is new goes into a padding, where no reader looks, all but its first nine bytes, and a smaller
+padding behind it. Then the nine bytes that were the old padding's head are replaced. They never
+straddle a page, and a system copies within a page in one go: whoever reads the file, and whenever
+the process is killed, sees the record whole or not at all. The summary's records are added in the
+same way. When one of the paddings is used up the file is made longer by its new footer alone, in
+one write behind a hole; that footer belongs to a second copy of the summary, because a footer in
+the middle of a summary is no valid file. Holes take no place on the disk.
+
+After a loss of power the order in which pages reached the disk counts, and what was written since
+the last `sync` may be torn; `reader.py` leaves out chunks whose checksum is wrong.
+
+Chunks: messages of about half a second, compressed together.
+"""
+
+import contextlib
+import errno
+import os
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import pyarrow as pa
+
+from aqualvs.sources import mcap_file
+from aqualvs.sources.mcap_file import DATA_END_BYTES, FOOTER_BYTES, HEAD_BYTES
+
+_COMPRESSION = "zstd"
+# The fastest level: higher ones gain 3 % on sub-pixel positions, for twice the time.
+_LEVEL = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """A chunk ready for the file.
+
+    Attributes
+    ----------
+    content : bytes
+        The chunk's record and its message indexes.
+    length : int
+        Of the record alone.
+    index_offsets : dict
+        Where each channel's message index begins, from the chunk's start.
+    times_ns : (int, int)
+        Log times of the first and the last message.
+    sizes : (int, int)
+        Compressed and raw.
+    counts : dict
+        Messages by channel.
+    """
+
+    content: bytes
+    length: int
+    index_offsets: dict[int, int]
+    times_ns: tuple[int, int]
+    sizes: tuple[int, int]
+    counts: dict[int, int]
+
+    def index_at(self, at: int) -> bytes:
+        """Return the record for the summary, with the chunk at a place in the file."""
+        return mcap_file.chunk_index(
+            self.times_ns,
+            at,
+            self.length,
+            {number: at + offset for number, offset in self.index_offsets.items()},
+            len(self.content) - self.length,
+            _COMPRESSION,
+            self.sizes,
+        )
+
+
+class ChunkBuilder:
+    """Gathers messages; `seal` compresses them."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._entries: dict[int, list[tuple[int, int]]] = {}
+        self.n_bytes = 0
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self._parts) // 2
+
+    def add(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
+        """Append a message; log times never fall."""
+        parts = mcap_file.message(channel, sequence, log_ns, publish_ns, data)
+        self._entries.setdefault(channel, []).append((log_ns, self.n_bytes))
+        self._parts += parts
+        self.n_bytes += len(parts[0]) + len(parts[1])
+
+    def seal(self) -> Chunk:
+        """Return the chunk of what was gathered: at least one message."""
+        raw = b"".join(self._parts)
+        packed = _codec().compress(raw, asbytes=True)
+        times = [entries[end][0] for entries in self._entries.values() for end in (0, -1)]
+        times_ns = (min(times), max(times))
+        whole = mcap_file.chunk(*times_ns, len(raw), zlib.crc32(raw), _COMPRESSION, packed)
+        indexes = [mcap_file.message_index(*item) for item in self._entries.items()]
+        offsets, at = {}, len(whole)
+        for number, index in zip(self._entries, indexes, strict=True):
+            offsets[number] = at
+            at += len(index)
+        return Chunk(
+            b"".join((whole, *indexes)),
+            len(whole),
+            offsets,
+            times_ns,
+            (len(packed), len(raw)),
+            Counter({number: len(entries) for number, entries in self._entries.items()}),
+        )
+
+
+@cache
+def _codec() -> Any:
+    return pa.Codec(_COMPRESSION, compression_level=_LEVEL)
+
+
+PAGE = 4096
+# Room for chunks, and for their index records, that the file gets at least when it is made longer.
+_DATA_BYTES = 8 << 20
+_INDEX_BYTES = 1 << 16
+# For what rounding to pages takes.
+_SPARE_BYTES = 3 * PAGE
+# Copying the summary costs at most this share of what is written.
+_DATA_PER_SUMMARY = 8
+
+
+class GrowingFile:
+    """Writer of one file, chunk by chunk.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist; it appears once the file is readable.
+    front : bytes
+        What the file begins with: magic, header, schemas and channels.
+    repeated : bytes
+        Schemas and channels once more, for the summary.
+    n_schemas : int
+    channels : sequence of int
+        Their numbers.
+    open_file : callable, optional
+        Opens a path for unbuffered reading and writing; for tests.
+
+    Raises
+    ------
+    OSError
+        From every method, as the system says it. After it the file is as it was before the call,
+        and the call may be repeated. `FileExistsError` if the path is taken.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        front: bytes,
+        repeated: bytes,
+        n_schemas: int,
+        channels: Sequence[int],
+        open_file: Callable[[Path], BinaryIO] | None = None,
+    ) -> None:
+        self._repeated, self._n_schemas = repeated, n_schemas
+        self._counts = dict.fromkeys(channels, 0)
+        self._n_chunks = 0
+        self._times_ns = (0, 0)
+        self._indexes: list[bytes] = []
+        self._index_bytes = 0
+        self._unlisted: list[bytes] = []
+        self._frontier = self._limit = self._summary_at = self._tail = self._size = 0
+        self._settled = True
+        draft = path.with_name(path.name + ".part")
+        self._file = (open_file or _open)(draft)
+        try:
+            self._begin(front)
+            _publish(draft, path)
+        except BaseException:
+            self._file.close()
+            draft.unlink(missing_ok=True)
+            raise
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of data so far, without the summary."""
+        return self._frontier
+
+    def append(self, chunk: Chunk) -> None:
+        """Write one chunk; when this returns it outlives the process."""
+        self._list_pending()
+        index = chunk.index_at(self._frontier)
+        self._make_room(len(chunk.content), len(index))
+        self._frontier = self._insert(self._frontier, chunk.content, self._limit)
+        self._note(chunk, index)
+        # The chunk is in the file; what cannot be listed now is listed by the next call.
+        with contextlib.suppress(OSError):
+            self._list_pending()
+
+    def sync(self) -> None:
+        """Wait until what was written is on the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Cut off what the file has too much, and close it; further calls do nothing.
+
+        It is closed and readable in any case.
+        """
+        if self._file.closed:
+            return
+        with self._file:
+            self._list_pending()
+            self._make_room(0, 0)
+            at = self._frontier
+            end = mcap_file.data_end() + self._summary() + mcap_file.footer(at + DATA_END_BYTES)
+            self._write(at + HEAD_BYTES, end[HEAD_BYTES:])
+            self._write(at, end[:HEAD_BYTES])
+            self._file.truncate(at + len(end))
+            self.sync()
+
+    def abandon(self) -> None:
+        """Close the file as it is, readable; further calls do nothing."""
+        self._file.close()
+
+    def _begin(self, front: bytes) -> None:
+        """Write a file without messages."""
+        self._frontier = len(front)
+        fill = self._fill(self._frontier)
+        self._frontier += len(fill)
+        self._write(0, front + fill)
+        self._size = self._size_for(self._frontier, 0)
+        self._settle()
+
+    def _insert(self, at: int, content: bytes, limit: int) -> int:
+        """Replace the beginning of the padding at `at`, which ends at `limit`, by whole records.
+
+        Returns
+        -------
+        at : int
+            Where the padding begins now.
+        """
+        content += self._fill(at + len(content))
+        end = at + len(content)
+        self._write(at + HEAD_BYTES, content[HEAD_BYTES:] + mcap_file.padding_head(limit - end))
+        self._write(at, content[:HEAD_BYTES])
+        return end
+
+    def _note(self, chunk: Chunk, index: bytes) -> None:
+        start_ns, end_ns = chunk.times_ns
+        first_ns, last_ns = self._times_ns if self._n_chunks else chunk.times_ns
+        self._times_ns = (min(first_ns, start_ns), max(last_ns, end_ns))
+        self._n_chunks += 1
+        for number, n in chunk.counts.items():
+            self._counts[number] += n
+        self._indexes.append(index)
+        self._index_bytes += len(index)
+        self._unlisted.append(index)
+
+    def _list_pending(self) -> None:
+        """Add what the summary lacks."""
+        while self._unlisted:
+            limit = self._size - FOOTER_BYTES
+            self._tail = self._insert(self._tail, self._unlisted[0], limit)
+            del self._unlisted[0]
+            self._write(self._summary_at, self._statistics())
+
+    def _make_room(self, n_data: int, n_index: int) -> None:
+        """Make the file longer where a chunk or its index, and the end that follows, do not fit."""
+        if not self._settled:
+            self._settle()
+        data_end = self._frontier + n_data + self._summary_bytes() + _SPARE_BYTES
+        index_end = self._tail + n_index + _SPARE_BYTES
+        if data_end > self._limit or index_end > self._size - FOOTER_BYTES:
+            self._grow(n_data)
+            self._settle()
+
+    def _grow(self, n_data: int) -> None:
+        """Make the file longer, with a copy of the summary where the data ended."""
+        size = self._size_for(self._size, n_data)
+        at = _down(self._limit - self._summary_bytes() - PAGE)
+        tail = self._write_summary(at, size)
+        self._write(size - FOOTER_BYTES, mcap_file.footer(at))
+        self._summary_at, self._tail, self._size, self._settled = at, tail, size, False
+
+    def _size_for(self, size: int, n_data: int) -> int:
+        """Return the size of a file that is longer by what data and summary will need."""
+        summary_bytes = self._summary_bytes()
+        data_bytes = max(_DATA_BYTES, _DATA_PER_SUMMARY * summary_bytes) + n_data
+        return _up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
+
+    def _settle(self) -> None:
+        """Put the summary near the end of the file and free what is before it."""
+        at = _down(self._size - FOOTER_BYTES - self._summary_room())
+        limit = at - DATA_END_BYTES
+        # Zeros, not a hole: adding to the summary then needs no new place on the disk.
+        tail = self._write_summary(at, self._size, zeros=_INDEX_BYTES // 2)
+        self._write(self._frontier, mcap_file.padding_head(limit - self._frontier))
+        self._write(self._size - FOOTER_BYTES, mcap_file.footer(at))
+        self._summary_at, self._tail, self._limit, self._settled = at, tail, limit, True
+
+    def _write_summary(self, at: int, size: int, zeros: int = 0) -> int:
+        """Write the end of the data and a summary, padded to the footer; returns its tail."""
+        summary = self._summary()
+        summary += self._fill(at + len(summary))
+        tail = at + len(summary)
+        padding = mcap_file.padding_head(size - FOOTER_BYTES - tail)
+        self._write(at - DATA_END_BYTES, mcap_file.data_end() + summary + padding + bytes(zeros))
+        return tail
+
+    def _summary(self) -> bytes:
+        listed = self._indexes[: len(self._indexes) - len(self._unlisted)]
+        return b"".join((self._statistics(), self._repeated, *listed))
+
+    def _summary_bytes(self) -> int:
+        return len(self._statistics()) + len(self._repeated) + self._index_bytes
+
+    def _summary_room(self) -> int:
+        """Return how much the summary may take before the file must be made longer."""
+        return self._summary_bytes() * 5 // 4 + _INDEX_BYTES + 2 * _SPARE_BYTES
+
+    def _statistics(self) -> bytes:
+        return mcap_file.statistics(self._n_schemas, self._n_chunks, self._times_ns, self._counts)
+
+    def _fill(self, at: int) -> bytes:
+        """Return a record of no meaning if a record's head at `at` would straddle two pages."""
+        left = PAGE - at % PAGE
+        if left >= HEAD_BYTES:
+            return b""
+        return mcap_file.padding_head(left + HEAD_BYTES) + bytes(left)
+
+    def _write(self, at: int, content: bytes) -> None:
+        self._file.seek(at)
+        rest = memoryview(content)
+        while len(rest):
+            # A disk that fills up takes a part; the next try makes it say why.
+            rest = rest[self._file.write(rest) :]
+
+
+def _up(n: int) -> int:
+    return -(-n // PAGE) * PAGE
+
+
+def _down(n: int) -> int:
+    return n // PAGE * PAGE
+
+
+def _open(path: Path) -> BinaryIO:
+    return path.open("w+b", buffering=0)
+
+
+def _publish(draft: Path, path: Path) -> None:
+    """Give a draft its name, never that of another file."""
+    try:
+        os.link(draft, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        # A file system without hard links, as memory cards have.
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
+        os.rename(draft, path)
+    else:
+        draft.unlink()

@@ -1,0 +1,414 @@
+"""Samples as messages, for the recording and for Foxglove; definitions are in `encoding.py`.
+
+All of them are in the frame `dome`, with angles in degrees as every border has them. Numbers that
+do not exist are NaN.
+
+From samples to the messages of a recording.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from aqualvs.control.time_filter import FilteredPosture
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
+from aqualvs.recording.encoding import (
+    CHROMA,
+    HEALTH,
+    PICTURE,
+    POINTS,
+    POSTURE,
+    RIG,
+    STRIPES,
+    CdrReader,
+    CdrWriter,
+    PictureFormat,
+    Topic,
+    jpeg_of,
+    options_text,
+    png_of,
+    rig_exact,
+    rig_yaml,
+)
+from aqualvs.recording.sample import LiveSample
+from aqualvs.scanner import ScannerOptions
+from aqualvs.scanning.laser_bands import SearchAxis
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.scan import Frame, ScanPoints
+from aqualvs.scanning.stripe import Returns
+from aqualvs.sources.base import Health, PartHealth, State
+
+FRAME_ID = "dome"
+_NAN = math.nan
+_STATES = {State.OFF: 0, State.OK: 1, State.WARN: 2, State.FAULT: 3}
+_FLOAT32, _UINT8 = 7, 2
+_FLOATS = ("x", "y", "z", "quality")
+_BYTES = ("intensity", "laser", "label", "used")
+_POINT = np.dtype([*((name, "<f4") for name in _FLOATS), *((name, "u1") for name in _BYTES)])
+
+
+def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
+    """Return range, pitch and yaw, raw and filtered."""
+    scan, posture, to = sample.scan, sample.scan.posture, CdrWriter()
+    to.header(stamp_ns, FRAME_ID)
+    to.numbers("q", scan.index)
+    to.numbers("d", scan.time_s)
+    to.numbers("?", bool(posture))
+    to.text("" if isinstance(posture, Posture) else posture.reason.value)
+    to.text("" if isinstance(posture, Posture) else posture.detail)
+    values = _posture_values(posture)
+    to.numbers("d", *values[:9], scan.n_water, *values[9:])
+    to.numbers("i", posture.n_points if isinstance(posture, Posture) else 0, len(scan.points))
+    filtered = sample.filtered
+    to.numbers("?", filtered is not None, filtered is not None and filtered.accepted)
+    to.numbers("d", *_filtered_values(filtered))
+    instants = sample.instants
+    to.numbers("d", 1e-9 * (instants.scanned_ns - instants.arrived_ns))
+    to.numbers("d", *_rig_values(posture))
+    return to.finish()
+
+
+def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
+    """Return what was detected, bit for bit, or why nothing was measured."""
+    scan, to = sample.scan, CdrWriter()
+    refusal = scan.posture if not sample.returns and not scan.posture else None
+    to.header(stamp_ns, FRAME_ID)
+    to.numbers("q", scan.index)
+    to.numbers("d", scan.time_s, scan.n_water)
+    to.text("" if refusal is None else refusal.reason.value)
+    to.text("" if refusal is None else refusal.detail)
+    to.numbers("I", len(sample.returns))
+    for axis, found in sample.returns.items():
+        to.text(axis.value)
+        to.array(found.line.astype(np.uint32))
+        for column in (found.position, found.height, found.width, found.likelihood):
+            to.array(column)
+    return to.finish()
+
+
+def stripes_of(
+    message: bytes,
+) -> tuple[int, float, float, dict[SearchAxis, Returns], Refusal | None]:
+    """Return frame, time, index of the water, stripes and refusal of a message.
+
+    Raises
+    ------
+    ValueError
+        If it is none of `stripes_message`.
+    """
+    of = CdrReader(message)
+    of.header()
+    index = of.number("q")
+    time_s, n_water = of.numbers("d", 2)
+    reason, detail = of.text(), of.text()
+    returns = {}
+    for _ in range(of.number("I")):
+        axis = SearchAxis(of.text())
+        line = of.array("u4").astype(np.int64)
+        position, height, width, likelihood = (of.array("f8") for _ in range(4))
+        # Recordings of 0.1.0 hold levels here, of returns that had passed a gate; NaN if grey.
+        likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
+        returns[axis] = Returns(line, position, height, width, likelihood)
+    return index, time_s, n_water, returns, Refusal(Reason(reason), detail) if reason else None
+
+
+def points_message(points: ScanPoints, stamp_ns: int) -> bytes:
+    """Return a point cloud; `label` is a number of `Label`, `laser` that of the rig."""
+    cloud = np.empty(len(points), _POINT)
+    cloud["x"], cloud["y"], cloud["z"] = points.points_in_dome.T
+    cloud["quality"] = points.quality
+    cloud["intensity"] = np.clip(points.intensity, 0.0, 255.0)
+    cloud["laser"], cloud["label"], cloud["used"] = points.laser, points.label, points.used
+    to = CdrWriter()
+    to.header(stamp_ns, FRAME_ID)
+    to.numbers("I", 1, len(points), len(_FLOATS) + len(_BYTES))
+    for i, name in enumerate(_FLOATS + _BYTES):
+        is_float = i < len(_FLOATS)
+        to.text(name)
+        to.numbers("I", 4 * i if is_float else 3 * len(_FLOATS) + i)
+        to.numbers("B", _FLOAT32 if is_float else _UINT8)
+        to.numbers("I", 1)
+    to.numbers("?", False)
+    to.numbers("I", _POINT.itemsize, cloud.nbytes)
+    to.blob(cloud.tobytes())
+    to.numbers("?", True)
+    return to.finish()
+
+
+def health_message(health: Health, stamp_ns: int) -> bytes:
+    """Return how the run goes."""
+    to = CdrWriter()
+    to.header(stamp_ns, "")
+    to.numbers("B", _STATES[health.state])
+    to.numbers("d", health.rate_hz, health.valid_share, health.quality)
+    to.numbers("d", health.n_water, health.sigma_n_water)
+    to.numbers("q", health.n_frames, health.n_dropped, health.n_lost)
+    parts = [("source", health.source)]
+    parts += [("laser", part) for part in health.lasers]
+    parts += [("output", part) for part in health.outputs]
+    to.numbers("I", len(parts))
+    for kind, part in parts:
+        _put_part(to, kind, part)
+    to.numbers("I", len(health.delays))
+    for delay in health.delays:
+        to.text(delay.name)
+        to.numbers("d", delay.median_s, delay.p99_s)
+    return to.finish()
+
+
+def rig_texts(rig: Rig, options: ScannerOptions) -> tuple[str, str, str]:
+    """Return the rig file, its exact numbers and the scanner's options as a message has them."""
+    return rig_yaml(rig), rig_exact(rig), options_text(options)
+
+
+def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
+    """Return what the run measures with, from `rig_texts`."""
+    to = CdrWriter()
+    to.header(stamp_ns, FRAME_ID)
+    for words in texts:
+        to.text(words)
+    return to.finish()
+
+
+def rig_texts_of(message: bytes) -> tuple[str, str, str]:
+    """Return the rig file, its exact numbers and the scanner's options of a message.
+
+    Raises
+    ------
+    ValueError
+        If it is none of `rig_message`.
+    """
+    of = CdrReader(message)
+    of.header()
+    return of.text(), of.text(), of.text()
+
+
+def image_message(kind: str, data: bytes, stamp_ns: int) -> bytes:
+    """Return a picture; `kind` is jpeg or png."""
+    to = CdrWriter()
+    to.header(stamp_ns, "cam")
+    to.text(kind)
+    to.blob(data)
+    return to.finish()
+
+
+def image_of(message: bytes) -> tuple[str, bytes]:
+    """Return kind and bytes of a picture's message.
+
+    Raises
+    ------
+    ValueError
+        If it is none of `image_message`.
+    """
+    of = CdrReader(message)
+    of.header()
+    return of.text(), of.blob()
+
+
+def _posture_values(posture: Posture | Refusal) -> list[float]:
+    """Return nine scalars, normal, covariance and curvatures."""
+    if not isinstance(posture, Posture):
+        return [_NAN] * 25
+    curvature = posture.curvature or (_NAN, _NAN)
+    sigma_curvature = posture.sigma_curvature or (_NAN, _NAN)
+    return [
+        *(posture.range, math.degrees(posture.pitch), math.degrees(posture.yaw)),
+        *_sigmas(posture.covariance),
+        *(posture.slant_range, posture.nearest, posture.rms),
+        *posture.normal_in_dome,
+        *np.ravel(posture.covariance),
+        *curvature,
+        *sigma_curvature,
+    ]
+
+
+def _rig_values(posture: Posture | Refusal) -> list[float]:
+    """Return standard deviations by the rig and by both, and the covariance by the rig."""
+    if not isinstance(posture, Posture):
+        return [_NAN] * 15
+    return [
+        *_sigmas(posture.rig_covariance),
+        *_sigmas(posture.total_covariance),
+        *np.ravel(posture.rig_covariance),
+    ]
+
+
+def _sigmas(covariance: FloatArray) -> list[float]:
+    sigma = np.sqrt(np.diagonal(covariance))
+    return [sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2])]
+
+
+def _filtered_values(filtered: FilteredPosture | None) -> list[float]:
+    if filtered is None:
+        return [_NAN] * 7
+    rates: Any = filtered.rates
+    return [
+        *(filtered.range, math.degrees(filtered.pitch), math.degrees(filtered.yaw)),
+        *(float(rates[0]), math.degrees(rates[1]), math.degrees(rates[2])),
+        filtered.age_s,
+    ]
+
+
+def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
+    to.text(kind)
+    to.text(part.name)
+    to.numbers("B", _STATES[part.state])
+    to.text(part.detail)
+    to.numbers("q", part.n_dropped)
+
+
+_HEALTH_EVERY_NS = 1_000_000_000
+# The rig is told again after a second, then at intervals that double up to a minute, and at the
+# end: a part that is damaged, the first one too, takes no rig with it.
+_RIG_AGAIN_NS, _RIG_EVERY_NS = 1_000_000_000, 60_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecorderOptions:
+    """What is recorded, and how safely.
+
+    Attributes
+    ----------
+    pictures : PictureFormat or None
+        Every frame's picture, or none of them.
+    jpeg_quality : int
+        1 to 100.
+    points_hz : float or None
+        Point clouds per second, for the eye: stripes, from which every point can be had again bit
+        for bit, are always kept. 0 for none, None for those of every frame.
+    scanner : ScannerOptions
+        That the run measures with; a replay uses them.
+    chunk_s : float
+        Time after which what was gathered is written: what the death of the process costs.
+    sync_s : float or None
+        Time after which it is also on the disk: what a loss of power costs. None leaves it to the
+        system.
+    max_waiting_bytes : int
+        Memory for what the disk has not taken yet.
+    """
+
+    pictures: PictureFormat | None = None
+    jpeg_quality: int = 90
+    points_hz: float | None = 5.0
+    scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    chunk_s: float = 0.5
+    sync_s: float | None = 5.0
+    max_waiting_bytes: int = 64 << 20
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if not 1 <= self.jpeg_quality <= 100:
+            raise OptionError(f"jpeg quality {self.jpeg_quality}: use 1 to 100")
+        if self.points_hz is not None and not self.points_hz >= 0.0:
+            raise OptionError(f"points_hz {self.points_hz:g}: use 0 or more")
+
+
+class SampleEncoder:
+    """Makes the messages of each sample.
+
+    Parameters
+    ----------
+    options : RecorderOptions
+    """
+
+    def __init__(self, options: RecorderOptions) -> None:
+        self._options = options
+        self._rig: Rig | None = None
+        self._exact = ""
+        self._rig_texts: tuple[str, str, str] | None = None
+        self._rig_wait_ns = self._rig_from_ns = 0
+        self._health_from_ns = self._points_from_ns = 0
+
+    def messages(self, sample: LiveSample, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+        """Yield topic and content; pictures come before the stripes that belong to them."""
+        yield from self.rig_messages(sample.rig, stamp_ns)
+        if sample.frame is not None:
+            yield from self._pictures(sample.frame, stamp_ns)
+        if not _is_silence(sample):
+            yield STRIPES, stripes_message(sample, stamp_ns)
+        yield POSTURE, posture_message(sample, stamp_ns)
+        if self._points_due(sample, stamp_ns):
+            yield POINTS, points_message(sample.scan.points, stamp_ns)
+        if stamp_ns >= self._health_from_ns:
+            self._health_from_ns = stamp_ns + _HEALTH_EVERY_NS
+            yield HEALTH, health_message(sample.health, stamp_ns)
+
+    def rig_messages(self, rig: Rig, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+        """Yield the rig if it is not the one before, or due again; its water is in every frame."""
+        if self._is_new(rig):
+            self._rig, self._exact = rig, rig_exact(rig)
+            self._rig_texts = rig_texts(rig, self._options.scanner)
+            self._rig_wait_ns = _RIG_AGAIN_NS
+        elif stamp_ns >= self._rig_from_ns:
+            self._rig_wait_ns = min(2 * self._rig_wait_ns, _RIG_EVERY_NS)
+        else:
+            return
+        self._rig_from_ns = stamp_ns + self._rig_wait_ns
+        yield from self.rig_again(stamp_ns)
+
+    def rig_again(self, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+        """Yield the rig that was told last, to the same bit."""
+        if self._rig_texts is not None:
+            yield RIG, rig_message(self._rig_texts, stamp_ns)
+
+    def _is_new(self, rig: Rig) -> bool:
+        if rig is self._rig:
+            return False
+        return self._exact != rig_exact(
+            rig if self._rig is None else rig.in_water(self._rig.n_water)
+        )
+
+    def _pictures(self, frame: Frame, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+        kind = self._options.pictures
+        if kind is PictureFormat.JPEG:
+            data = jpeg_of(frame, self._options.jpeg_quality)
+            yield PICTURE, image_message(kind, data, stamp_ns)
+        elif kind is PictureFormat.PNG:
+            luma, chroma = png_of(frame)
+            yield PICTURE, image_message(kind, luma, stamp_ns)
+            if chroma is not None:
+                yield CHROMA, image_message(kind, chroma, stamp_ns)
+
+    def _points_due(self, sample: LiveSample, stamp_ns: int) -> bool:
+        hz = self._options.points_hz
+        if not len(sample.scan.points) or hz == 0.0 or stamp_ns < self._points_from_ns:
+            return False
+        if hz is not None:
+            # A tenth of a period early rather than a whole frame late.
+            self._points_from_ns = stamp_ns + round(0.9e9 / hz)
+        return True
+
+
+class RecordClock:
+    """Gives every sample a time that rises, whatever the system's clock does.
+
+    That of the first sample is the system's; from there on the monotonic clock counts.
+
+    Attributes
+    ----------
+    last_ns : int
+        Time of the last sample.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None
+        self.last_ns = 0
+
+    def stamp_ns(self, sample: LiveSample) -> int:
+        """Return the time of a sample's arrival, nanoseconds since 1970."""
+        arrived_ns = sample.instants.arrived_ns
+        if self._offset_ns is None:
+            self._offset_ns = sample.utc_ns - arrived_ns
+        self.last_ns = max(self._offset_ns + arrived_ns, self.last_ns + 1)
+        return self.last_ns
+
+
+def _is_silence(sample: LiveSample) -> bool:
+    """Return whether a sample stands for no frame at all."""
+    posture = sample.scan.posture
+    return isinstance(posture, Refusal) and posture.reason is Reason.NO_FRAMES

@@ -1,0 +1,419 @@
+"""The recorder of a live run: an output that loses nothing and holds nobody up.
+
+A recording that is written in the caller's own time, as `aqualvs run` does it.
+
+Recording on and off while a run goes on.
+"""
+
+import errno
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+from aqualvs import __version__
+from aqualvs.errors import OutputError
+from aqualvs.recording.encoding import RIG, TOPICS, Topic
+from aqualvs.recording.growing_file import Chunk, ChunkBuilder, GrowingFile
+from aqualvs.recording.messages import RecordClock, RecorderOptions, SampleEncoder
+from aqualvs.recording.sample import LiveSample
+from aqualvs.sources import mcap_file
+from aqualvs.sources.base import PartHealth, State
+
+MAX_CHUNK_BYTES = 4 << 20
+
+
+class SampleChunks:
+    """Gathers the messages of samples in a chunk until it is due.
+
+    Parameters
+    ----------
+    options : RecorderOptions
+
+    Attributes
+    ----------
+    n_samples : int
+        In the present chunk.
+    """
+
+    def __init__(self, options: RecorderOptions) -> None:
+        self._encoder, self._clock = SampleEncoder(options), RecordClock()
+        self._chunk_ns = round(1e9 * options.chunk_s)
+        self._sequence = self._publish_ns = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._builder = ChunkBuilder()
+        self._from_ns = 0
+        self._holds_rig = False
+        self.n_samples = 0
+
+    def add(self, sample: LiveSample) -> bool:
+        """Add a sample; returns whether the chunk is due."""
+        stamp_ns = self._clock.stamp_ns(sample)
+        self._from_ns = self._from_ns or stamp_ns
+        self._publish_ns = max(sample.utc_ns, 0)
+        self._add(self._encoder.messages(sample, stamp_ns), stamp_ns)
+        self._sequence += 1
+        self.n_samples += 1
+        long = stamp_ns - self._from_ns >= self._chunk_ns
+        return long or self._builder.n_bytes >= MAX_CHUNK_BYTES
+
+    def finish(self) -> None:
+        """Add the rig once more, unless the present chunk holds it already."""
+        if not self._holds_rig:
+            stamp_ns = self._clock.last_ns
+            self._add(self._encoder.rig_again(stamp_ns), stamp_ns)
+
+    def _add(self, messages: Iterable[tuple[Topic, bytes]], stamp_ns: int) -> None:
+        for topic, data in messages:
+            self._holds_rig = self._holds_rig or topic is RIG
+            self._builder.add(topic.number, self._sequence, stamp_ns, self._publish_ns, data)
+
+    def take(self) -> ChunkBuilder:
+        """Return the messages so far, perhaps none, and begin anew."""
+        found = self._builder
+        self._begin()
+        return found
+
+
+class Recording:
+    """Writes samples to a file that is readable at any time.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    options : RecorderOptions
+
+    Raises
+    ------
+    OSError
+        From every method, as the system says it; what was written stays readable.
+    """
+
+    def __init__(self, path: Path, options: RecorderOptions) -> None:
+        self._chunks = SampleChunks(options)
+        self._file = recording_file(path)
+        self._closed = False
+
+    def write(self, sample: LiveSample) -> None:
+        """Add a sample; it is in the file after `RecorderOptions.chunk_s` at the latest."""
+        if self._chunks.add(sample):
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left and close the file; further calls do nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._chunks.finish()
+        try:
+            self._flush()
+        except OSError:
+            self._file.abandon()
+            raise
+        self._file.close()
+
+    def _flush(self) -> None:
+        messages = self._chunks.take()
+        if len(messages):
+            self._file.append(messages.seal())
+
+
+def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> GrowingFile:
+    """Begin a file with the topics of a recording.
+
+    Raises
+    ------
+    OSError
+        As `GrowingFile`.
+    """
+    repeated = b"".join(
+        mcap_file.schema(topic.number, topic.kind, topic.definition)
+        + mcap_file.channel(topic.number, topic.number, topic.name)
+        for topic in TOPICS
+    )
+    return GrowingFile(
+        path,
+        # The profile tells rosbag2 and its kin that the messages are ROS 2's.
+        front=mcap_file.MAGIC + mcap_file.header("ros2", f"aqualvs {__version__}") + repeated,
+        repeated=repeated,
+        n_schemas=len(TOPICS),
+        channels=[topic.number for topic in TOPICS],
+        open_file=open_file,
+    )
+
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+# How often a disk that refused is tried again, and a chunk without company is looked at.
+_RETRY_S, _LOOK_S = 2.0, 0.25
+_PATIENCE_S = 4.0
+
+
+class Recorder:
+    """Writes samples to a file that is readable at any time, by a thread of its own.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    options : RecorderOptions, optional
+        Defaults if left out.
+    open_file : callable, optional
+        As in `GrowingFile`; for tests.
+
+    Attributes
+    ----------
+    name, inline, keeps_all
+        As in `Output`.
+    path : Path
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be begun. Later faults are told by `health`: what does not fit
+        on the disk waits, as far as memory is granted, and is tried again.
+    """
+
+    name = "recorder"
+    inline = False
+    keeps_all = True
+
+    def __init__(
+        self,
+        path: Path,
+        options: RecorderOptions | None = None,
+        open_file: Callable[[Path], BinaryIO] | None = None,
+    ) -> None:
+        self.path = path
+        self._options = options or RecorderOptions()
+        self._chunks = SampleChunks(self._options)
+        self._file = _begun(path, open_file)
+        self._changed = threading.Condition()
+        self._waiting: deque[tuple[ChunkBuilder, int]] = deque()
+        self._waiting_bytes = 0
+        self._n_samples = self._n_dropped = 0
+        self._fault = ""
+        self._closing = False
+        self._began_s = self._chunk_s = self._synced_s = time.monotonic()
+        self._thread = threading.Thread(target=self._work, name=self.name, daemon=True)
+        self._thread.start()
+
+    def send(self, sample: LiveSample) -> None:
+        """Take a sample; returns without waiting for the disk."""
+        with self._changed:
+            if self._closing:
+                return
+            self._n_samples += 1
+            if self._chunks.add(sample):
+                self._hand_over()
+
+    def health(self) -> PartHealth:
+        """Return how much was recorded, or why no more is."""
+        n_dropped = self._n_dropped
+        size = f"{1e-6 * self._file.n_bytes:.1f} MB"
+        if self._fault:
+            return PartHealth(self.name, State.FAULT, f"{self._fault}; {size} kept", n_dropped)
+        if self._closing:
+            return PartHealth(self.name, State.OFF, f"{self.path.name}, {size}", n_dropped)
+        seconds = time.monotonic() - self._began_s
+        detail = f"{self.path.name}, {size} in {seconds:.0f} s"
+        if n_dropped:
+            return PartHealth(self.name, State.WARN, f"{detail}, {n_dropped} lost", n_dropped)
+        return PartHealth(self.name, State.OK, detail)
+
+    def close(self) -> None:
+        """Write what is left and close the file; further calls do nothing."""
+        with self._changed:
+            if not self._closing:
+                self._chunks.finish()
+                self._hand_over()
+                self._closing = True
+                self._changed.notify()
+        self._thread.join(_PATIENCE_S)
+
+    def _hand_over(self) -> None:
+        """Leave the present chunk to the thread, or drop it where too much waits already."""
+        n_samples, messages = self._chunks.n_samples, self._chunks.take()
+        self._chunk_s = time.monotonic()
+        if not len(messages):
+            return
+        if self._waiting_bytes + messages.n_bytes > self._options.max_waiting_bytes:
+            self._n_dropped += n_samples
+            return
+        self._waiting.append((messages, n_samples))
+        self._waiting_bytes += messages.n_bytes
+        self._changed.notify()
+
+    def _work(self) -> None:
+        while (messages := self._next()) is not None:
+            written = self._write(messages.seal())
+            with self._changed:
+                _, n_samples = self._waiting.popleft()
+                self._waiting_bytes -= messages.n_bytes
+                if not written:
+                    self._n_dropped += n_samples
+        self._end()
+
+    def _next(self) -> ChunkBuilder | None:
+        """Return the oldest chunk, which waits until it is written; None at the end."""
+        with self._changed:
+            while not self._waiting:
+                if self._closing:
+                    return None
+                self._changed.wait(_LOOK_S)
+                if time.monotonic() - self._chunk_s > self._options.chunk_s + _LOOK_S:
+                    self._hand_over()
+            return self._waiting[0][0]
+
+    def _write(self, chunk: Chunk) -> bool:
+        """Write a chunk, however often it takes; False if the recording ends before it worked."""
+        while True:
+            try:
+                self._file.append(chunk)
+            except OSError as fault:
+                self._fault = _words(fault)
+            else:
+                self._fault = ""
+                self._sync_if_due()
+                return True
+            if self._must_end():
+                return False
+
+    def _sync_if_due(self) -> None:
+        every_s, now_s = self._options.sync_s, time.monotonic()
+        if every_s is None or now_s - self._synced_s < every_s:
+            return
+        self._synced_s = now_s
+        try:
+            self._file.sync()
+        except OSError as fault:
+            self._fault = _words(fault)
+
+    def _must_end(self) -> bool:
+        """Wait before the disk is tried again; returns whether there is no time left for it."""
+        with self._changed:
+            return self._closing or self._changed.wait_for(lambda: self._closing, _RETRY_S)
+
+    def _end(self) -> None:
+        try:
+            self._file.close()
+        except OSError as fault:
+            self._fault = _words(fault)
+
+
+def _begun(path: Path, open_file: Callable[[Path], BinaryIO] | None) -> GrowingFile:
+    try:
+        return recording_file(path, open_file)
+    except FileExistsError:
+        raise OutputError(f"{path}: exists; give the recording another name") from None
+    except OSError as fault:
+        raise OutputError(f"{path}: {_words(fault)}; choose another place") from fault
+
+
+def _words(fault: OSError) -> str:
+    if fault.errno in _FULL:
+        return "the disk is full"
+    return f"cannot be written ({fault.strerror or fault})"
+
+
+class RecorderSwitch:
+    """An output that records when told to; every start makes a file of its own.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when it is needed.
+    options : RecorderOptions, optional
+        Defaults if left out.
+
+    Attributes
+    ----------
+    name, inline, keeps_all
+        As in `Output`.
+    """
+
+    name = "recorder"
+    inline = False
+    keeps_all = True
+
+    def __init__(self, folder: Path, options: RecorderOptions | None = None) -> None:
+        self._folder, self._options = folder, options or RecorderOptions()
+        self._lock = threading.Lock()
+        self._recorder: Recorder | None = None
+        self._last: PartHealth | None = None
+
+    @property
+    def path(self) -> Path | None:
+        """File that is being written, None where none is."""
+        recorder = self._recorder
+        return None if recorder is None else recorder.path
+
+    def start(self, path: Path | None = None) -> Path:
+        """Begin to record, if that is not yet so.
+
+        Parameters
+        ----------
+        path : Path or None
+            File to write, which must not exist; None names it by the time (UTC).
+
+        Returns
+        -------
+        path : Path
+            File that is being written.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be begun.
+        """
+        with self._lock:
+            if self._recorder is None:
+                self._recorder = Recorder(path or self._free_path(), self._options)
+            return self._recorder.path
+
+    def stop(self) -> Path | None:
+        """Close the file; returns it, or None if nothing was being recorded."""
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            return None
+        recorder.close()
+        self._last = recorder.health()
+        return recorder.path
+
+    def send(self, sample: LiveSample) -> None:
+        """Record a sample, if recording is on."""
+        recorder = self._recorder
+        if recorder is not None:
+            recorder.send(sample)
+
+    def health(self) -> PartHealth:
+        """Return how the recording is; off says what the last one was."""
+        recorder = self._recorder
+        if recorder is not None:
+            return recorder.health()
+        return self._last or PartHealth(self.name, State.OFF, "not recording")
+
+    def close(self) -> None:
+        """Close the file; further calls do nothing."""
+        self.stop()
+
+    def _free_path(self) -> Path:
+        """Return a name by the time that no file has."""
+        stem = f"dive_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as fault:
+            raise OutputError(
+                f"{self._folder}: cannot be made ({fault.strerror}); choose another folder"
+            ) from fault
+        path, n = self._folder / f"{stem}.mcap", 1
+        while path.exists():
+            n += 1
+            path = self._folder / f"{stem}_{n}.mcap"
+        return path

@@ -1,0 +1,477 @@
+"""Residuals over the picture: vectors, coverage, and their histogram.
+
+Pictures of a calibration with points drawn over them, small enough to embed.
+"""
+
+import base64
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import cv2
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.report import svg as draw
+from aqualvs.report.calibration_material import MarkKind, Overlay, PictureShot, ResidualMap
+from aqualvs.report.html import Raw
+from aqualvs.scanning.scan import ImagePlane
+
+# Greatest width and JPEG quality, tried in this order until a picture fits its share of the page.
+_SIZES = ((960, 80), (800, 75), (640, 72), (480, 65), (360, 55), (240, 45))
+_ALL_BYTES = 340_000
+_MOST_BYTES = 130_000
+_ALL_MARKS = 6000
+_UNDER = "#10181c"
+# Size of a mark and widths of its line and of the dark edge under it, for a picture 640 wide.
+_SHAPES: dict[MarkKind, tuple[float, float, float]] = {
+    "cross": (5.0, 1.5, 3.2),
+    "dot": (0.0, 4.0, 5.6),
+    "circle": (5.5, 1.5, 3.2),
+}
+
+
+def picture_view(shots: Sequence[PictureShot]) -> Raw:
+    """Return pictures with their points, captions and legends.
+
+    Raises
+    ------
+    ValueError
+        If an image is empty, not of 8 bits, or neither grey nor of three channels.
+    """
+    figures = "".join(_figure(shot, index, len(shots)) for index, shot in enumerate(shots))
+    return Raw(f'<div class="shots">{figures}</div>')
+
+
+def _figure(shot: PictureShot, index: int, count: int) -> str:
+    jpeg, width, height = _embedded(shot.image, min(_MOST_BYTES, _ALL_BYTES // count))
+    scale = width / shot.image.shape[1]
+    body = [f'<image href="data:image/jpeg;base64,{jpeg}" width="{width}" height="{height}"/>']
+    limit = _ALL_MARKS // count // max(len(shot.points), 1)
+    for layer, overlay in enumerate(shot.points):
+        name = f"marks-{index}-{layer}"
+        body.append(_marks(overlay, name, scale, width / 640.0, limit))
+    picture = draw.svg(width, height, body, alt=_alt(shot), kind="picture")
+    return (
+        f"<figure>{picture}<figcaption>{escape(shot.caption)}</figcaption>"
+        f"{_legend(shot.points)}</figure>"
+    )
+
+
+def _embedded(image: ImagePlane, most_bytes: int) -> tuple[str, int, int]:
+    """Return a picture as JPEG in base64 with its width and height."""
+    if image.dtype != np.uint8 or not image.size or image.ndim not in (2, 3):
+        raise ValueError(f"image has shape {image.shape} of {image.dtype}, expected 8-bit pixels")
+    if image.ndim == 3 and image.shape[2] != 3:
+        raise ValueError(f"image has {image.shape[2]} channels, expected grey or 3")
+    for widest, quality in _SIZES:
+        jpeg, width, height = _jpeg(image, widest, quality)
+        if len(jpeg) <= most_bytes:
+            break
+    return base64.b64encode(jpeg).decode("ascii"), width, height
+
+
+def _jpeg(image: ImagePlane, widest: int, quality: int) -> tuple[bytes, int, int]:
+    small = image
+    if image.shape[1] > widest:
+        size = (widest, max(1, round(image.shape[0] * widest / image.shape[1])))
+        small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, jpeg = cv2.imencode(".jpg", small, (cv2.IMWRITE_JPEG_QUALITY, quality))
+    return jpeg.tobytes(), small.shape[1], small.shape[0]
+
+
+def _marks(overlay: Overlay, name: str, scale: float, grown: float, limit: int) -> str:
+    """Return the marks twice, dark and wide below, so that they stand out from any picture."""
+    pixels = overlay.pixels[np.isfinite(overlay.pixels).all(axis=1)]
+    places = (pixels[draw.sampled(len(pixels), limit)] + 0.5) * scale
+    size, thin, wide = (grown * value for value in _SHAPES[overlay.kind])
+    path = _path(places, overlay.kind, size)
+    layers = "".join(
+        f'<use href="#{name}" stroke="{colour}" stroke-width="{draw.num(width)}"/>'
+        for colour, width in ((_UNDER, wide), (escape(overlay.colour), thin))
+    )
+    return (
+        f'<defs><path id="{name}" d="{path}"/></defs>'
+        f'<g fill="none" stroke-linecap="round">{layers}</g>'
+    )
+
+
+def _path(places: FloatArray, kind: MarkKind, size: float) -> str:
+    if kind == "dot":
+        return draw.points_path(places)
+    s, d = draw.num(size), draw.num(2.0 * size)
+    if kind == "cross":
+        shape = (-size, 0.0, f"h{d}m-{s} -{s}v{d}")
+    else:
+        shape = (-size, 0.0, f"a{s} {s} 0 1 0 {d} 0a{s} {s} 0 1 0 -{d} 0")
+    dx, dy, rest = shape
+    return "".join(f"M{draw.num(x + dx)} {draw.num(y + dy)}{rest}" for x, y in places.tolist())
+
+
+def _alt(shot: PictureShot) -> str:
+    shown = ", ".join(overlay.label for overlay in shot.points if overlay.label)
+    return f"{shot.caption}; drawn over it: {shown}" if shown else shot.caption
+
+
+def _legend(points: Sequence[Overlay]) -> str:
+    items = "".join(
+        f"<li>{_key(overlay)}{escape(overlay.label)}</li>" for overlay in points if overlay.label
+    )
+    return f'<ul class="legend">{items}</ul>' if items else ""
+
+
+def _key(overlay: Overlay) -> str:
+    size, thin, wide = _SHAPES[overlay.kind]
+    path = _path(np.array([[9.0, 8.0]]), overlay.kind, size)
+    lines = "".join(
+        f'<path d="{path}" stroke="{colour}" stroke-width="{width}"/>'
+        for colour, width in ((_UNDER, wide), (escape(overlay.colour), thin))
+    )
+    return (
+        '<svg class="key square" viewBox="0 0 18 16" fill="none" stroke-linecap="round" '
+        f'aria-hidden="true">{lines}</svg>'
+    )
+
+
+N_VECTORS = 3000
+
+_WIDTH, _LEFT, _HEAD, _RIGHT, _FOOT = 760.0, 50.0, 30.0, 8.0, 28.0
+# Lengths of vectors as a share of the picture's width: typical ones, and where long ones are cut.
+_TYPICAL, _LONGEST = 0.03, 0.09
+_COLUMNS = 10
+_SIDE, _SIDE_HEIGHT = 400.0, 240.0
+_BINS = 32
+_REACH = 4.0
+_PALE, _DEEP = np.array([222.0, 238.0, 245.0]), np.array([11.0, 92.0, 125.0])
+_GAUSS_WITHIN_ONE = math.erf(math.sqrt(0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """The points of a map that are finite."""
+
+    size_px: tuple[int, int]
+    pixels: FloatArray
+    residuals: FloatArray
+    view: IntArray
+    used: BoolArray
+
+    @property
+    def used_residuals(self) -> FloatArray:
+        return self.residuals[self.used]
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """From pixels to places in the chart, and from residuals to vectors."""
+
+    per_px: float
+    magnified: float
+    longest: float
+
+    def places(self, pixels: FloatArray) -> FloatArray:
+        """Return where pixels lie; the centre of the first is half a pixel inside the frame."""
+        return np.array([_LEFT, _HEAD]) + (pixels + 0.5) * self.per_px
+
+    def vectors(self, residuals: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return vectors in the chart and which had to be cut."""
+        vectors = residuals * (self.magnified * self.per_px)
+        length = np.hypot(vectors[:, 0], vectors[:, 1])
+        cut = length > self.longest
+        shrink = np.where(cut, self.longest / np.where(cut, length, 1.0), 1.0)
+        return vectors * shrink[:, None], cut
+
+
+def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = N_VECTORS) -> Raw:
+    """Return a map's charts: vectors, coverage, histogram, each with its words.
+
+    Parameters
+    ----------
+    found : ResidualMap
+    names : sequence of str
+        Names of the views that `found.view_index` counts.
+    n_vectors : int
+        Draw at most so many points; outliers go first, the others are a random choice.
+    """
+    points = _finite(found)
+    side = "".join(
+        f"<figure>{chart}<figcaption>{escape(words)}</figcaption></figure>"
+        for chart, words in (_coverage_chart(points, found.title), _histogram(points, found.title))
+    )
+    vectors, words, legend = _vector_chart(points, found.title, names, n_vectors)
+    return Raw(
+        f'<div class="residuals"><figure>{vectors}{legend}<figcaption>{escape(words)}'
+        f'</figcaption></figure><div class="side">{side}</div></div>'
+    )
+
+
+def _vector_chart(
+    points: _Points, title: str, names: Sequence[str], n_vectors: int
+) -> tuple[Raw, str, Raw]:
+    """Return one vector per point, what to say of them, and a legend."""
+    scale = _scale_of(points)
+    rows = _thinned(points, n_vectors)
+    width, height = (scale.per_px * side for side in points.size_px)
+    vectors, cut = scale.vectors(points.residuals)
+    starts = scale.places(points.pixels)
+    # An inner picture of the frame's size cuts what would run over the numbers beside it.
+    frame = f"{_LEFT:g} {_HEAD:g} {draw.num(width)} {draw.num(height)}"
+    x, y, w, h = frame.split()
+    body = [
+        *_frame(points.size_px, scale),
+        f'<svg x="{x}" y="{y}" width="{w}" height="{h}" viewBox="{frame}">',
+        *_view_groups(points, rows, starts, vectors, names),
+        *_outliers(rows[~points.used[rows]], starts, vectors),
+        "</svg>",
+        *_scale_bar(scale),
+    ]
+    words = _vector_words(points, len(rows), bool(cut[rows].any()))
+    total = (width + _LEFT + _RIGHT, height + _HEAD + _FOOT)
+    chart = draw.svg(*total, body, alt=f"{title}: residual vectors. {words}", kind="map")
+    return chart, words, _vector_legend(bool((~points.used).any()))
+
+
+def _coverage_chart(points: _Points, title: str) -> tuple[Raw, str]:
+    """Return how many used points lie in each cell of the picture, and the share covered."""
+    counts = _cell_counts(points)
+    covered = 100.0 * float((counts > 0).mean())
+    width, height = points.size_px
+    size = _SIDE - 2.0
+    tall = size * height / width
+    dx, dy = size / counts.shape[1], tall / counts.shape[0]
+    body: list[str] = []
+    for (row, column), count in np.ndenumerate(counts):
+        x, y = 1.0 + dx * column, 1.0 + dy * row
+        body += _cell(x, y, dx, dy, int(count), int(counts.max()))
+    words = f"Coverage: {covered:.0f} % of the picture’s cells hold points, as many as they say"
+    words += "." if counts.all() else "; hatched cells hold none."
+    alt = f"{title}: coverage of the picture, {covered:.0f} % of its cells hold points"
+    return draw.svg(_SIDE, tall + 2.0, body, alt=alt, kind="coverage"), words
+
+
+def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
+    """Return the histogram of used residuals beside the Gaussian of their rms."""
+    values = points.used_residuals.ravel()
+    rms = _rms(values)
+    if not len(values) or not rms > 0.0:
+        return Raw(""), "No residuals to count."
+    reach = _REACH * rms
+    counts, edges = np.histogram(values, _BINS, range=(-reach, reach))
+    dense = np.linspace(-reach, reach, 97)
+    bell = len(values) * (2.0 * _REACH / _BINS) / math.sqrt(2.0 * math.pi)
+    curve = bell * np.exp(-0.5 * (dense / rms) ** 2)
+    x_axis = draw.Axis(-reach, reach, 10.0, _SIDE - 10.0)
+    y_axis = draw.Axis(0.0, 1.06 * max(float(counts.max()), bell), _SIDE_HEIGHT - 46.0, 8.0)
+    body = [
+        *_bars(counts, edges, x_axis, y_axis),
+        _bell(dense, curve, x_axis, y_axis),
+        *_histogram_axis(x_axis, y_axis),
+    ]
+    words = _histogram_words(values, rms)
+    alt = f"{title}: histogram of residuals. {words}"
+    return draw.svg(_SIDE, _SIDE_HEIGHT, body, alt=alt, kind="histogram"), words
+
+
+def _finite(found: ResidualMap) -> _Points:
+    fine = np.isfinite(found.pixels).all(axis=1) & np.isfinite(found.residuals).all(axis=1)
+    return _Points(
+        found.size_px,
+        found.pixels[fine],
+        found.residuals[fine],
+        found.view_index[fine],
+        found.inliers[fine],
+    )
+
+
+def _scale_of(points: _Points) -> _Scale:
+    """Return the scale at which nine of ten used residuals are at most of typical length."""
+    width = points.size_px[0]
+    per_px = (_WIDTH - _LEFT - _RIGHT) / width
+    residuals = points.used_residuals if points.used.any() else points.residuals
+    lengths = np.hypot(residuals[:, 0], residuals[:, 1])
+    typical = float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0
+    # Without any residual every magnification is as good; one pixel then fills the typical length.
+    least = _TYPICAL * width / (typical if typical > 1e-9 else 1.0)
+    return _Scale(per_px, draw.round_step(least / 2.0), _LONGEST * width * per_px)
+
+
+def _thinned(points: _Points, limit: int) -> IntArray:
+    """Return the rows to draw: outliers up to half the limit, then used points at random."""
+    outliers, used = np.flatnonzero(~points.used), np.flatnonzero(points.used)
+    outliers = outliers[draw.sampled(len(outliers), max(limit // 2, limit - len(used)))]
+    used = used[draw.sampled(len(used), limit - len(outliers))]
+    return np.sort(np.concatenate([outliers, used]))
+
+
+def _frame(size_px: tuple[int, int], scale: _Scale) -> Iterator[str]:
+    """Yield the picture's edge with round pixels beside it."""
+    width, height = (scale.per_px * side for side in size_px)
+    yield draw.box(_LEFT, _HEAD, width, height, fill="#fff", stroke=draw.EDGE)
+    half = 0.5 * scale.per_px
+    x_axis = draw.Axis(0.0, float(size_px[0]), _LEFT + half, _LEFT + half + width)
+    y_axis = draw.Axis(0.0, float(size_px[1]), _HEAD + half, _HEAD + half + height)
+    foot = _HEAD + height
+    for x, words in x_axis.ticks(7):
+        if x < _LEFT + width - 14.0:
+            yield draw.line(x, foot, x, foot + 5) + draw.words_at(x, foot + 20, words)
+    yield draw.words_at(_LEFT + width, foot + 20, "px", anchor="end")
+    for y, words in y_axis.ticks(6):
+        if y < foot:
+            yield draw.line(_LEFT - 5, y, _LEFT, y)
+            yield draw.words_at(_LEFT - 9, y + 5, words, anchor="end")
+
+
+def _view_groups(
+    points: _Points, rows: IntArray, starts: FloatArray, vectors: FloatArray, names: Sequence[str]
+) -> Iterator[str]:
+    """Yield the used points, view by view; a pointer over one tells the view and its rms."""
+    style = f'stroke="{draw.ACCENT}" fill="none" stroke-linecap="round"'
+    rows = rows[points.used[rows]]
+    for view in np.unique(points.view[rows]).tolist():
+        mine = rows[points.view[rows] == view]
+        rms = _rms_of_lengths(points.residuals[points.used & (points.view == view)])
+        name = names[view] if 0 <= view < len(names) else f"view {view + 1}"
+        yield (
+            f"<g {style}><title>{escape(name)}: {rms:.3f} px rms</title>"
+            f'<path d="{draw.points_path(starts[mine])}" stroke-width="2.6"/>'
+            f'<path d="{_vector_path(starts[mine], vectors[mine])}" stroke-width="1.1"/></g>'
+        )
+
+
+def _outliers(rows: IntArray, starts: FloatArray, vectors: FloatArray) -> Iterator[str]:
+    if len(rows):
+        crosses = "".join(_cross(x, y) for x, y in starts[rows].tolist())
+        yield (
+            f'<path d="{crosses}{_vector_path(starts[rows], vectors[rows])}" fill="none" '
+            f'stroke="{draw.OUTLIER}" stroke-width="1.5"/>'
+        )
+
+
+def _vector_path(starts: FloatArray, vectors: FloatArray) -> str:
+    return "".join(
+        f"M{draw.num(x)} {draw.num(y)}l{draw.num(dx)} {draw.num(dy)}"
+        for (x, y), (dx, dy) in zip(starts.tolist(), vectors.tolist(), strict=True)
+    )
+
+
+def _cross(x: float, y: float) -> str:
+    corner = f"M{draw.num(x - 4)} {draw.num(y - 4)}"
+    return f"{corner}l8 8m0 -8l-8 8"
+
+
+def _scale_bar(scale: _Scale) -> Iterator[str]:
+    """Yield a bar of a round residual with its length and the magnification in words."""
+    per_residual = scale.magnified * scale.per_px
+    residual = draw.round_step(45.0 / per_residual)
+    y, end = 14.0, _LEFT + residual * per_residual
+    yield draw.line(_LEFT, y, end, y, colour=draw.ACCENT, more=' stroke-width="2"')
+    for x in (_LEFT, end):
+        yield draw.line(x, y - 5, x, y + 5, colour=draw.ACCENT, more=' stroke-width="2"')
+    words = f"{residual:g} px; residuals are drawn {scale.magnified:,g} times as long as they are"
+    yield draw.words_at(end + 10, y + 5, words, anchor="start", kind="strong")
+
+
+def _vector_words(points: _Points, drawn: int, cut: bool) -> str:
+    total, used = len(points.used), points.used_residuals
+    if not total:
+        return "No points."
+    said = f"{int(points.used.sum()):,} points used"
+    if len(used):
+        said += f", {_rms_of_lengths(used):.3f} px rms"
+    if total > len(used):
+        many = "" if total - len(used) == 1 else "s"
+        said += f"; {total - len(used):,} outlier{many} left out"
+    said += "."
+    if drawn < total:
+        said += f" A random {drawn:,} of {total:,} points are drawn."
+    return said + (" The longest vectors are cut." if cut else "")
+
+
+def _vector_legend(outliers: bool) -> Raw:
+    shapes = [
+        (
+            f'<path d="M5 9h0" stroke-width="4" stroke-linecap="round" stroke="{draw.ACCENT}"/>'
+            f'<path d="M5 9L25 4" stroke="{draw.ACCENT}" stroke-width="1.4"/>',
+            "dot: measured point; line: its residual (measured minus predicted)",
+        )
+    ]
+    if outliers:
+        cross = f'<path d="M9 2l8 8m0 -8l-8 8" stroke="{draw.OUTLIER}" stroke-width="1.7"/>'
+        shapes.append((cross, "outlier, not used"))
+    items = "".join(
+        f'<li><svg class="key" viewBox="0 0 28 12" fill="none" aria-hidden="true">{shape}</svg>'
+        f"{words}</li>"
+        for shape, words in shapes
+    )
+    return Raw(f'<ul class="legend">{items}</ul>')
+
+
+def _cell_counts(points: _Points) -> IntArray:
+    """Return the used points in each cell; cells are about square, ten to a row."""
+    width, height = points.size_px
+    rows = max(1, round(_COLUMNS * height / width))
+    pixels = points.pixels[points.used] + 0.5
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1], pixels[:, 0], bins=(rows, _COLUMNS), range=((0, height), (0, width))
+    )
+    return counts.astype(np.int64)
+
+
+def _cell(x: float, y: float, dx: float, dy: float, count: int, most: int) -> Iterator[str]:
+    if not count:
+        yield draw.box(x, y, dx, dy, fill="#fff", stroke="#b9c5cc")
+        yield draw.line(x, y + dy, x + dx, y, colour="#b08968")
+        yield draw.line(x, y + dy / 2, x + dx / 2, y, colour="#b08968")
+        yield draw.line(x + dx / 2, y + dy, x + dx, y + dy / 2, colour="#b08968")
+        return
+    # The root keeps thinly covered cells apart from each other.
+    deep = math.sqrt(count / most)
+    red, green, blue = (_PALE + deep * (_DEEP - _PALE)).round().astype(int)
+    yield draw.box(x, y, dx, dy, fill=f"#{red:02x}{green:02x}{blue:02x}", stroke="#fff")
+    shown = f"{count}" if count < 10_000 else f"{count / 1000:.0f}k"
+    # Where black and white words contrast equally.
+    kind = "on-deep" if deep > 0.74 else "on-pale"
+    yield draw.words_at(x + dx / 2, y + dy / 2 + 4.5, shown, kind=kind)
+
+
+def _bars(
+    counts: IntArray, edges: FloatArray, x_axis: draw.Axis, y_axis: draw.Axis
+) -> Iterator[str]:
+    lefts, tops = x_axis.place(edges), y_axis.place(counts.astype(np.float64))
+    width = float(lefts[1] - lefts[0])
+    for left, top in zip(lefts[:-1].tolist(), tops.tolist(), strict=True):
+        yield draw.box(left, top, width, y_axis.start - top, fill=draw.BAND, stroke="#fff")
+
+
+def _bell(x: FloatArray, y: FloatArray, x_axis: draw.Axis, y_axis: draw.Axis) -> str:
+    places = zip(x_axis.place(x).tolist(), y_axis.place(y).tolist(), strict=True)
+    path = "M" + "L".join(f"{draw.num(a)} {draw.num(b)}" for a, b in places)
+    return f'<path d="{path}" fill="none" stroke="{draw.OUTLIER}" stroke-width="1.8"/>'
+
+
+def _histogram_axis(x_axis: draw.Axis, y_axis: draw.Axis) -> Iterator[str]:
+    foot = y_axis.start
+    yield draw.line(x_axis.start, foot, x_axis.end, foot)
+    for x, words in x_axis.ticks(8):
+        yield draw.line(x, foot, x, foot + 5) + draw.words_at(x, foot + 20, words)
+    middle = 0.5 * (x_axis.start + x_axis.end)
+    yield draw.words_at(middle, foot + 40, "residual in x and in y, px", kind="axis")
+
+
+def _histogram_words(values: FloatArray, rms: float) -> str:
+    within = 100.0 * float((np.abs(values) <= rms).mean())
+    beyond = int((np.abs(values) > _REACH * rms).sum())
+    said = (
+        f"Bars: residuals, x and y apart. Line: the Gaussian of their rms, {rms:.3f} px. "
+        f"{within:.0f} % lie within one rms (Gaussian: {100 * _GAUSS_WITHIN_ONE:.0f} %)"
+    )
+    return said + (f"; {beyond:,} beyond the chart." if beyond else ".")
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _rms_of_lengths(residuals: FloatArray) -> float:
+    return _rms(np.hypot(residuals[:, 0], residuals[:, 1]))

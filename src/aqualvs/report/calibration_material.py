@@ -1,0 +1,395 @@
+"""What the page of a calibration shows: plain values, filled in by the commands.
+
+Units are those of the page, as the suffixes say. A number that is not known is NaN, or None where
+the type allows it; the page shows a dash for it. Every part of a page may be empty.
+
+Parts of a calibration's page that all steps have.
+"""
+
+import math
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from aqualvs import __version__
+from aqualvs.calibration.targets.targets import View
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.optics.expected_error import expected_posture_errors
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty
+from aqualvs.optics.solved import completed_uncertainty
+from aqualvs.report.findings import Card
+from aqualvs.scanning.scan import ImagePlane
+
+MarkKind: TypeAlias = Literal["cross", "dot", "circle"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualMap:
+    """Reprojection residuals over the picture, for the points of all views together.
+
+    Attributes
+    ----------
+    title : str
+    size_px : (int, int)
+        Width and height of the pictures.
+    pixels : array, shape (N, 2)
+        Measured points as (x, y); rows that are not finite are left out.
+    residuals : array, shape (N, 2)
+        Measured minus predicted, in pixels.
+    view_index : int array, shape (N,)
+        Row of the view in `Page.views`.
+    inliers : bool array, shape (N,)
+        False for points that the solution did not use.
+    """
+
+    title: str
+    size_px: tuple[int, int]
+    pixels: FloatArray
+    residuals: FloatArray
+    view_index: IntArray
+    inliers: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewRow:
+    """One view: a picture in which the target was looked for.
+
+    Attributes
+    ----------
+    name : str
+    n_points : int
+    rms_px : float
+        Of the distances between measured and predicted points.
+    remark : str
+        Why it was left out, say; may be empty.
+    used : bool
+        Whether the solution rests on it.
+    """
+
+    name: str
+    n_points: int
+    rms_px: float
+    remark: str = ""
+    used: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterRow:
+    """One calibrated parameter.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+    sigma : float or None
+        Standard deviation; None for a parameter that was held.
+    unit : str
+    digits : int
+        Decimals of the value.
+    before : float or None
+        What the rig said before the calibration.
+    remark : str
+    """
+
+    name: str
+    value: float
+    sigma: float | None
+    unit: str = ""
+    digits: int = 2
+    before: float | None = None
+    remark: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpectationRow:
+    """What the calibration lets expect on a target, as standard deviations.
+
+    Attributes
+    ----------
+    range_m : float
+        Distance of the target.
+    sigma_range_mm, sigma_pitch_deg, sigma_yaw_deg : float
+        Systematic: from the calibration's covariance, the same in every picture.
+    noise_range_mm, noise_pitch_deg, noise_yaw_deg : float
+        Random: from the noise of the stripes in one picture.
+    """
+
+    range_m: float
+    sigma_range_mm: float
+    sigma_pitch_deg: float
+    sigma_yaw_deg: float
+    noise_range_mm: float = float("nan")
+    noise_pitch_deg: float = float("nan")
+    noise_yaw_deg: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaserRow:
+    """One calibrated laser plane, n·X = offset in `dome`.
+
+    Attributes
+    ----------
+    name : str
+    normal : array, shape (3,)
+        Unit normal in `dome`.
+    offset_mm : float
+    sigma_normal_deg, sigma_offset_mm : float
+        Standard deviations of the normal's direction and of the offset.
+    rms_px, rms_mm : float
+        Of the points' distances from the plane, in the picture and in space.
+    n_points : int
+    surfaces : str
+        What its stripes were seen on: "floor, back wall".
+    model : str
+        "plane" or "refracted sheet".
+    moved : str
+        In words, against the rig before; may be empty.
+    """
+
+    name: str
+    normal: FloatArray
+    offset_mm: float
+    sigma_normal_deg: float
+    sigma_offset_mm: float
+    rms_px: float
+    rms_mm: float
+    n_points: int
+    surfaces: str = ""
+    model: str = "plane"
+    moved: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Series:
+    """A value over something, usually time.
+
+    Attributes
+    ----------
+    title, x_label, y_label : str
+    x, y : array, shape (N,)
+        `x` ascending; the line is broken where `y` is NaN.
+    sigma : array, shape (N,), or None
+        Standard deviations of `y`, drawn as a band.
+    level : (str, float) or None
+        A named horizontal line.
+    marks : tuple of (float, str)
+        Places on the x axis and what happened there.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    x: FloatArray
+    y: FloatArray
+    sigma: FloatArray | None = None
+    level: tuple[str, float] | None = None
+    marks: tuple[tuple[float, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overlay:
+    """Points drawn over a picture.
+
+    Attributes
+    ----------
+    pixels : array, shape (N, 2)
+        (x, y) in the full picture; rows that are not finite are left out.
+    colour : str
+        #RRGGBB.
+    kind : {'cross', 'dot', 'circle'}
+    label : str
+        What they are, for the legend; without one the legend leaves them out.
+    """
+
+    pixels: FloatArray
+    colour: str
+    kind: MarkKind = "cross"
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureShot:
+    """A picture with points drawn over it.
+
+    Attributes
+    ----------
+    caption : str
+    image : uint8 array, shape (height, width) or (height, width, 3)
+        Grey, or blue, green, red.
+    points : tuple of Overlay
+    """
+
+    caption: str
+    image: ImagePlane
+    points: tuple[Overlay, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Page:
+    """The page of one calibration.
+
+    Attributes
+    ----------
+    title, subtitle : str
+    cards : tuple of Card
+        The headline's numbers.
+    warnings : tuple of str
+    words : tuple of str
+        What was found, one plain sentence each.
+    residual_maps : tuple of ResidualMap
+    views : tuple of ViewRow
+    parameters : tuple of ParameterRow
+    expectations : tuple of ExpectationRow
+    lasers : tuple of LaserRow
+        In the rig's order, which gives them their colours.
+    series : tuple of Series
+    pictures : tuple of PictureShot
+    facts : tuple of (str, str)
+        Date, command, versions, files.
+    """
+
+    title: str
+    subtitle: str = ""
+    cards: tuple[Card, ...] = ()
+    warnings: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+    residual_maps: tuple[ResidualMap, ...] = ()
+    views: tuple[ViewRow, ...] = ()
+    parameters: tuple[ParameterRow, ...] = ()
+    expectations: tuple[ExpectationRow, ...] = ()
+    lasers: tuple[LaserRow, ...] = ()
+    series: tuple[Series, ...] = ()
+    pictures: tuple[PictureShot, ...] = ()
+    facts: tuple[tuple[str, str], ...] = ()
+
+
+_DEG = 180.0 / math.pi
+_NAMES = {
+    "lens_x": ("lens x", "mm", 1e3, 3),
+    "lens_y": ("lens y", "mm", 1e3, 3),
+    "lens_z": ("lens z", "mm", 1e3, 3),
+    "rotation_x": ("camera rotation x", "°", _DEG, 3),
+    "rotation_y": ("camera rotation y", "°", _DEG, 3),
+    "rotation_z": ("camera rotation z", "°", _DEG, 3),
+    "inner_radius": ("dome inner radius", "mm", 1e3, 3),
+    "thickness": ("dome thickness", "mm", 1e3, 3),
+    "n_air": ("index of the air inside", "", 1.0, 5),
+    "n_acrylic": ("index of the dome", "", 1.0, 4),
+    "n_water": ("index of the water", "", 1.0, 5),
+    "fx": ("fx", "px", 1.0, 2),
+    "fy": ("fy", "px", 1.0, 2),
+    "cx": ("cx", "px", 1.0, 2),
+    "cy": ("cy", "px", 1.0, 2),
+}
+
+
+def expectations(rig: Rig) -> tuple[ExpectationRow, ...]:
+    """Return what a rig's calibration means on a wall at the usual ranges; none without lasers."""
+    if not rig.lasers:
+        return ()
+    return tuple(
+        ExpectationRow(
+            range_m=found.wall_range,
+            sigma_range_mm=1e3 * float(found.sigma_calibration[0]),
+            sigma_pitch_deg=_DEG * float(found.sigma_calibration[1]),
+            sigma_yaw_deg=_DEG * float(found.sigma_calibration[2]),
+            noise_range_mm=1e3 * float(found.sigma_noise[0]),
+            noise_pitch_deg=_DEG * float(found.sigma_noise[1]),
+            noise_yaw_deg=_DEG * float(found.sigma_noise[2]),
+        )
+        for found in expected_posture_errors(rig, completed_uncertainty(rig))
+    )
+
+
+def parameter_rows(
+    rig: Rig,
+    uncertainty: RigUncertainty,
+    names: Sequence[str],
+    before: Rig | None = None,
+    remarks: Mapping[str, str] | None = None,
+) -> tuple[ParameterRow, ...]:
+    """Return the named numbers of a rig's camera, with sigma and what they were before."""
+    values, sigmas = camera_numbers(rig), uncertainty.sigmas
+    old = {} if before is None else camera_numbers(before)
+    rows = []
+    for name in names:
+        label, unit, factor, digits = _NAMES.get(name, (name, "", 1.0, 5))
+        sigma = sigmas.get(name)
+        rows.append(
+            ParameterRow(
+                name=label,
+                value=factor * values[name],
+                sigma=None if not sigma else factor * sigma,
+                unit=unit,
+                digits=digits,
+                before=factor * old[name] if name in old else None,
+                remark=(remarks or {}).get(name, ""),
+            )
+        )
+    return tuple(rows)
+
+
+def camera_numbers(rig: Rig) -> dict[str, float]:
+    """Return the numbers of a rig's camera by name, SI units and radians.
+
+    The rotation is the rig file's: a vector that is applied after the nominal mounting.
+    """
+    lens = rig.lens
+    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    numbers = dict(zip(lens.parameter_names, values, strict=True))
+    turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T)
+    for axis, place, angle in zip("xyz", rig.dome_from_cam.translation, turn, strict=True):
+        numbers[f"lens_{axis}"] = float(place)
+        numbers[f"rotation_{axis}"] = float(angle)
+    numbers["n_air"], numbers["n_water"] = rig.n_air, rig.n_water
+    if rig.dome is not None:
+        numbers["inner_radius"] = rig.dome.inner_radius
+        numbers["thickness"] = rig.dome.thickness
+        numbers["n_acrylic"] = rig.dome.n_acrylic
+    return numbers
+
+
+def residual_map(
+    title: str,
+    size_px: tuple[int, int],
+    views: Sequence[View],
+    residuals: Sequence[FloatArray],
+    inliers: Sequence[BoolArray],
+) -> ResidualMap:
+    """Return the residuals (measured minus predicted, px) of several views as one map."""
+    return ResidualMap(
+        title=title,
+        size_px=size_px,
+        pixels=np.concatenate([view.pixels for view in views]),
+        residuals=np.concatenate(list(residuals)),
+        view_index=np.concatenate([np.full(len(view), i) for i, view in enumerate(views)]),
+        inliers=np.concatenate(list(inliers)),
+    )
+
+
+def missed_rows(missed: Mapping[str, str]) -> tuple[ViewRow, ...]:
+    """Return rows for the pictures in which the target was not found."""
+    return tuple(
+        ViewRow(name=name, n_points=0, rms_px=float("nan"), remark=why, used=False)
+        for name, why in missed.items()
+    )
+
+
+def facts(*more: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+    """Return date, command and version, and what else is given."""
+    command = shlex.join(["aqualvs", *sys.argv[1:]])
+    # Hundreds of pictures say no more than the first and the last few.
+    if len(command) > 600:
+        command = f"{command[:300]} ... {command[-280:]}"
+    return (
+        ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+        ("command", command),
+        ("aqualvs", __version__),
+        *more,
+    )

@@ -1,0 +1,373 @@
+"""The report of a calibration: one page of plain HTML that opens anywhere and prints well.
+
+The commands fill a `Page`; everything in it is escaped here. There are no scripts, and nothing is
+asked of a network.
+
+The tables of a calibration's page; what is not known shows as a dash.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.report import html
+from aqualvs.report import svg as draw
+from aqualvs.report.calibration_charts import N_VECTORS, picture_view, residual_view
+from aqualvs.report.calibration_material import (
+    ExpectationRow,
+    LaserRow,
+    Overlay,
+    Page,
+    ParameterRow,
+    PictureShot,
+    ResidualMap,
+    Series,
+    ViewRow,
+)
+from aqualvs.report.html import Raw, swatch, table
+from aqualvs.report.svg import line_chart
+from aqualvs.results.files import writing
+from aqualvs.text import signed
+
+DASH = "–"
+LIMIT_PERCENT, LIMIT_DEG = 0.5, 0.5
+
+_MOVED_SIGMAS = 3.0
+_HIGH_RMS = 2.5
+_ROWS_PER_COLUMN = 18
+_BAR, _BAR_HEIGHT, _BAR_REACH = 180.0, 14.0, 4.0
+
+
+def number(value: float | None, digits: int, *, plus: bool = False) -> str:
+    """Return a number with a true minus sign, or a dash if there is none."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    # Adding zero turns a rounded -0.0 into 0.0.
+    rounded = round(value, digits) + 0.0
+    return signed(f"{rounded:{'+' if plus and rounded else ''}.{digits}f}")
+
+
+def view_table(views: Sequence[ViewRow]) -> Raw:
+    """Return the views with a bar for the rms of each; in two columns if they are many."""
+    usual = _usual_rms(views)
+    remarks = any(view.remark or not view.used for view in views)
+    halves = 2 if len(views) > _ROWS_PER_COLUMN else 1
+    length = -(-len(views) // halves)
+    parts = [
+        _view_part(views[start : start + length], usual, remarks)
+        for start in range(0, len(views), length)
+    ]
+    lead = ""
+    if math.isfinite(usual):
+        lead = (
+            '<p class="lead">Distance between measured and predicted points, rms. The dashed line '
+            f"is the median of the views used, {usual:.3f} px; orange views are left out, or more "
+            f"than {_HIGH_RMS:g} times as far off.</p>"
+        )
+    return Raw(f'{lead}<div class="halves">{"".join(parts)}</div>')
+
+
+def parameter_table(rows: Sequence[ParameterRow]) -> Raw:
+    """Return values with their sigmas and, where it is known, what they were before."""
+    changed = any(_known(row.before) for row in rows)
+    remarks = any(row.remark for row in rows)
+    head = ["parameter", "value", "± σ", "unit"]
+    head += ["before", "change", "change in σ"] if changed else []
+    head += ["remark"] if remarks else []
+    cells = []
+    for row in rows:
+        line = [row.name, number(row.value, row.digits), _sigma_text(row), row.unit or DASH]
+        line += _change_cells(row) if changed else []
+        line += [row.remark] if remarks else []
+        cells.append(line)
+    return Raw(table(head, cells, tail=int(remarks)))
+
+
+def expectation_view(rows: Sequence[ExpectationRow]) -> Raw:
+    """Return what the calibration lets expect on a target: a sentence and a table."""
+    head = ("target at", "σ from", "range, mm", "range, %", "pitch, °", "yaw, °")
+    cells = [line for row in rows for line in _expectation_lines(row)]
+    return Raw(_expectation_words(rows) + table(head, cells, texts=2))
+
+
+def laser_tables(rows: Sequence[LaserRow]) -> Raw:
+    """Return the laser planes, and how well each is known; two tables, to fit on paper."""
+    moved = any(row.moved for row in rows)
+    planes = ["laser", "normal x", "normal y", "normal z", "offset, mm", "model"]
+    planes += ["moved"] if moved else []
+    quality = ["laser", "σ normal, °", "σ offset, mm", "rms, px", "rms, mm", "points", "seen on"]
+    plane_cells, quality_cells = [], []
+    for index, row in enumerate(rows):
+        name = Raw(swatch(index) + escape(row.name))
+        normal = [number(float(value), 5, plus=True) for value in np.ravel(row.normal)]
+        line = [name, *normal, number(row.offset_mm, 2), row.model or DASH]
+        plane_cells.append(line + ([row.moved or DASH] if moved else []))
+        quality_cells.append(
+            [
+                name,
+                number(row.sigma_normal_deg, 3),
+                number(row.sigma_offset_mm, 3),
+                number(row.rms_px, 2),
+                number(row.rms_mm, 3),
+                f"{row.n_points:,}",
+                row.surfaces or DASH,
+            ]
+        )
+    return Raw(
+        '<p class="lead">Plane n·X = offset, in the frame of the dome (x right, y forward, z up).'
+        f"</p>{table(planes, plane_cells, tail=1 + moved)}{table(quality, quality_cells, tail=1)}"
+    )
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _marked(text: str, wrong: bool) -> str:
+    return Raw(f'<span class="refused">{escape(text)}</span>') if wrong else text
+
+
+def _usual_rms(views: Sequence[ViewRow]) -> float:
+    values = [view.rms_px for view in views if view.used and math.isfinite(view.rms_px)]
+    return float(np.median(values)) if values else math.nan
+
+
+def _view_part(views: Sequence[ViewRow], usual: float, remarks: bool) -> str:
+    head = ["view", "", "rms, px", "points", *(["remark"] if remarks else [])]
+    cells = []
+    for view in views:
+        wrong = not view.used or view.rms_px > _HIGH_RMS * usual
+        words = "; ".join(filter(None, ("" if view.used else "left out", view.remark)))
+        remark = [_marked(words, wrong)] if remarks else []
+        line = [
+            _marked(view.name, wrong),
+            _bar(view, usual, wrong),
+            _marked(number(view.rms_px, 3), wrong),
+            f"{view.n_points:,}",
+            *remark,
+        ]
+        cells.append(line)
+    return table(head, cells, tail=int(remarks))
+
+
+def _bar(view: ViewRow, usual: float, wrong: bool) -> Raw:
+    """Return the rms as a bar; one that would be too long is cut open at its end."""
+    if not math.isfinite(view.rms_px):
+        return Raw("")
+    reach = _BAR_REACH * usual if usual > 0.0 else max(view.rms_px, 1e-9)
+    length = _BAR * min(view.rms_px / reach, 1.0)
+    colour = draw.OUTLIER if wrong else draw.ACCENT
+    body = [draw.box(0.0, 2.0, length, _BAR_HEIGHT - 4.0, fill=colour, stroke="none")]
+    if view.rms_px > reach:
+        gap = ' stroke-width="3"'
+        body.append(draw.line(_BAR - 16, _BAR_HEIGHT, _BAR - 10, 0, colour="#fff", more=gap))
+    if usual > 0.0:
+        x = _BAR / _BAR_REACH
+        dashed = ' stroke-width="1.2" stroke-dasharray="3 2"'
+        body.append(draw.line(x, 0.0, x, _BAR_HEIGHT, colour="#1c2a33", more=dashed))
+    return draw.svg(_BAR, _BAR_HEIGHT, body, alt=f"{view.rms_px:.3f} px", kind="bar")
+
+
+def _sigma_text(row: ParameterRow) -> str:
+    """Return sigma with the value's decimals, or more where these would hide it."""
+    if row.sigma is None:
+        return "held"
+    digits = row.digits
+    if math.isfinite(row.sigma) and row.sigma > 0.0:
+        digits = min(max(digits, 1 - math.floor(math.log10(row.sigma))), digits + 3)
+    return number(row.sigma, digits)
+
+
+def _change_cells(row: ParameterRow) -> list[str]:
+    if row.before is None or not math.isfinite(row.before):
+        return [DASH, DASH, DASH]
+    change = row.value - row.before
+    sigmas = math.nan
+    if row.sigma is not None and row.sigma > 0.0:
+        sigmas = change / row.sigma
+    return [
+        number(row.before, row.digits),
+        number(change, row.digits, plus=True),
+        _marked(number(sigmas, 1, plus=True), abs(sigmas) > _MOVED_SIGMAS),
+    ]
+
+
+def _parts_of(row: ExpectationRow) -> dict[str, tuple[float, float, float]]:
+    """Return standard deviations of range (mm), pitch and yaw (degrees) by their cause."""
+    system = (row.sigma_range_mm, row.sigma_pitch_deg, row.sigma_yaw_deg)
+    noise = (row.noise_range_mm, row.noise_pitch_deg, row.noise_yaw_deg)
+    both = [math.hypot(s, n) for s, n in zip(system, noise, strict=True)]
+    return {
+        "calibration": system,
+        "noise of one picture": noise,
+        "both": (both[0], both[1], both[2]),
+    }
+
+
+def _percent(row: ExpectationRow, range_mm: float) -> float:
+    return 0.1 * range_mm / row.range_m if row.range_m > 0.0 else math.nan
+
+
+def _expectation_lines(row: ExpectationRow) -> Iterator[list[str]]:
+    for cause, (range_mm, pitch, yaw) in _parts_of(row).items():
+        percent = _percent(row, range_mm)
+        strong = cause == "both"
+        yield [
+            f"{number(row.range_m, 2)} m" if cause == "calibration" else "",
+            Raw(f"<b>{cause}</b>") if strong else cause,
+            number(range_mm, 2),
+            _marked(number(percent, 3), percent > LIMIT_PERCENT),
+            _marked(number(pitch, 3), pitch > LIMIT_DEG),
+            _marked(number(yaw, 3), yaw > LIMIT_DEG),
+        ]
+
+
+def _excess(row: ExpectationRow) -> float:
+    """Return the worst of range, pitch and yaw, relative to what it should stay within."""
+    range_mm, pitch, yaw = _seen(row)
+    parts = (_percent(row, range_mm) / LIMIT_PERCENT, pitch / LIMIT_DEG, yaw / LIMIT_DEG)
+    return math.nan if any(math.isnan(part) for part in parts) else max(parts)
+
+
+def _seen(row: ExpectationRow) -> tuple[float, float, float]:
+    """Return both causes together; the calibration's alone where the noise is not known."""
+    parts = _parts_of(row)
+    both = parts["both"]
+    return both if all(map(math.isfinite, both)) else parts["calibration"]
+
+
+def _expectation_words(rows: Sequence[ExpectationRow]) -> str:
+    known = [row for row in rows if math.isfinite(_excess(row))]
+    if not known:
+        return '<p class="verdict bad">What to expect on a target is not known.</p>'
+    worst = max(known, key=_excess)
+    range_mm, pitch, yaw = _seen(worst)
+    fine = _excess(worst) <= 1.0 and len(known) == len(rows)
+    limits = f"{LIMIT_PERCENT:g} % of range and {LIMIT_DEG:g}°"
+    where = " at every distance" if len(rows) > 1 else ""
+    start = f"Good to {limits}{where}." if fine else f"Not good to {limits}."
+    cause, end = "one picture gives", "averaging pictures does not remove it."
+    if not all(map(math.isfinite, _parts_of(worst)["both"])):
+        cause, end = "the calibration alone gives", "the noise of the picture comes on top."
+    means = (
+        f" On a target at {number(worst.range_m, 2)} m {cause} the range to "
+        f"{number(range_mm, 1)} mm ({number(_percent(worst, range_mm), 2)} %), pitch to "
+        f"{number(pitch, 2)}° and yaw to {number(yaw, 2)}° (one standard deviation). The "
+        f"calibration’s part is the same in every picture: {end}"
+    )
+    kind = "good" if fine else "bad"
+    return f'<p class="verdict {kind}"><b>{start}</b>{means}</p>'
+
+
+__all__ = [
+    "ExpectationRow",
+    "LaserRow",
+    "Overlay",
+    "Page",
+    "ParameterRow",
+    "PictureShot",
+    "ResidualMap",
+    "Series",
+    "ViewRow",
+    "page_html",
+    "write_page",
+]
+
+# Vectors of all maps together; with them and the pictures' share a page stays below 1 MB.
+_ALL_VECTORS = 7500
+
+
+def write_page(page: Page, path: Path) -> Path:
+    """Write the report of a calibration.
+
+    Parameters
+    ----------
+    page : Page
+    path : Path
+        The file to write.
+
+    Returns
+    -------
+    path : Path
+        The page. It carries all it needs and asks no network.
+
+    Raises
+    ------
+    OutputError
+        If the page cannot be written.
+    """
+    # Names of files that are no Unicode reach Python as surrogates, which UTF-8 refuses.
+    data = page_html(page).encode("utf-8", errors="replace")
+    with writing(path):
+        path.write_bytes(data)
+    return path
+
+
+def page_html(page: Page) -> str:
+    """Return the report of a calibration as HTML."""
+    return html.page(
+        {
+            "title": html.text(page.title),
+            "subtitle": html.text(page.subtitle),
+            "summary": _summary(page),
+            "sections": "\n".join(
+                f'<section id="{name}">\n<h2>{heading}</h2>\n{body}\n</section>'
+                for name, heading, body in _sections(page)
+            ),
+            "css": html.asset("report.css") + html.asset("calibration.css"),
+        },
+        "calibration.html",
+    )
+
+
+def _summary(page: Page) -> str:
+    parts = [html.notice(page.warnings)]
+    if page.cards:
+        parts.insert(0, f'<div class="cards">{html.cards(page.cards)}</div>')
+    if page.words:
+        items = "".join(f"<li>{escape(words)}</li>" for words in page.words)
+        parts.append(
+            f'<section id="findings"><h2>Findings</h2><ul class="findings">{items}</ul></section>'
+        )
+    return "\n".join(parts)
+
+
+def _sections(page: Page) -> Iterator[tuple[str, str, str]]:
+    """Yield name, heading and content of the parts that are not empty."""
+    if page.expectations:
+        body = expectation_view(page.expectations)
+        yield "expectations", "What it means on a target", body
+    if page.parameters:
+        yield "parameters", "Parameters", parameter_table(page.parameters)
+    if page.lasers:
+        yield "lasers", "Lasers", laser_tables(page.lasers)
+    if page.series:
+        yield "series", "Charts", _series(page)
+    if page.residual_maps:
+        yield "residuals", "Residuals", _residuals(page)
+    if page.views:
+        yield "views", "Views", view_table(page.views)
+    if page.pictures:
+        yield "pictures", "Pictures", picture_view(page.pictures)
+    if page.facts:
+        yield "facts", "Command, files and versions", html.fact_table(page.facts)
+
+
+def _series(page: Page) -> str:
+    return "\n".join(
+        f'<div class="whole"><h3>{escape(series.title)}</h3>{line_chart(series)}</div>'
+        for series in page.series
+    )
+
+
+def _residuals(page: Page) -> str:
+    names = [view.name for view in page.views]
+    share = min(N_VECTORS, _ALL_VECTORS // len(page.residual_maps))
+    return "\n".join(
+        f'<div class="whole"><h3>{escape(found.title)}</h3>'
+        f"{residual_view(found, names, n_vectors=share)}</div>"
+        for found in page.residual_maps
+    )

@@ -1,0 +1,58 @@
+"""Figures that are written to files: no display is needed.
+
+How the printed figures look: one column of a journal, or two.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def new_canvas(width_in: float, height_in: float) -> "Figure":
+    """Return an empty figure of a size in inches, on Matplotlib's Agg canvas."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+BLUE, ORANGE, GREEN, PURPLE = "#1f4fc8", "#d55e00", "#1a8f5a", "#8a4fbf"
+DARK, GREY, PALE, PINK = "#23272e", "#8a8f98", "#d9dce1", "#f06fae"
+OURS, PAPER, TRUTH = BLUE, ORANGE, DARK
+"""The same three everywhere: what we measure, the paper's way, and the truth."""
+
+WIDTH_IN: Mapping[str, float] = {"column": 3.5, "page": 7.2}
+
+STYLE: Mapping[Any, Any] = {
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e6ea",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.1,
+    "pdf.fonttype": 42,
+    "savefig.dpi": 200,
+}
+
+
+def new_figure(height_in: float, width: Literal["column", "page"] = "page") -> "Figure":
+    """Return an empty figure that needs no display; draw inside `style()`.
+
+    Parameters
+    ----------
+    height_in : float
+        Height in inches.
+    width : {"column", "page"}
+        As wide as a journal's column or page.
+    """
+    return new_canvas(WIDTH_IN[width], height_in)

@@ -1,0 +1,220 @@
+"""What a run amounts to: the headline and the warnings, in plain words."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.report.charts import stretch_end_s, stretch_words, stretches
+from aqualvs.report.frames import Picture
+from aqualvs.report.points import PointSummary
+from aqualvs.report.run_data import Track
+from aqualvs.text import clock, signed
+
+_LONG_GAP_S = 2.0
+_FEW_POINTS = 60
+_LOOSE = 0.02
+_WATER_STEP = 5e-4
+_MOST_GAPS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """One number of the headline: its name, the number, and a line below it."""
+
+    name: str
+    value: str
+    note: str
+
+
+def headline(track: Track) -> list[Card]:
+    """Return the numbers at the top of the report."""
+    share = float(track.valid.mean())
+    valid = f"{int(track.valid.sum())} of {len(track)} frames"
+    cards = [
+        _posture_card("Range", "mm", 0, track, scale=1e3, digits=1),
+        _posture_card("Pitch", "°", 1, track, scale=1.0, digits=2),
+        _posture_card("Yaw", "°", 2, track, scale=1.0, digits=2),
+        Card("Frames with a posture", f"{100 * share:.1f} %", valid),
+        Card("Duration", clock(duration_s(track)), _rate_words(track)),
+    ]
+    water = track.n_water[np.isfinite(track.n_water)]
+    if len(water):
+        note = "fresh water is about 1.335, sea water 1.342"
+        if np.ptp(water) > 1e-4:
+            note = f"{water.min():.4f} to {water.max():.4f} over the dive"
+        cards.append(Card("Water's refractive index", f"{np.median(water):.4f}", note))
+    return cards
+
+
+def duration_s(track: Track) -> float:
+    """Return the time from the first frame to the last, in seconds."""
+    return float(track.time_s[-1] - track.time_s[0])
+
+
+def warnings_of(
+    track: Track,
+    points: PointSummary | None,
+    pictures: Mapping[int, Picture],
+    run: Mapping[str, Any],
+    working_range: tuple[float, float] | None,
+    names: list[str],
+) -> list[str]:
+    """Return what the reader of the report should know, most important first."""
+    return [
+        *_status_warnings(run, track),
+        *_summary_words(run, "laser_agreement"),
+        *_summary_words(run, "net_check"),
+        *_gap_warnings(track),
+        *_range_warnings(track, working_range),
+        *_precision_warnings(track),
+        *(_laser_warnings(points, names) if points is not None else ()),
+        *_picture_warnings(pictures),
+        *_water_warnings(track),
+        *_own_warnings(run),
+    ]
+
+
+def errors_against(truth: FloatArray, posture: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+    """Return rms and greatest absolute error (3,) each, and the number of frames compared.
+
+    Parameters
+    ----------
+    truth, posture : array, shape (N, 3)
+        Range in metres, pitch and yaw in degrees; NaN where there is none.
+    """
+    error = posture - truth
+    error = error[np.isfinite(error).all(axis=1)]
+    if not len(error):
+        return np.full(3, np.nan), np.full(3, np.nan), 0
+    return np.sqrt((error**2).mean(axis=0)), np.abs(error).max(axis=0), len(error)
+
+
+def _posture_card(
+    name: str, unit: str, column: int, track: Track, *, scale: float, digits: int
+) -> Card:
+    values = scale * track.posture[track.valid, column]
+    if not len(values):
+        return Card(name, "–", "no frame gave a posture")
+    sign = "" if column == 0 else "+"
+    gap = " " if column == 0 else ""
+    note = f"{values.min():{sign}.{digits}f} to {values.max():{sign}.{digits}f}{gap}{unit}"
+    sigmas = (
+        scale * track.sigma[track.valid, column],
+        scale * track.sigma_total[track.valid, column],
+    )
+    frame, total = (sigma[np.isfinite(sigma)] for sigma in sigmas)
+    if len(frame):
+        note += f"; σ typically {np.median(frame):.{digits}f}{gap}{unit} by the frame's noise, "
+        note += f"{np.median(total):.{digits}f}{gap}{unit} with the rig's uncertainty"
+    value = f"{np.median(values):{sign}.{digits}f}{gap}{unit}"
+    return Card(name, signed(value), signed(f"median; {note}"))
+
+
+def _rate_words(track: Track) -> str:
+    if len(track) < 2 or not duration_s(track) > 0.0:
+        return f"{len(track)} frames"
+    return f"{len(track)} frames, {(len(track) - 1) / duration_s(track):.3g} per second"
+
+
+def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
+    status = run.get("status")
+    if status is not None and status != "finished":
+        until = clock(float(track.time_s[-1]))
+        yield f"The run did not finish (status: {status}); this page covers it up to {until}."
+    if run.get("error"):
+        yield f"The run ended with: {run['error']}"
+    share = float(track.valid.mean())
+    if share < 0.5:
+        yield f"Only {100 * share:.0f} % of the frames gave a posture."
+
+
+def _summary_words(run: Mapping[str, Any], name: str) -> Iterator[str]:
+    """Yield what a part of the run's summary has to say, as a sentence."""
+    summary = run.get("summary")
+    found = summary.get(name) if isinstance(summary, dict) else None
+    words = found.get("words") if isinstance(found, dict) else None
+    if isinstance(words, str) and words:
+        yield f"{words[0].upper()}{words[1:]}."
+
+
+def _gap_warnings(track: Track) -> Iterator[str]:
+    spans = [(stretch_end_s(found, track), found) for found in stretches(track)]
+    long = [
+        (end - start, start, found) for (start, end), found in spans if end - start > _LONG_GAP_S
+    ]
+    long.sort(key=lambda gap: -gap[0])
+    for length, start, found in long[:_MOST_GAPS]:
+        words = stretch_words(found, track)
+        yield f"No posture for {clock(length)} from {_moment(start)} on: {words}."
+    if len(long) > _MOST_GAPS:
+        yield f"{len(long) - _MOST_GAPS} more gaps longer than {_LONG_GAP_S:g} s."
+
+
+def _moment(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 60.0 else clock(seconds)
+
+
+def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> Iterator[str]:
+    if working_range is None:
+        return
+    near, far = working_range
+    ranges = track.posture[track.valid, 0]
+    outside = int(((ranges < near) | (ranges > far)).sum())
+    if outside:
+        yield (
+            f"{outside} frames lie outside the rig's working range of "
+            f"{1e3 * near:.0f}–{1e3 * far:.0f} mm; trust them less."
+        )
+
+
+def _precision_warnings(track: Track) -> Iterator[str]:
+    relative = track.sigma_total[track.valid, 0] / track.posture[track.valid, 0]
+    loose = float((relative > _LOOSE).mean()) if len(relative) else 0.0
+    if loose > 0.05:
+        yield f"{100 * loose:.0f} % of the ranges are looser than {100 * _LOOSE:g} % (1 σ)."
+    n_points = track.n_points[track.valid & np.isfinite(track.n_points)]
+    if len(n_points) and np.median(n_points) < _FEW_POINTS:
+        yield (
+            f"Few points on the target: {np.median(n_points):.0f} in a typical frame. "
+            "Check focus, exposure and the lasers."
+        )
+
+
+def _laser_warnings(points: PointSummary, names: list[str]) -> Iterator[str]:
+    used = points.on_target.sum(axis=0)
+    total = used.sum()
+    for index, name in enumerate(names):
+        share = used[index] / total if total else 0.0
+        if total and share < 0.3 / len(names):
+            yield f"Laser “{name}” gave only {100 * share:.1f} % of the target points."
+
+
+def _picture_warnings(pictures: Mapping[int, Picture]) -> Iterator[str]:
+    shares = np.array([picture.saturated for picture in pictures.values()])
+    shares = shares[np.isfinite(shares)]
+    if len(shares) and np.median(shares) > 0.5:
+        yield (
+            f"Stripes are saturated in the sample frames ({100 * np.median(shares):.0f} % of "
+            "their points): shorten the exposure or dim the lasers."
+        )
+
+
+def _water_warnings(track: Track) -> Iterator[str]:
+    water = track.n_water[np.isfinite(track.n_water)]
+    if len(water) and np.ptp(water) > _WATER_STEP:
+        yield (
+            f"The water's index moved by {np.ptp(water):.4f} during the dive: a change of "
+            "medium, a leak, or a target that moved."
+        )
+
+
+def _own_warnings(run: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the run itself put on record."""
+    summary = run.get("summary")
+    for place in (run, summary if isinstance(summary, dict) else {}):
+        found = place.get("warnings")
+        if isinstance(found, list):
+            yield from (str(text) for text in found)

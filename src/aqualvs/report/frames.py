@@ -1,0 +1,238 @@
+"""Which frames the report shows, and their pictures decoded again from the source."""
+
+import base64
+import contextlib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+
+from aqualvs.geometry.arrays import IntArray
+from aqualvs.report.charts import stretches
+from aqualvs.report.overlay import draw_points
+from aqualvs.report.points import FramePoints
+from aqualvs.report.run_data import Track
+from aqualvs.scanning.posture import Reason
+from aqualvs.scanning.scan import ImagePlane
+from aqualvs.sources.images import IMAGE_SUFFIXES, images_in, read_image
+
+N_PICTURES = 6
+N_SAMPLES = 24
+_WIDTH_PX = 800
+_DECODERS = 2
+# What a file raises that is no video, has no picture, or breaks off.
+_BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
+# Colour at full resolution, else the lasers' colours bleed into the green stripes below.
+_JPEG = (
+    cv2.IMWRITE_JPEG_QUALITY,
+    80,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+)
+_SATURATED = 250
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A sample frame ready for the page.
+
+    Attributes
+    ----------
+    jpeg_base64 : str
+    size_px : (int, int)
+        Width and height as embedded.
+    saturated : float
+        Share of the target points that lie on a saturated pixel; NaN without target points.
+    """
+
+    jpeg_base64: str
+    size_px: tuple[int, int]
+    saturated: float
+
+
+def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
+    """Return rows of the frames worth a picture: refusals, the worst posture, an even spread.
+
+    Parameters
+    ----------
+    track : Track
+    source : Path or None
+        Of a video, those of the spread are at key frames where one is near: others can only be
+        decoded with all frames from there on.
+    """
+    chosen = _refused_rows(track)
+    valid = np.flatnonzero(track.valid)
+    if len(valid):
+        relative = track.sigma[valid, 0] / track.posture[valid, 0]
+        chosen.append(int(valid[np.nan_to_num(relative).argmax()]))
+    spread = valid if len(valid) else np.arange(len(track))
+    special = set(chosen)
+    while len(set(chosen)) < min(N_PICTURES, len(set(chosen) | set(spread.tolist()))):
+        chosen.append(_farthest(spread, chosen))
+    rows = sorted(set(chosen))
+    if source is None or not source.is_file():
+        return rows
+    ordinary = [row for row in rows if row not in special]
+    for row, moved in zip(ordinary, _rows_at_key_frames(source, track, ordinary), strict=False):
+        if moved not in chosen and moved in spread and row - moved <= len(track) / N_PICTURES:
+            chosen[chosen.index(row)] = moved
+    return sorted(set(chosen))
+
+
+def choose_samples(track: Track, pictures: list[int]) -> list[int]:
+    """Return rows for the laser-plane view: the pictures' and an even spread over the dive."""
+    even = _evenly(np.arange(len(track)), N_SAMPLES)
+    room = N_SAMPLES - len(pictures)
+    others = [row for row in even if row not in pictures]
+    return sorted([*pictures, *(others[i] for i in _evenly(np.arange(len(others)), room))])
+
+
+def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    """Decode the frames of some rows again.
+
+    Returns
+    -------
+    pictures : dict
+        Row to BGR picture, shape (height, width, 3); rows that cannot be decoded are absent.
+    """
+    if source.is_dir():
+        return _from_images(images_in(source), track, rows)
+    if source.suffix.lower() in IMAGE_SUFFIXES:
+        return _from_images([source], track, rows)
+    with ThreadPoolExecutor(_DECODERS) as pool:
+        parts = [rows[i::_DECODERS] for i in range(_DECODERS)]
+        found = pool.map(lambda part: _from_video(source, track, part), parts)
+        return {row: picture for pictures in found for row, picture in pictures.items()}
+
+
+def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
+    """Draw the points of a frame into its picture and compress it for the page."""
+    scale = min(1.0, _WIDTH_PX / image.shape[1])
+    small = image
+    if scale < 1.0:
+        small = np.asarray(
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    if points is not None:
+        pixels = (points.pixels + 0.5) * scale - 0.5
+        small = draw_points(small, points.laser, pixels, points.used)
+    _, jpeg = cv2.imencode(".jpg", small, _JPEG)
+    text = base64.b64encode(jpeg.tobytes()).decode("ascii")
+    return Picture(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
+
+
+def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:
+    """Return the share of target points on a pixel with a channel at 250 or above."""
+    if points is None:
+        return float("nan")
+    pixels = points.pixels[points.used & np.isfinite(points.pixels).all(axis=1)]
+    columns, rows = np.round(pixels).astype(np.int64).T
+    inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+    if not inside.any():
+        return float("nan")
+    brightest = image[rows[inside], columns[inside]].max(axis=-1)
+    return float((brightest >= _SATURATED).mean())
+
+
+def _refused_rows(track: Track) -> list[int]:
+    """Return the middle of the longest refusal, for the two commonest reasons with a picture."""
+    longest: dict[str, tuple[int, int]] = {}
+    for stretch in stretches(track):
+        middle = (stretch.first + stretch.last) // 2
+        reason = track.reasons[track.reason[middle]]
+        length = stretch.last - stretch.first + 1
+        if reason != Reason.CORRUPT_FRAME and length > longest.get(reason, (0, 0))[0]:
+            longest[reason] = (length, middle)
+    return [middle for _, middle in sorted(longest.values(), reverse=True)[:2]]
+
+
+def _evenly(rows: IntArray, count: int) -> list[int]:
+    """Return `count` of `rows`, evenly spread, both ends included."""
+    if count <= 0 or not len(rows):
+        return []
+    places = np.linspace(0, len(rows) - 1, count).round().astype(int).tolist()
+    return [int(rows[i]) for i in dict.fromkeys(places)]
+
+
+def _farthest(rows: IntArray, chosen: list[int]) -> int:
+    """Return the row that lies farthest from all chosen ones."""
+    if not chosen:
+        return int(rows[0])
+    distance = np.abs(rows[:, None] - np.array(chosen)).min(axis=1)
+    return int(rows[distance.argmax()])
+
+
+def _from_images(files: list[Path], track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    pictures = {}
+    for row in rows:
+        frame = int(track.frame[row])
+        image = read_image(files[frame], cv2.IMREAD_COLOR) if frame < len(files) else None
+        if image is not None:
+            pictures[row] = image
+    return pictures
+
+
+def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    """Return pictures by row; a broken file gives what came before the fault.
+
+    Jumps to the key frame before each frame that is wanted.
+    """
+    pictures: dict[int, ImagePlane] = {}
+    half = 0.5 * _step_s(track)
+    with contextlib.suppress(*_BROKEN), av.open(str(source)) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.thread_count = 1
+        start = next(container.decode(stream)).time or 0.0
+        for row in rows:
+            wanted = start + float(track.time_s[row])
+            _seek(container, wanted)
+            found = _frame_at(container, wanted - half)
+            if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
+                pictures[row] = np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+    return pictures
+
+
+def _rows_at_key_frames(source: Path, track: Track, rows: list[int]) -> list[int]:
+    """Return the row of the last key frame up to each row, as far as the file tells."""
+    found: list[int] = []
+    half = 0.5 * _step_s(track)
+    with contextlib.suppress(*_BROKEN), av.open(str(source)) as container:
+        start = _next_time(container)
+        for row in rows:
+            _seek(container, start + float(track.time_s[row]))
+            time_s = _next_time(container) - start
+            found.append(min(int(np.searchsorted(track.time_s, time_s - half)), row))
+    return found
+
+
+def _next_time(container: InputContainer) -> float:
+    """Return the time at which the next packet's picture is shown."""
+    packet = next(container.demux(video=0))
+    return float(packet.pts or 0) * float(packet.time_base or 0.0)
+
+
+def _seek(container: InputContainer, time_s: float) -> None:
+    stream = container.streams.video[0]
+    base = stream.time_base or Fraction(1, 90_000)
+    container.seek(round(time_s / base), stream=stream, backward=True)
+
+
+def _frame_at(container: InputContainer, earliest: float) -> VideoFrame | None:
+    for frame in container.decode(video=0):
+        if frame.time is not None and frame.time >= earliest:
+            return frame
+    return None
+
+
+def _step_s(track: Track) -> float:
+    """Return the usual time between frames of the source, in seconds."""
+    frames = np.diff(track.frame)
+    if not len(frames):
+        return 0.04
+    return float(np.nanmedian(np.diff(track.time_s) / np.maximum(frames, 1)))

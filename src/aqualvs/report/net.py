@@ -1,0 +1,260 @@
+"""The state of the net in a run's report: what its files say, as a section and a card."""
+
+import base64
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from aqualvs.report.findings import Card
+from aqualvs.report.html import Raw, table, text
+from aqualvs.results.files import read_json
+from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
+from aqualvs.text import clock, signed
+
+_LONG_TABLE = 12
+_NONE = "–"
+_PLACED = {"track": "", "bearing": " (by bearing)", "speed": " (by speed)", "nothing": ""}
+
+Row: TypeAlias = Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class NetTables:
+    """The files that tell the state of a net, read again.
+
+    Attributes
+    ----------
+    stretches, holes : list of mapping
+        Rows of `net.csv` and `holes.csv`, column to cell.
+    facts : mapping
+        Member `aqualvs_net` of `net.geojson`; empty where it is missing.
+    map_base64 : str
+        `net_map.png`; "" where it is missing.
+    """
+
+    stretches: list[Row]
+    holes: list[Row]
+    facts: Mapping[str, Any]
+    map_base64: str
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """The dive in a few numbers; empty where `net.geojson` is missing."""
+        found = self.facts.get("summary")
+        return found if isinstance(found, dict) else {}
+
+
+def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
+    """Read the state of a net from a run's folder.
+
+    Returns
+    -------
+    net : NetTables or None
+        None where the folder holds none.
+    trouble : str
+        What is wrong with it, in words; "" if nothing.
+    """
+    if not (run_dir / NET_CSV).is_file():
+        return None, ""
+    try:
+        stretches = _rows(run_dir / NET_CSV)
+        holes = _rows(run_dir / HOLES_CSV) if (run_dir / HOLES_CSV).is_file() else []
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return None, "net.csv or holes.csv cannot be read: the state of the net is not shown."
+    return NetTables(stretches, holes, _facts(run_dir / NET_GEOJSON), _picture(run_dir)), ""
+
+
+def net_warnings(net: NetTables | None) -> list[str]:
+    """Return what the reader of the report should know about the net."""
+    slip = None if net is None else net.summary.get("track_slip_m")
+    if not isinstance(slip, int | float) or not slip > 0.0:
+        return []
+    # Imported here: it brings the evaluation of nets along, which few reports have.
+    from aqualvs.nets.tables import slip_words
+
+    words = slip_words(slip)
+    return [f"Net: {words}."]
+
+
+def net_cards(net: NetTables | None) -> list[Card]:
+    """Return the card of the headline; none without a net."""
+    if net is None or not net.stretches:
+        return []
+    n = len(net.holes)
+    value = "no holes" if not n else "1 hole" if n == 1 else f"{n} holes"
+    words = []
+    largest = max((_number(row, "diameter_mm") or 0.0 for row in net.holes), default=0.0)
+    if largest:
+        words.append(f"up to {largest:.0f} mm")
+    solidity, fouling = net.summary.get("solidity"), net.summary.get("fouling")
+    if isinstance(solidity, float):
+        words.append(f"solidity {solidity:.2f}")
+    if isinstance(fouling, float):
+        words.append(signed(f"fouling {fouling:+.2f}"))
+    return [Card("Net", value, "; ".join(words) or "solidity not measured")]
+
+
+def net_view(net: NetTables | None) -> str:
+    """Return the section on the net; nothing without one."""
+    if net is None:
+        return ""
+    head = '<section id="net"><h2>Net</h2>\n'
+    if not net.stretches:
+        return f'{head}<p class="note">No net was seen.</p></section>'
+    return "\n".join(
+        [head + _lead(net), _map(net), _holes(net), _stretches(net), _log(net), "</section>"]
+    )
+
+
+def _lead(net: NetTables) -> str:
+    facts, words = net.summary, []
+    if isinstance(facts.get("bar_mm"), int | float):
+        mesh = str(facts.get("mesh")).capitalize()
+        words.append(f"{mesh} meshes of {facts['bar_mm']:.1f} mm bar")
+    if isinstance(facts.get("twine_mm"), int | float):
+        words.append(f"twine {facts['twine_mm']:.1f} mm")
+    if isinstance(facts.get("area_m2"), int | float):
+        words.append(f"{facts['area_m2']:.2f} m² looked at for holes")
+    said = f"{text(', '.join(words))}. " if words else ""
+    return (
+        f'<p class="lead">{said}Solidity is the share of the net’s area that strands and growth '
+        "cover; fouling is what it has beyond the bare twine.</p>"
+    )
+
+
+def _map(net: NetTables) -> str:
+    if not net.map_base64:
+        return '<p class="note">net_map.png is missing.</p>'
+    return (
+        f'<figure><img class="wide" src="data:image/png;base64,{net.map_base64}" '
+        'alt="Map of the net wall: fouling, holes and the vehicle’s way"></figure>'
+    )
+
+
+def _holes(net: NetTables) -> str:
+    if not net.holes:
+        return "<h3>Holes</h3><p>None was found.</p>"
+    names = ("hole", "diameter, mm", "width × height, mm", "meshes", *_PLACE_HEAD, "time", "frame")
+    rows = [
+        (
+            _cell(row, "hole"),
+            Raw(f"{_cell(row, 'diameter_mm', 0)} ± {_cell(row, 'sigma_diameter_mm', 0)}"),
+            f"{_cell(row, 'width_mm', 0)} × {_cell(row, 'height_mm', 0)}",
+            _cell(row, "missing_meshes", 0),
+            *_place(row),
+            _time(row, "time_s"),
+            _cell(row, "frame"),
+        )
+        for row in net.holes
+    ]
+    return f"<h3>Holes</h3>{_folded(table(names, rows), len(rows), 'holes')}"
+
+
+_PLACE_HEAD = ("along, m", "depth, m", "bearing, °")
+
+
+def _stretches(net: NetTables) -> str:
+    names = (
+        *("stretch", "from", "to", *_PLACE_HEAD, "range, mm", "bar, mm", "twine, mm"),
+        *("solidity", "fouling"),
+    )
+    rows = [
+        (
+            _cell(row, "stretch"),
+            _time(row, "begin_s"),
+            _time(row, "end_s"),
+            *_place(row),
+            _cell(row, "range_m", 0, scale=1e3),
+            _with_sigma(row, "bar_mm", 1),
+            _with_sigma(row, "twine_mm", 1),
+            _with_sigma(row, "solidity", 2),
+            _cell(row, "fouling", 2, sign="+"),
+        )
+        for row in net.stretches
+    ]
+    return f"<h3>Stretches</h3>{_folded(table(names, rows), len(rows), 'stretches')}"
+
+
+def _folded(content: str, n_rows: int, name: str) -> str:
+    """Return a table, folded away where it is long."""
+    if n_rows <= _LONG_TABLE:
+        return content
+    return f"<details><summary>All {n_rows} {name}</summary>{content}</details>"
+
+
+def _log(net: NetTables) -> str:
+    log = net.facts.get("log")
+    if not isinstance(log, dict):
+        return (
+            '<p class="note">No log of the vehicle was given, so depth and bearing are not known: '
+            "add <code>--log</code> to aqualvs net.</p>"
+        )
+    name = text(log.get("file", ""))
+    if not log.get("used"):
+        why = text(log.get("refused") or "it covers none of the dive")
+        return f'<p class="note">The vehicle’s log {name} is not used: {why}.</p>'
+    sigma = f" ± {log.get('sigma_offset_s')}" if log.get("sigma_offset_s") else ""
+    return signed(
+        f'<p class="note">Depth and bearing are from {name}; its clock minus the dive’s is '
+        f"{text(log.get('offset_s'))}{text(sigma)} s ({text(log.get('offset_from'))}).</p>"
+    )
+
+
+def _place(row: Row) -> tuple[str, str, str]:
+    along = _cell(row, "along_m", 2)
+    placed = _PLACED.get(row.get("placed_by") or "", "")
+    return along + placed, _cell(row, "depth_m", 2), _cell(row, "bearing_deg", 0)
+
+
+def _with_sigma(row: Row, name: str, digits: int) -> str:
+    value = _cell(row, name, digits)
+    sigma = _number(row, f"sigma_{name}")
+    return value if value == _NONE or not sigma else f"{value} ± {sigma:.{digits}f}"
+
+
+def _time(row: Row, name: str) -> str:
+    value = _number(row, name)
+    return _NONE if value is None else clock(value)
+
+
+def _cell(
+    row: Row, name: str, digits: int | None = None, *, scale: float = 1.0, sign: str = ""
+) -> str:
+    value = _number(row, name)
+    if value is None:
+        return _NONE
+    return row[name] if digits is None else signed(f"{scale * value:{sign}.{digits}f}")
+
+
+def _number(row: Row, name: str) -> float | None:
+    try:
+        return float(row.get(name) or "")
+    except ValueError:
+        return None
+
+
+def _rows(path: Path) -> list[Row]:
+    with path.open(newline="", encoding="utf-8") as file:
+        rows: list[Row] = list(csv.DictReader(file))
+    # A damaged table may have lost a hole: better no table than one of fewer holes.
+    if any(None in row or None in row.values() for row in rows):
+        raise csv.Error("rows differ in length")
+    return rows
+
+
+def _facts(path: Path) -> Mapping[str, Any]:
+    try:
+        content = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    found = content.get("aqualvs_net") if isinstance(content, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _picture(run_dir: Path) -> str:
+    try:
+        return base64.b64encode((run_dir / NET_MAP_PNG).read_bytes()).decode("ascii")
+    except OSError:
+        return ""

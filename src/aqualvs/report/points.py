@@ -1,0 +1,385 @@
+"""One pass over a run's points, batch by batch: counts, histograms, a sample of everything.
+
+The one loop of the report that touches every point of a dive.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel
+from aqualvs.report.run_data import Track
+from aqualvs.results.points import read_journal
+from aqualvs.scanning.scan import Label
+
+
+@borrowing_kernel
+def add_points(
+    frame: IntArray,
+    laser: IntArray,
+    label: IntArray,
+    used: BoolArray,
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    frames: IntArray,
+    planes: FloatArray,
+    labels: IntArray,
+    on_target: IntArray,
+    squares: FloatArray,
+    n_squares: IntArray,
+    residual: IntArray,
+    lowest: float,
+    step: float,
+    target: IntArray,
+) -> int:
+    """Add points to the sums of a dive, and list those on the target.
+
+    Parameters
+    ----------
+    frame, laser, label, used : array, shape (N,)
+        Points of a frame that is not among `frames`, or of a laser beyond those of `labels`, are
+        passed over.
+    x, y, z : array, shape (N,)
+        Metres in `dome`.
+    frames : int array, shape (T,), ascending
+    planes : array, shape (T, 4)
+        Unit normal and distance in metres of each frame's target; NaN where it has none.
+    labels, on_target, squares, n_squares, residual : array
+        As `PointSummary` has them, added to; squares in mm².
+    lowest, step : float
+        First edge and width of the bins of `residual`, in mm.
+    target : int array, shape (N,)
+        Receives the numbers of the points on the target.
+
+    Returns
+    -------
+    n_target : int
+        How many those are.
+    """
+    n_target, row, known = 0, -1, False
+    last_bin = residual.shape[1] - 1
+    for i in range(frame.shape[0]):
+        if row < 0 or frames[row] != frame[i]:
+            row = np.searchsorted(frames, frame[i])
+            row = min(row, frames.shape[0] - 1)
+            known = frames[row] == frame[i]
+        k = laser[i]
+        if not known or k < 0 or k >= labels.shape[0]:
+            continue
+        labels[k, min(max(label[i], 0), labels.shape[1] - 1)] += 1
+        if not (used[i] and np.isfinite(x[i]) and np.isfinite(y[i]) and np.isfinite(z[i])):
+            continue
+        target[n_target] = i
+        n_target += 1
+        on_target[row, k] += 1
+        off = planes[row, 0] * x[i] + planes[row, 1] * y[i] + planes[row, 2] * z[i]
+        off = 1e3 * (off - planes[row, 3])
+        if np.isfinite(off):
+            squares[row] += off * off
+            n_squares[row] += 1
+            place = (off - lowest) / step
+            residual[k, int(min(max(place, 0.0), float(last_bin)))] += 1
+    return n_target
+
+
+_BATCH = 1 << 16
+_CLOUD = 15_000
+_LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
+_NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label", "used")
+_OPTIONAL = ("quality",)
+_NONE = np.empty(0, np.int64)
+MAX_LASERS = 16
+
+QUALITY_EDGES = np.linspace(0.0, 1.0, 41)
+RESIDUAL_EDGES_MM = np.linspace(-50.0, 50.0, 1001)
+
+
+@dataclass(frozen=True, slots=True)
+class FramePoints:
+    """Stripe points of one sample frame, M of them.
+
+    Attributes
+    ----------
+    laser, label : integer array, shape (M,)
+    used : bool array, shape (M,)
+        Points that entered the posture: the target points.
+    pixels : array, shape (M, 2)
+    points_in_dome : array, shape (M, 3)
+        Metres.
+    """
+
+    laser: IntArray
+    label: IntArray
+    used: BoolArray
+    pixels: FloatArray
+    points_in_dome: FloatArray
+
+
+@dataclass(slots=True)
+class PointSummary:
+    """What the report needs of all points of a dive; its size does not grow with their number.
+
+    Attributes
+    ----------
+    on_target : int array, shape (n_frames, MAX_LASERS)
+        Points that entered the posture, per frame and laser: the target points.
+    labels : int array, shape (MAX_LASERS, len(Label))
+        Points per laser and label over the dive.
+    squares_mm2, n_squares : array, shape (n_frames,)
+        Sum of squared distances of target points from the frame's plane, and their number.
+    quality, residual : int array, shape (MAX_LASERS, bins)
+        Histograms of the target points over `QUALITY_EDGES` and `RESIDUAL_EDGES_MM`.
+    cloud_in_dome, cloud_laser : array, shape (K, 3) and (K,)
+        Random target points of the dive, at most 15,000, the same ones every time.
+    samples : dict
+        Frame number to the points of that frame.
+    """
+
+    on_target: IntArray
+    squares_mm2: FloatArray
+    n_squares: IntArray
+    labels: IntArray = field(default_factory=lambda: _counts(len(Label)))
+    quality: IntArray = field(default_factory=lambda: _counts(len(QUALITY_EDGES) - 1))
+    residual: IntArray = field(default_factory=lambda: _counts(len(RESIDUAL_EDGES_MM) - 1))
+    cloud_in_dome: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    cloud_laser: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    samples: dict[int, FramePoints] = field(default_factory=dict)
+
+    @property
+    def n_lasers(self) -> int:
+        """Return one more than the highest laser number that has a point."""
+        seen = np.flatnonzero(self.labels.sum(axis=1))
+        return int(seen[-1]) + 1 if len(seen) else 0
+
+    def rms_mm(self) -> FloatArray:
+        """Return the rms distance of target points from the plane per frame; NaN without any."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rms: FloatArray = np.sqrt(self.squares_mm2 / self.n_squares)
+        return rms
+
+
+def summarize_points(
+    run_dir: Path, track: Track, sample_frames: list[int]
+) -> tuple[PointSummary | None, str]:
+    """Read a run's points once, in batches: `points.parquet`, else the journal of a killed run.
+
+    Returns
+    -------
+    summary : PointSummary or None
+        None where there are no points that can be read.
+    trouble : str
+        What is wrong, in words; "" if nothing.
+    """
+    summary = _empty(track)
+    rng = np.random.default_rng(20210126)
+    keys = np.zeros(0)
+    planes = _planes(track)
+    try:
+        for batch in _batches(run_dir):
+            keys = _add(summary, batch, track, planes, sample_frames, keys, rng)
+    except FileNotFoundError:
+        return None, "points.parquet is missing: no points are shown."
+    except KeyError as absent:
+        return None, f"points.parquet has no column {absent}: no points are shown."
+    except (pa.ArrowInvalid, OSError):
+        return None, "points.parquet cannot be read to its end: no points are shown."
+    return summary, ""
+
+
+def plane_of_posture(posture: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return unit normals (N, 3) and distances (N,) in metres of postures (N, 3) in m and degrees.
+
+    Inverse of the paper's Eq. 23-26: n is along (tan yaw, 1, tan pitch).
+    """
+    pitch, yaw = np.deg2rad(posture[:, 1]), np.deg2rad(posture[:, 2])
+    normal = np.stack([np.tan(yaw), np.ones_like(yaw), np.tan(pitch)], axis=-1)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True), posture[:, 0]
+
+
+def _planes(track: Track) -> FloatArray:
+    """Return normal and distance of the target in every frame, shape (N, 4), NaN where refused."""
+    normal, distance = plane_of_posture(track.posture)
+    planes = np.column_stack([normal, distance])
+    planes[~track.valid] = np.nan
+    return planes
+
+
+def _counts(bins: int) -> IntArray:
+    return np.zeros((MAX_LASERS, bins), dtype=np.int64)
+
+
+def _empty(track: Track) -> PointSummary:
+    n = len(track)
+    return PointSummary(
+        on_target=np.zeros((n, MAX_LASERS), dtype=np.int64),
+        squares_mm2=np.zeros(n),
+        n_squares=np.zeros(n, dtype=np.int64),
+    )
+
+
+def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
+    """Yield batches as arrays by column, labels as numbers."""
+    path, journal = run_dir / "points.parquet", run_dir / "points.arrows"
+    if path.exists() or not journal.exists():
+        with parquet.ParquetFile(path, pre_buffer=False) as file:
+            names = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.schema_arrow.names]
+            # One batch at a time, on one thread, keeps memory flat however long the dive.
+            batches = file.iter_batches(batch_size=_BATCH, columns=names, use_threads=False)
+            yield from map(_columns, batches)
+    else:
+        yield from map(_columns, read_journal(journal))
+
+
+def _columns(batch: Any) -> dict[str, NDArray[Any]]:
+    """Return the columns that the report needs.
+
+    Raises
+    ------
+    KeyError
+        Naming a column that is absent.
+    """
+    present = [name for name in _OPTIONAL if name in batch.schema.names]
+    return {
+        name: _label_codes(batch.column(name)) if name == "label" else _plain(batch.column(name))
+        for name in (*_NEEDED, *present)
+    }
+
+
+def _plain(column: Any) -> NDArray[Any]:
+    array: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return array
+
+
+def _label_codes(column: Any) -> NDArray[Any]:
+    """Return `Label` values of a column of names; a name unknown here counts as clutter."""
+    if pa.types.is_integer(column.type):
+        return _plain(column)
+    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+    names = coded.dictionary.to_pylist()
+    table = np.array([_LABEL_OF_NAME.get(name, int(Label.CLUTTER)) for name in names] or [0])
+    codes: NDArray[Any] = table[coded.indices.to_numpy(zero_copy_only=False)]
+    return codes
+
+
+def _add(
+    summary: PointSummary,
+    batch: dict[str, NDArray[Any]],
+    track: Track,
+    planes: FloatArray,
+    sample_frames: list[int],
+    keys: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Add one batch; returns the sampling keys of the cloud as it now is."""
+    frame, laser, label = (batch[name].astype(np.int64) for name in ("frame", "laser", "label"))
+    x, y, z = xyz = [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"]
+    target = np.empty(len(frame), np.int64)
+    n_target = add_points(
+        frame,
+        laser,
+        label,
+        batch["used"].astype(np.bool_),
+        x,
+        y,
+        z,
+        track.frame,
+        planes,
+        summary.labels,
+        summary.on_target,
+        summary.squares_mm2,
+        summary.n_squares,
+        summary.residual,
+        float(RESIDUAL_EDGES_MM[0]),
+        float(RESIDUAL_EDGES_MM[1] - RESIDUAL_EDGES_MM[0]),
+        target,
+    )
+    target = target[:n_target]
+    if "quality" in batch:
+        quality = batch["quality"][target].astype(np.float64)
+        _count(summary.quality, QUALITY_EDGES, laser[target], quality)
+    _keep_samples(summary, batch, frame, laser, label, xyz, sample_frames)
+    return _grow_cloud(summary, xyz, laser, target, keys, rng)
+
+
+def _keep_samples(
+    summary: PointSummary,
+    batch: dict[str, NDArray[Any]],
+    frame: IntArray,
+    laser: IntArray,
+    label: IntArray,
+    xyz: list[FloatArray],
+    sample_frames: list[int],
+) -> None:
+    """Keep the points of sample frames; a frame may go on in the next batch."""
+    if not len(frame):
+        return
+    first, last = int(frame.min()), int(frame.max())
+    for sample in sample_frames:
+        mine = np.flatnonzero(frame == sample) if first <= sample <= last else _NONE
+        mine = mine[(laser[mine] >= 0) & (laser[mine] < MAX_LASERS)]
+        if not len(mine):
+            continue
+        new = FramePoints(
+            laser[mine],
+            label[mine].clip(0, len(Label) - 1),
+            batch["used"][mine],
+            np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64),
+            np.stack([axis[mine] for axis in xyz], axis=-1),
+        )
+        old = summary.samples.get(sample)
+        summary.samples[sample] = new if old is None else _joined(old, new)
+
+
+def _joined(first: FramePoints, second: FramePoints) -> FramePoints:
+    return FramePoints(
+        np.concatenate([first.laser, second.laser]),
+        np.concatenate([first.label, second.label]),
+        np.concatenate([first.used, second.used]),
+        np.concatenate([first.pixels, second.pixels]),
+        np.concatenate([first.points_in_dome, second.points_in_dome]),
+    )
+
+
+def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: FloatArray) -> None:
+    """Add values to the histogram of their laser; those beyond the edges go to the last bins."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        laser, values = laser[finite], values[finite]
+    n_lasers, n_bins = histogram.shape
+    step = edges[1] - edges[0]
+    bins = ((values - edges[0]) / step).clip(0, n_bins - 1).astype(np.int64)
+    counted = np.bincount(laser * n_bins + bins, minlength=histogram.size)
+    histogram += counted.reshape(n_lasers, n_bins)
+
+
+def _grow_cloud(
+    summary: PointSummary,
+    xyz: list[FloatArray],
+    laser: IntArray,
+    target: IntArray,
+    keys: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Keep the points with the smallest of all random keys: a uniform sample of any stream."""
+    drawn = rng.random(len(target))
+    if len(keys) == _CLOUD:
+        # Of many points only the few whose key is small enough are looked at again.
+        small = np.flatnonzero(drawn < keys.max())
+        drawn, target = drawn[small], target[small]
+    keys = np.concatenate([keys, drawn])
+    points = np.stack([axis[target] for axis in xyz], axis=-1)
+    points = np.concatenate([summary.cloud_in_dome, points])
+    laser = np.concatenate([summary.cloud_laser, laser[target]])
+    if len(keys) > _CLOUD:
+        kept = np.argpartition(keys, _CLOUD)[:_CLOUD]
+        keys, points, laser = keys[kept], points[kept], laser[kept]
+    summary.cloud_in_dome, summary.cloud_laser = points, laser
+    return keys

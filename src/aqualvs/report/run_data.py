@@ -1,0 +1,393 @@
+"""Read what a run left behind: `run.yaml`, `posture.csv`, truth and the bare-lens posture.
+
+The rig as `run.yaml` holds it: lasers' planes, their own frames, and facts for the table.
+
+A laser behind a window has a bent sheet; it is shown in the plane that fits the sheet best where
+the camera sees it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv
+
+from aqualvs.errors import RigError, SourceError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.optics.rigfile import rig_from_mapping
+from aqualvs.optics.sheet import sheets_of
+from aqualvs.results.folder import POSTURE_BARE_CSV
+from aqualvs.results.run_request import read_run_yaml
+from aqualvs.results.summary import read_truth as truth_by_frame
+
+_NUMBERS = (
+    "frame",
+    "time_s",
+    "range_m",
+    "pitch_deg",
+    "yaw_deg",
+    "sigma_range_m",
+    "sigma_pitch_deg",
+    "sigma_yaw_deg",
+    "sigma_range_total_m",
+    "sigma_pitch_total_deg",
+    "sigma_yaw_total_deg",
+    "n_points",
+    "n_water",
+)
+_TOTALS = tuple(name for name in _NUMBERS if "_total_" in name)
+_TRUE = ("true", "1", "yes")
+POSTURE = ("range_m", "pitch_deg", "yaw_deg")
+"""The three columns of a posture, in the order of every (N, 3) array of the report."""
+
+
+class NoFrameError(SourceError):
+    """A table without a row, as of a run that was killed before its first frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """`posture.csv` as arrays, one entry per frame, ordered by frame.
+
+    Attributes
+    ----------
+    frame : int array, shape (N,)
+    time_s : array, shape (N,)
+    valid : bool array, shape (N,)
+    reason : int array, shape (N,)
+        Index into `reasons`; meaningful where not valid.
+    reasons : tuple of str
+        As the file spells them.
+    posture, sigma : array, shape (N, 3)
+        Range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what the noise of
+        one frame makes.
+    sigma_total : array, shape (N, 3)
+        By noise and rig together; that of the noise in runs of older versions.
+    n_points, n_water : array, shape (N,)
+        NaN where the file has none.
+    """
+
+    frame: IntArray
+    time_s: FloatArray
+    valid: BoolArray
+    reason: IntArray
+    reasons: tuple[str, ...]
+    posture: FloatArray
+    sigma: FloatArray
+    sigma_total: FloatArray
+    n_points: FloatArray
+    n_water: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.frame)
+
+
+def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
+    """Return the content of `run.yaml` and what is wrong with it, in words ("" if nothing).
+
+    An interrupted run may have left none or half of one; the report is still worth having.
+    """
+    if not (run_dir / "run.yaml").exists():
+        return {}, "run.yaml is missing: rig, options and source are unknown."
+    try:
+        return read_run_yaml(run_dir), ""
+    except SourceError:
+        return {}, "run.yaml cannot be read: rig, options and source are unknown."
+
+
+def read_track(path: Path) -> Track:
+    """Read a `posture.csv`; rows cut short by an interruption are left out.
+
+    Raises
+    ------
+    SourceError
+        If the file is missing, holds no frame, or holds something that is no number.
+    """
+    columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason"))
+    order = np.argsort(columns["frame"], kind="stable")
+    posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
+    sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
+    total = np.stack([columns[name] for name in _TOTALS], axis=-1)[order]
+    total = np.where(np.isfinite(total), total, sigma)
+    words, (reasons, reason) = texts["valid"], texts["reason"]
+    says_so = np.array([word.lower() in _TRUE for word in words.names])
+    valid = says_so[words.codes][order] & np.isfinite(posture).all(axis=1)
+    return Track(
+        frame=columns["frame"][order].astype(np.int64),
+        time_s=columns["time_s"][order],
+        valid=valid,
+        reason=reason[order],
+        reasons=reasons,
+        posture=np.where(valid[:, None], posture, np.nan),
+        sigma=np.where(valid[:, None], sigma, np.nan),
+        sigma_total=np.where(valid[:, None], total, np.nan),
+        n_points=columns["n_points"][order],
+        n_water=columns["n_water"][order],
+    )
+
+
+def read_truth(path: Path, track: Track) -> FloatArray:
+    """Read truth onto the frames of a track.
+
+    Parameters
+    ----------
+    path : Path
+        As `aqualvs.results.summary.read_truth` takes it.
+    track : Track
+
+    Returns
+    -------
+    truth : array, shape (N, 3)
+        As `Track.posture`; NaN where the file has no such frame.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or shares no frame with the track.
+    """
+    rows = truth_by_frame(path)
+    values = np.array([*rows.values()], dtype=np.float64).reshape(-1, 3)
+    truth = _onto(track.frame, np.array([*rows], dtype=np.float64), values)
+    if not np.isfinite(truth).any():
+        raise SourceError(f"{path}: no frame in common with the run; give the truth of this dive")
+    return truth
+
+
+def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:
+    """Read the posture that a bare-lens camera gives on the same pixels, if the run has it.
+
+    Returns
+    -------
+    posture : array, shape (N, 3), or None
+        As `Track.posture`, on the frames of `track`.
+    trouble : str
+        What is wrong with the file, in words; "" if nothing is, or the run was killed before it
+        had a row.
+    """
+    path = run_dir / POSTURE_BARE_CSV
+    if not path.is_file() or path.stat().st_size == 0:
+        return None, ""
+    try:
+        bare = read_track(path)
+    except NoFrameError:
+        return None, ""
+    except SourceError as fault:
+        return None, f"{fault}: no comparison with a bare lens."
+    return _onto(track.frame, bare.frame.astype(np.float64), bare.posture), ""
+
+
+def number(value: object) -> float:
+    """Return a file's value as a finite float, NaN where it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return float("nan")
+    return float(value) if np.isfinite(value) else float("nan")
+
+
+def _onto(frames: IntArray, from_frames: FloatArray, values: FloatArray) -> FloatArray:
+    """Return rows of `values` for each of `frames`, NaN where there is none."""
+    known = np.isfinite(from_frames)
+    from_frames, values = from_frames[known], values[known]
+    found = np.full((len(frames), values.shape[1]), np.nan)
+    if not len(from_frames):
+        return found
+    order = np.argsort(from_frames, kind="stable")
+    place = np.searchsorted(from_frames[order], frames).clip(max=len(order) - 1)
+    rows = order[place]
+    match = from_frames[rows] == frames
+    found[match] = values[rows[match]]
+    return found
+
+
+class _Words(NamedTuple):
+    """A column of few different words: all of them in order, and the number of each row's."""
+
+    names: tuple[str, ...]
+    codes: IntArray
+
+
+def _read_columns(
+    path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]
+) -> tuple[dict[str, FloatArray], dict[str, _Words]]:
+    """Read the named columns of a CSV; a missing column becomes NaN or "None"."""
+    table = _read_table(path, numbers, texts)
+    # With NumPy: filtering an Arrow table imports all of its functions first.
+    whole = np.isfinite(_numbers(table["frame"]))
+    if not whole.any():
+        raise NoFrameError(
+            f"{path}: holds no frame; there is nothing to report, run the dive again"
+        )
+    words = table.unify_dictionaries()
+    return (
+        {name: _numbers(table[name])[whole] for name in numbers},
+        {name: _words(words[name], whole) for name in texts},
+    )
+
+
+def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) -> Any:
+    word = pa.dictionary(pa.int32(), pa.string())
+    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(texts, word)
+    convert = csv.ConvertOptions(
+        column_types=types, include_columns=list(types), include_missing_columns=True
+    )
+    parse = csv.ParseOptions(invalid_row_handler=lambda _row: "skip")
+    try:
+        content = path.read_bytes()
+        if not content.isascii():
+            # Arrow prints its own complaint of a damaged row that is not UTF-8.
+            content = content.decode("utf-8", "replace").encode()
+        return csv.read_csv(pa.BufferReader(content), parse_options=parse, convert_options=convert)
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; name the folder of a run, or run it") from None
+    except (pa.ArrowInvalid, OSError) as fault:
+        first_line = str(fault).splitlines()[0]
+        raise SourceError(f"{path}: cannot be read ({first_line}); mend or remove it") from fault
+
+
+def _words(column: Any, rows: BoolArray) -> _Words:
+    """Return the words of some rows of a dictionary column, those alone that occur there."""
+    if column.null_count:
+        return _Words(("None",), np.zeros(int(rows.sum()), np.int64))
+    chunks = column.chunks
+    found = np.concatenate([chunk.indices.to_numpy() for chunk in chunks])[rows]
+    occurs = np.bincount(found)
+    names = {
+        name: code
+        for code, name in enumerate(chunks[0].dictionary.to_pylist()[: len(occurs)])
+        if occurs[code]
+    }
+    ordered = tuple(sorted(names))
+    place = np.zeros(len(occurs), np.int64)
+    place[[names[name] for name in ordered]] = np.arange(len(ordered))
+    return _Words(ordered, place[found])
+
+
+def _numbers(column: Any) -> FloatArray:
+    values = column.to_numpy(zero_copy_only=False).astype(np.float64)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+# Lasers whose plane is square to the forward axis have no projection of it to use as y.
+_SQUARE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class LaserFacts:
+    """A laser as the report needs it.
+
+    Attributes
+    ----------
+    name : str
+    normal : array, shape (3,)
+        Unit normal in `dome`; NaN where the file has none.
+    offset : float
+        Metres.
+    bent : bool
+        Whether the plane only fits a bent sheet.
+    """
+
+    name: str
+    normal: FloatArray
+    offset: float
+    bent: bool = False
+
+    @classmethod
+    def unknown(cls, index: int) -> "LaserFacts":
+        """Return a laser of which only its number is known."""
+        return cls(f"laser {index + 1}", np.full(3, np.nan), float("nan"))
+
+    @property
+    def known(self) -> bool:
+        """Whether the plane is known and has a frame of its own."""
+        forward_part = 1.0 - self.normal[1] ** 2
+        return bool(np.isfinite(self.offset) and forward_part > _SQUARE)
+
+    def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return origin, e_x and e_y of the laser's frame in `dome` (paper, Eq. 37-40).
+
+        e_y is the dome's forward axis projected into the plane, e_x = e_y x e_z.
+        """
+        forward = np.array([0.0, 1.0, 0.0])
+        e_y = forward - self.normal * self.normal[1]
+        e_y /= np.linalg.norm(e_y)
+        return self.normal * self.offset, np.cross(e_y, self.normal), e_y
+
+
+def lasers_of(rig: Mapping[str, Any]) -> list[LaserFacts]:
+    """Return the lasers of a rig file's content; what is missing or malformed becomes NaN."""
+    entries = rig.get("lasers")
+    if not isinstance(entries, list):
+        return []
+    lasers = [_laser(entry, i) for i, entry in enumerate(entries) if isinstance(entry, dict)]
+    return _fitted(lasers, rig) if any(laser.bent for laser in lasers) else lasers
+
+
+def _fitted(lasers: list[LaserFacts], rig: Mapping[str, Any]) -> list[LaserFacts]:
+    """Give the lasers behind windows the planes of their sheets, NaN if the rig does not tell."""
+    try:
+        known = rig_from_mapping(rig, source_name="run.yaml")
+    except RigError:
+        nothing = np.full(3, np.nan)
+        return [replace(one, normal=nothing, offset=np.nan) if one.bent else one for one in lasers]
+    camera = known.camera()
+    planes = [sheet.best_plane(camera, known.working_range) for sheet in sheets_of(known)]
+    return [
+        replace(one, normal=plane.normal, offset=plane.offset) if one.bent else one
+        for one, plane in zip(lasers, planes, strict=True)
+    ]
+
+
+def working_range_m(rig: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Return the nearest and farthest range at which the rig is believed, in metres."""
+    pair = rig.get("working_range_mm")
+    if not isinstance(pair, list) or len(pair) != 2:
+        return None
+    near, far = (1e-3 * number(value) for value in pair)
+    return (near, far) if np.isfinite(near) and np.isfinite(far) else None
+
+
+def dome_radius_mm(rig: Mapping[str, Any]) -> float:
+    """Return the dome's outer radius in millimetres, NaN where the rig has no dome."""
+    dome = rig.get("dome")
+    if not isinstance(dome, dict):
+        return float("nan")
+    return number(dome.get("inner_radius_mm")) + number(dome.get("thickness_mm"))
+
+
+def facts(content: Mapping[str, Any], skip: tuple[str, ...] = ()) -> list[tuple[str, str]]:
+    """Return a nested mapping as rows (dotted key, value) for a table."""
+    rows: list[tuple[str, str]] = []
+    for key, value in content.items():
+        name = str(key)
+        if name in skip:
+            continue
+        if isinstance(value, dict):
+            rows += [(f"{name}.{inner}", text) for inner, text in facts(value)]
+        else:
+            rows.append((name, _shown(value)))
+    return rows
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(_shown(item) for item in value)
+    return "none" if value is None else str(value)
+
+
+def _laser(entry: Mapping[str, Any], index: int) -> LaserFacts:
+    values = entry.get("normal")
+    triple = values if isinstance(values, list) and len(values) == 3 else [None] * 3
+    normal = np.array([number(value) for value in triple])
+    length = float(np.linalg.norm(normal))
+    unknown = LaserFacts.unknown(index)
+    name = str(entry.get("name") or unknown.name)
+    if not length > 0.0:
+        return LaserFacts(name, unknown.normal, unknown.offset)
+    # As in rig files, the offset belongs to the unit normal.
+    bent = entry.get("window") is not None
+    return LaserFacts(name, normal / length, 1e-3 * number(entry.get("offset_mm")), bent)

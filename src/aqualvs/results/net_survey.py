@@ -1,0 +1,400 @@
+"""Scans of a run that is on disk, read back one by one from `posture.csv` and its points.
+
+The net's condition over a dive: from scans, one by one, to the files that tell of it.
+
+What evaluates and draws is imported where it is used: every run reads this module, few want a net.
+"""
+
+import csv
+import math
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from aqualvs import __version__
+from aqualvs.errors import SourceError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.nets.target_file import NetRequest
+from aqualvs.optics.rig import Rig
+from aqualvs.results.files import writing
+from aqualvs.results.folder import (
+    HOLES_CSV,
+    JOURNAL,
+    NET_CSV,
+    NET_GEOJSON,
+    NET_MAP_PNG,
+    NET_MAP_SVG,
+    POINTS_PARQUET,
+    POSTURE_CSV,
+    check_run_files,
+)
+from aqualvs.results.points import LABELS, POINTS_SCHEMA, read_journal
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.scan import Label, Scan, ScanPoints
+
+if TYPE_CHECKING:
+    from aqualvs.nets.places import LaidLog
+    from aqualvs.nets.tables import NetWall
+
+
+# The posture is that of a net if so much of what it rests on is net.
+_NET_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class NetResult:
+    """What was found of a net and written.
+
+    Attributes
+    ----------
+    wall : NetWall
+        Stretches and holes on the unrolled net.
+    summary : dict
+        The same in numbers, as `net.geojson` has it.
+    lines : list of str
+        The summary in words.
+    log : LaidLog or None
+        The vehicle's log.
+    """
+
+    wall: "NetWall"
+    summary: dict[str, Any]
+    lines: list[str]
+    log: "LaidLog | None"
+
+
+class NetPass:
+    """Takes a dive's scans in turn, and writes what they say of the net.
+
+    Parameters
+    ----------
+    rig : Rig
+        That the scans were made with.
+    request : NetRequest
+        What to find out; its log is read at once.
+
+    Raises
+    ------
+    AqualvsError
+        If the log cannot be read.
+    """
+
+    def __init__(self, rig: Rig, request: NetRequest) -> None:
+        from aqualvs.nets.condition import NetCondition
+        from aqualvs.nets.places import open_log
+
+        self._rig, self._request = rig, request
+        self._log = open_log(request.log, request.log_offset_s)
+        self._condition = NetCondition(rig, request.options())
+        self._postures = [array("d") for _ in range(4)]
+        self._n_frames = 0
+
+    def add(self, scan: Scan) -> None:
+        """Take the next scan; what is not a net is passed over."""
+        self._n_frames += 1
+        posture = scan.posture
+        if not isinstance(posture, Posture) or not _is_net(scan):
+            return
+        values = (scan.time_s, posture.range, posture.pitch, posture.yaw)
+        for column, value in zip(self._postures, values, strict=True):
+            column.append(value)
+        self._condition.add(scan)
+
+    def write(self, folder: Path, video: Path | None = None) -> NetResult:
+        """Finish, write the files of `NET_FILES` and return what was found.
+
+        Parameters
+        ----------
+        folder : Path
+            That exists.
+        video : Path or None
+            Of the dive; its clock may help to lay the log on it.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written.
+        """
+        from aqualvs.nets.places import DivePostures, lay_log, place_net
+        from aqualvs.nets.tables import net_facts, net_lines, unroll
+
+        self._condition.finish()
+        stretches, holes = self._condition.stretches, self._condition.holes
+        postures = DivePostures(*(np.array(column) for column in self._postures))
+        log = None
+        if self._log is not None:
+            log = lay_log(self._log, postures, self._request.log_offset_s, video)
+        places = place_net(stretches, holes, postures, log.places if log else None)
+        wall = unroll(stretches, holes, places, self._rig)
+        area = self._condition.area
+        summary = net_facts(wall, area, self._n_frames, len(postures.time_s))
+        facts = {
+            "version": __version__,
+            "options": self._request.facts(),
+            "log": None if log is None else log.facts(),
+            "summary": summary,
+        }
+        with writing(folder):
+            write_net_files(folder, wall, facts)
+        lines = net_lines(wall, area, self._n_frames)
+        if log is not None:
+            lines += [*log.log.notes, log.words()]
+        return NetResult(wall, summary, lines, log)
+
+
+def write_net_files(folder: Path, wall: "NetWall", facts: dict[str, Any]) -> None:
+    """Write tables first, pictures last.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    from aqualvs.nets.map import draw_map
+    from aqualvs.nets.tables import (
+        HOLE_COLUMNS,
+        NET_COLUMNS,
+        hole_rows,
+        stretch_rows,
+        write_geojson,
+        write_table,
+    )
+
+    write_table(folder / NET_CSV, NET_COLUMNS, stretch_rows(wall))
+    write_table(folder / HOLES_CSV, HOLE_COLUMNS, hole_rows(wall))
+    write_geojson(folder / NET_GEOJSON, wall, facts)
+    draw_map(wall, [folder / NET_MAP_PNG, folder / NET_MAP_SVG])
+
+
+def _is_net(scan: Scan) -> bool:
+    labels = scan.points.label[scan.points.used]
+    return bool(np.count_nonzero(labels == Label.NET) > _NET_SHARE * len(labels))
+
+
+_BATCH = 1 << 15
+_CODE = {name: code for code, name in enumerate(LABELS)}
+_SIGMAS = ("sigma_range_m", "sigma_pitch_deg", "sigma_yaw_deg")
+_RIG_SIGMAS = ("sigma_range_rig_m", "sigma_pitch_rig_deg", "sigma_yaw_rig_deg")
+
+Columns: TypeAlias = dict[str, NDArray[Any]]
+_NONE = np.empty(0)
+
+
+def stored_scans(run_folder: Path) -> Iterator[Scan]:
+    """Yield the scans of a run in the order of their frames.
+
+    Parameters
+    ----------
+    run_folder : Path
+        With `posture.csv` and `points.parquet`, or `points.arrows` of a run that was killed.
+
+    Yields
+    ------
+    scan : Scan
+        As the scanner gave it, as far as it was stored: pixels, points, sigma, intensity, width and
+        quality as float32, range to a micrometre, angles to 1e-5 degrees. The covariances hold
+        the variances alone (what is between range and angles was not stored; the rig's are NaN in
+        older runs), `rms` is NaN, a refusal has lost its detail.
+
+    Raises
+    ------
+    SourceError
+        If a file is missing, cannot be read, or lacks a column; an older run lacks `intensity` and
+        `width_px`.
+
+    Notes
+    -----
+    Memory holds one batch of points, however long the dive.
+    """
+    points = _Points(run_folder)
+    path = run_folder / POSTURE_CSV
+    for row in _posture_rows(path):
+        try:
+            index, posture = int(row["frame"]), _posture(row)
+            time_s, n_water = float(row["time_s"]), _number(row["n_water"])
+        except ValueError as fault:
+            raise SourceError(
+                f"{path}: frame {row['frame']} holds what is no number ({fault}); mend the row"
+            ) from fault
+        yield Scan(index, time_s, posture, points.of(index), n_water)
+
+
+def check_stored(run_folder: Path) -> None:
+    """Raise if `stored_scans` could not read a run.
+
+    Raises
+    ------
+    SourceError
+        As `stored_scans`.
+    """
+    check_run_files(run_folder)
+    next(_posture_rows(run_folder / POSTURE_CSV), None)
+    next(_batches(run_folder), None)
+
+
+def _posture_rows(path: Path) -> Iterator[dict[str, str]]:
+    """Yield the whole rows of a `posture.csv`; one that was cut short is left out."""
+    try:
+        with path.open(newline="", encoding="ascii", errors="replace") as file:
+            reader = csv.DictReader(file)
+            missing = {"frame", "time_s", "valid", "reason", "range_m", "n_water", *_SIGMAS}
+            missing -= set(reader.fieldnames or ())
+            if missing:
+                raise SourceError(
+                    f"{path}: no column {sorted(missing)[0]}; give the folder of a run"
+                )
+            last = (reader.fieldnames or [""])[-1]
+            yield from (row for row in reader if row[last] is not None)
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; give the folder of a run") from None
+    except csv.Error as fault:
+        raise SourceError(f"{path}: is damaged ({fault}); run the dive again") from None
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the disk") from fault
+
+
+def _posture(row: dict[str, str]) -> Posture | Refusal:
+    if row["valid"] != "1":
+        return Refusal(_reason(row["reason"]))
+    pitch, yaw = math.radians(float(row["pitch_deg"])), math.radians(float(row["yaw_deg"]))
+    normal = np.array([math.tan(yaw), 1.0, math.tan(pitch)])
+    return Posture(
+        range=float(row["range_m"]),
+        pitch=pitch,
+        yaw=yaw,
+        covariance=_variances(row, _SIGMAS),
+        normal_in_dome=normal / np.linalg.norm(normal),
+        slant_range=float(row["slant_range_m"]),
+        nearest=float(row["nearest_m"]),
+        n_points=int(row["n_points"]),
+        rms=math.nan,
+        curvature=_pair(row, "curvature_{}_per_m"),
+        sigma_curvature=_pair(row, "sigma_curvature_{}_per_m"),
+        rig_covariance=_variances(row, _RIG_SIGMAS),
+    )
+
+
+def _variances(row: dict[str, str], names: tuple[str, ...]) -> FloatArray:
+    """Return a covariance (3, 3) without what is between its numbers."""
+    sigma = np.array([_number(row.get(name)) for name in names])
+    sigma[1:] = np.deg2rad(sigma[1:])
+    return np.diag(sigma**2)
+
+
+def _pair(row: dict[str, str], name: str) -> tuple[float, float] | None:
+    """Return a pair along x and z, None where it is empty or the run older than its columns."""
+    words = [row.get(name.format(axis)) for axis in "xz"]
+    if not all(words):
+        return None
+    return _number(words[0]), _number(words[1])
+
+
+def _number(text: str | None) -> float:
+    return float(text) if text else math.nan
+
+
+def _reason(text: str) -> Reason:
+    """Return the reason of a refusal; one that this version does not know is no target."""
+    return Reason(text) if text in set(Reason) else Reason.NO_TARGET
+
+
+class _Points:
+    """The points of a run, asked for frame by frame in ascending order."""
+
+    def __init__(self, run_folder: Path) -> None:
+        self._pieces = _pieces(run_folder)
+        self._waiting: tuple[int, Columns] | None = None
+
+    def of(self, frame: int) -> ScanPoints:
+        """Return the points of a frame; none where it has none."""
+        found: list[Columns] = []
+        while (piece := self._waiting or next(self._pieces, None)) is not None:
+            self._waiting = piece
+            if piece[0] > frame:
+                break
+            if piece[0] == frame:
+                found.append(piece[1])
+            self._waiting = None
+        return _scan_points(found)
+
+
+def _pieces(run_folder: Path) -> Iterator[tuple[int, Columns]]:
+    """Yield each frame's points, in pieces where the file's batches part them."""
+    for columns in _batches(run_folder):
+        frame = columns["frame"]
+        edges = [0, *(np.flatnonzero(np.diff(frame)) + 1).tolist(), len(frame)]
+        for begin, end in pairwise(edges):
+            if begin < end:
+                part = {name: column[begin:end] for name, column in columns.items()}
+                yield int(frame[begin]), part
+
+
+def _batches(run_folder: Path) -> Iterator[Columns]:
+    path, journal = run_folder / POINTS_PARQUET, run_folder / JOURNAL
+    if not path.exists() and journal.exists():
+        path = journal
+    try:
+        for batch in _arrow_batches(path):
+            missing = [name for name in POINTS_SCHEMA.names if name not in batch.schema.names]
+            if missing:
+                raise SourceError(
+                    f"{path}: has no column {' and no '.join(missing)}, as runs of older versions; "
+                    "run the dive again with this version"
+                )
+            yield {name: _plain(name, batch.column(name)) for name in POINTS_SCHEMA.names}
+    except FileNotFoundError:
+        raise SourceError(
+            f"{path}: no such file; give the folder of a run, or run the dive again"
+        ) from None
+    except (pa.ArrowInvalid, OSError) as fault:
+        line = str(fault).splitlines()[0]
+        raise SourceError(f"{path}: cannot be read ({line}); run the dive again") from fault
+
+
+def _arrow_batches(path: Path) -> Iterator[Any]:
+    if path.name == JOURNAL:
+        yield from read_journal(path)
+        return
+    with parquet.ParquetFile(path, pre_buffer=False) as file:
+        # One batch at a time, on one thread, keeps memory flat however long the dive; the empty
+        # one before them shows the columns of a file without rows.
+        yield pa.RecordBatch.from_pylist([], schema=file.schema_arrow)
+        yield from file.iter_batches(batch_size=_BATCH, use_threads=False)
+
+
+def _plain(name: str, column: Any) -> NDArray[Any]:
+    """Return a column as an array, labels as `Label` values."""
+    if name != "label":
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+    names = coded.dictionary.to_pylist()
+    table = np.array([_CODE.get(one, int(Label.CLUTTER)) for one in names] or [0], np.uint8)
+    return np.asarray(table[coded.indices.to_numpy(zero_copy_only=False)])
+
+
+def _scan_points(parts: list[Columns]) -> ScanPoints:
+    """Join the pieces of one frame's points."""
+
+    def of(*names: str) -> FloatArray:
+        columns = [np.concatenate([part[name] for part in parts] or [_NONE]) for name in names]
+        return np.stack(columns, axis=-1).astype(np.float64)
+
+    return ScanPoints(
+        laser=of("laser")[:, 0].astype(np.int8),
+        pixels=of("u_px", "v_px"),
+        points_in_dome=of("x_m", "y_m", "z_m"),
+        sigma=of("sigma_m")[:, 0],
+        intensity=of("intensity")[:, 0],
+        width=of("width_px")[:, 0],
+        quality=of("quality")[:, 0],
+        label=of("label")[:, 0].astype(np.uint8),
+        used=of("used")[:, 0].astype(np.bool_),
+    )

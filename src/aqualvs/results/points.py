@@ -1,0 +1,358 @@
+"""`points.parquet` and `points.ply`, batch by batch.
+
+`points.arrows`: the points of a run that is under way, as an Arrow IPC stream.
+
+Parquet cannot be read before its footer is written; a stream can be read up to its last whole
+batch, whatever happened after it.
+"""
+
+import contextlib
+import io
+import itertools
+import os
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from aqualvs.errors import OutputError
+from aqualvs.results.files import AppendFile, is_locked
+from aqualvs.scanning.scan import Label, Scan
+from aqualvs.text import bgr, laser_colour
+
+LABELS = tuple(label.name.lower() for label in Label)
+POINTS_SCHEMA = pa.schema(
+    [
+        ("frame", pa.int32()),
+        ("time_s", pa.float64()),
+        ("laser", pa.int8()),
+        *((name, pa.float32()) for name in ("u_px", "v_px", "x_m", "y_m", "z_m")),
+        *((name, pa.float32()) for name in ("sigma_m", "quality")),
+        ("label", pa.dictionary(pa.int8(), pa.string())),
+        ("used", pa.bool_()),
+        *((name, pa.float32()) for name in ("intensity", "width_px")),
+    ]
+)
+"""Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`.
+
+`label` says what a point lies on (`Label`), `used` whether it entered the posture; `intensity` is
+the stripe's height above its background in grey levels, `width_px` its full width at half of that.
+"""
+
+_LABEL_NAMES = pa.array(LABELS, pa.string())
+
+
+class PointsJournal:
+    """Writer of `points.arrows`, a few frames at a time as `AppendFile` does it.
+
+    Parameters
+    ----------
+    path : Path
+        Written anew.
+    exclusive : bool
+        As for `AppendFile`.
+
+    Raises
+    ------
+    OSError
+        From the constructor and from `write`, as the system says it.
+    """
+
+    def __init__(self, path: Path, *, exclusive: bool = False) -> None:
+        self._file = AppendFile(path, exclusive=exclusive)
+        self._file.lock()
+        self._waiting = io.BytesIO()
+        self._writer = pa.ipc.new_stream(pa.PythonFile(self._waiting, "w"), POINTS_SCHEMA)
+        self._closed = False
+
+    def write(self, *scans: Scan) -> Any:
+        """Append the points of frames, all or none; those without points leave no trace.
+
+        Returns
+        -------
+        batch : pyarrow.RecordBatch or None
+            What was appended.
+        """
+        if not any(len(scan.points) for scan in scans):
+            return None
+        batch = points_batch(*scans)
+        self._writer.write_batch(batch)
+        self._append()
+        return batch
+
+    def close(self) -> None:
+        """Finish the stream; further calls do nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._writer.close()
+            self._append()
+        finally:
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is after a failed write: with every whole frame."""
+        self._closed = True
+        self._file.close()
+
+    def _append(self) -> None:
+        """Hand over what Arrow has written as many small parts."""
+        self._file.append(self._waiting.getvalue())
+        self._waiting.seek(0)
+        self._waiting.truncate()
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the stream, or leave it as it is where writing failed."""
+        if isinstance(fault, OSError):
+            self.abandon()
+        else:
+            self.close()
+
+
+def points_batch(*scans: Scan) -> Any:
+    """Return the points of frames as a record batch of `POINTS_SCHEMA`."""
+    points = [scan.points for scan in scans]
+    counts = [len(one) for one in points]
+    numbers = np.empty((9, sum(counts)), np.float32)
+    end = 0
+    for one in points:
+        first, end = end, end + len(one)
+        mine = numbers[:, first:end]
+        mine[0:2] = one.pixels.T
+        mine[2:5] = one.points_in_dome.T
+        mine[5] = one.sigma
+        mine[6] = one.quality
+        mine[7] = one.intensity
+        mine[8] = one.width
+    head = (
+        np.repeat(np.array([scan.index for scan in scans], np.int32), counts),
+        np.repeat(np.array([scan.time_s for scan in scans]), counts),
+        np.concatenate([one.laser for one in points]),
+    )
+    label = pa.array(np.concatenate([one.label for one in points]).view(np.int8))
+    names = pa.DictionaryArray.from_arrays(label, _LABEL_NAMES, safe=False)
+    used = pa.array(np.concatenate([one.used for one in points]))
+    columns = [pa.array(column) for column in (*head, *numbers)]
+    arrays = [*columns[:10], names, used, *columns[10:]]
+    return pa.RecordBatch.from_arrays(arrays, schema=POINTS_SCHEMA)
+
+
+def read_journal(path: Path) -> Iterator[Any]:
+    """Yield the whole record batches of a journal, up to where it was cut off."""
+    with pa.OSFile(str(path), "rb") as file:
+        try:
+            yield from pa.ipc.open_stream(file)
+        except (pa.ArrowInvalid, OSError):
+            return
+
+
+def check_idle(path: Path) -> None:
+    """Raise if another process is still writing this journal.
+
+    Raises
+    ------
+    OutputError
+        If it is.
+    """
+    if is_locked(path):
+        raise OutputError(
+            f"{path.parent}: a run is still writing here; wait for its end or stop it first"
+        )
+
+
+DRAFT = ".part"
+"""What is added to the names of files that are not finished."""
+
+_ROWS_PER_GROUP = 1 << 17
+_N_LASERS = 128
+# Only names are worth a dictionary: to look for repetition in numbers takes longer than to write
+# them. What repeats is short once compressed, and of measured numbers the bytes that resemble each
+# other, signs and exponents, are put side by side: the file is a sixth smaller so, and the fast
+# compression makes it hardly larger than the thorough one.
+_NAMES = ("label",)
+# What ascends over the dive, so that a reader of a stretch of it can pass over groups of rows; of
+# all else each group holds everything, and to look for its least and greatest takes a third of the
+# time of writing.
+_ASCENDING = ("frame", "time_s")
+_VERTEX = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+)
+
+
+class PointsExport:
+    """Writes `points.parquet` and `points.ply`; both appear whole, at the end, or not at all.
+
+    Rows are gathered to groups of always the same size, which a thread of its own writes: the files
+    do not depend on how the points come, and memory does not grow with their number.
+
+    Parameters
+    ----------
+    points_parquet : Path
+    points_ply : Path
+        Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser; of the points that
+        entered a posture.
+    schema : pyarrow.Schema
+        Columns of what will be added: `POINTS_SCHEMA`, or those of an older journal.
+
+    Raises
+    ------
+    OSError
+        From every method, as the system says it, a full disk for example; `discard` is to be called
+        then.
+    """
+
+    def __init__(
+        self, points_parquet: Path, points_ply: Path, schema: pa.Schema = POINTS_SCHEMA
+    ) -> None:
+        self._paths = points_parquet, points_ply
+        self._drafts = [path.with_name(path.name + DRAFT) for path in self._paths]
+        self._waiting: list[Any] = []
+        self._n_waiting, self._n_points, self._n_vertices = 0, 0, 0
+        self._written: Future[None] | None = None
+        with contextlib.ExitStack() as stack:
+            self._ply = stack.enter_context(self._drafts[1].open("wb"))
+            self._ply.write(_ply_header(0))
+            self._table_file = stack.enter_context(
+                parquet.ParquetWriter(
+                    self._drafts[0],
+                    schema,
+                    compression="lz4",
+                    use_dictionary=[name for name in _NAMES if name in schema.names],
+                    use_byte_stream_split=[f.name for f in schema if f.type == pa.float32()],
+                    write_statistics=[name for name in _ASCENDING if name in schema.names],
+                )
+            )
+            # It ends before the files are closed that it writes to.
+            self._thread = stack.enter_context(ThreadPoolExecutor(1))
+            self._open_files = stack.pop_all()
+
+    def add(self, batch: Any) -> None:
+        """Add a record batch; it must not be changed afterwards."""
+        self._waiting.append(batch)
+        self._n_waiting += batch.num_rows
+        while self._n_waiting >= _ROWS_PER_GROUP:
+            table = pa.Table.from_batches(self._waiting)
+            self._begin_group(table.slice(0, _ROWS_PER_GROUP))
+            self._waiting = table.slice(_ROWS_PER_GROUP).to_batches()
+            self._n_waiting -= _ROWS_PER_GROUP
+
+    def finish(self) -> int:
+        """Complete both files; returns the number of points in `points.parquet`."""
+        if self._n_waiting:
+            self._begin_group(pa.Table.from_batches(self._waiting))
+        self._await_group()
+        self._ply.seek(0)
+        self._ply.write(_ply_header(self._n_vertices))
+        self._open_files.close()
+        for draft, path in zip(self._drafts, self._paths, strict=True):
+            os.replace(draft, path)
+        return self._n_points
+
+    def discard(self) -> None:
+        """Remove what has been written of files that will not be finished."""
+        with contextlib.suppress(OSError):
+            self._open_files.close()
+        for draft in self._drafts:
+            draft.unlink(missing_ok=True)
+
+    def _begin_group(self, table: Any) -> None:
+        self._await_group()
+        self._written = self._thread.submit(self._write_group, table)
+
+    def _await_group(self) -> None:
+        if self._written is not None:
+            self._written.result()
+
+    def _write_group(self, table: Any) -> None:
+        group = table.combine_chunks()
+        self._table_file.write_table(group)
+        vertices = _vertices(group)
+        vertices.tofile(self._ply)
+        self._n_points += group.num_rows
+        self._n_vertices += len(vertices)
+
+
+def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
+    """Write the points of a journal as `PointsExport` does it.
+
+    Parameters
+    ----------
+    journal : Path
+        May lack its end; what follows the last whole batch is left out.
+    points_parquet, points_ply : Path
+
+    Returns
+    -------
+    n_points : int
+        Points in `points_parquet`.
+
+    Raises
+    ------
+    OSError
+        As the system says it, a full disk for example; the journal is left as it is.
+    """
+    return export_batches(read_journal(journal), points_parquet, points_ply)
+
+
+def export_batches(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:
+    """Write record batches with the columns of the first, as `export_points` does it."""
+    first = next(batches, None)
+    schema = POINTS_SCHEMA if first is None else first.schema
+    export = PointsExport(points_parquet, points_ply, schema)
+    try:
+        for batch in itertools.chain([] if first is None else [first], batches):
+            export.add(batch)
+        return export.finish()
+    except BaseException:
+        export.discard()
+        raise
+
+
+def _vertices(table: Any) -> NDArray[np.void]:
+    """Return the points of a table that entered a posture, as PLY vertices."""
+    target = table["used"].to_numpy()
+    vertices = np.empty(np.count_nonzero(target), _VERTEX)
+    for axis in "xyz":
+        vertices[axis] = table[f"{axis}_m"].to_numpy()[target]
+    colours = _LASER_RGB[table["laser"].to_numpy()[target]]
+    vertices["red"], vertices["green"], vertices["blue"] = colours.T
+    return vertices
+
+
+def _ply_header(n_vertices: int) -> bytes:
+    """Return a header of the same length for any count: a comment takes up the slack."""
+    count = f"element vertex {n_vertices}"
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment target points in dome coordinates, metres {'.' * (40 - len(count))}",
+        count,
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _laser_rgb() -> NDArray[np.uint8]:
+    """Return red, green, blue of every laser that an int8 can number, shape (128, 3)."""
+    return np.array([bgr(laser_colour(i))[::-1] for i in range(_N_LASERS)], np.uint8)
+
+
+_LASER_RGB = _laser_rgb()

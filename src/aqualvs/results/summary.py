@@ -1,0 +1,271 @@
+"""Summary numbers of a run, gathered frame by frame.
+
+Posture against truth.
+"""
+
+import contextlib
+import csv
+import math
+import statistics
+from array import array
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aqualvs.errors import SourceError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.nets.target_file import NetCheck
+from aqualvs.scanning.agreement import LaserAgreement
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Scan
+
+_RANGE_UNITS = {"range_m": 1.0, "range_mm": 1e-3}
+_LIT_PLANE = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg")
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Root mean square and largest absolute value of a deviation."""
+
+    rms: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthComparison:
+    """How far the postures of a run are from the truth.
+
+    Attributes
+    ----------
+    n_compared : int
+        Frames with a posture and a truth.
+    n_missed : int
+        Frames with a truth but without a posture.
+    range_percent : Deviation
+        Of the range, in percent of the true range.
+    pitch_deg, yaw_deg : Deviation
+        In degrees.
+    """
+
+    n_compared: int
+    n_missed: int
+    range_percent: Deviation
+    pitch_deg: Deviation
+    yaw_deg: Deviation
+
+    def lines(self) -> list[str]:
+        """Return the comparison in words."""
+        return [
+            f"against the truth in {self.n_compared} frames "
+            f"({self.n_missed} with truth but without posture):",
+            f"  range  rms {self.range_percent.rms:.3f} %   max {self.range_percent.max:.3f} %",
+            f"  pitch  rms {self.pitch_deg.rms:.3f} deg max {self.pitch_deg.max:.3f} deg",
+            f"  yaw    rms {self.yaw_deg.rms:.3f} deg max {self.yaw_deg.max:.3f} deg",
+        ]
+
+
+def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
+    """Compare the valid postures of a run with the truth of the same frames.
+
+    Parameters
+    ----------
+    posture_csv : Path
+        As a run writes it.
+    truth_csv : Path
+        As `read_truth` takes it.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be read, lacks a column, or no frame is in both.
+    """
+    measured = read_truth(posture_csv)
+    truth = read_truth(truth_csv)
+    common = sorted(measured.keys() & truth.keys())
+    if not common:
+        raise SourceError(
+            f"{truth_csv}: none of its {len(truth)} frames has a posture in {posture_csv}; "
+            "give the truth of this dive"
+        )
+    got = np.array([measured[frame] for frame in common])
+    true = np.array([truth[frame] for frame in common])
+    error = got - true
+    return TruthComparison(
+        n_compared=len(common),
+        n_missed=len(truth.keys() & _frames(posture_csv)) - len(common),
+        range_percent=_deviation(100 * error[:, 0] / true[:, 0]),
+        pitch_deg=_deviation(error[:, 1]),
+        yaw_deg=_deviation(error[:, 2]),
+    )
+
+
+def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
+    """Return range (m), pitch and yaw (deg) by frame, of rows where all are finite.
+
+    Parameters
+    ----------
+    path : Path
+        Columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`. Where a row has
+        `visible_fit_range_mm`, `visible_fit_pitch_deg` and `visible_fit_yaw_deg` as well, these
+        count: the plane through what the lasers light. Light falls on the front of a net's twine,
+        a radius before the net's own plane. Other columns are ignored.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or lacks a column.
+    """
+    rows = _rows(path)
+    range_column = _range_column(path, rows)
+    unit = _RANGE_UNITS[range_column]
+    found = {}
+    for row in rows:
+        frame = _number(row["frame"])
+        lit = [_number(row.get(name)) for name in _LIT_PLANE]
+        values = [_number(row[name]) for name in (range_column, "pitch_deg", "yaw_deg")]
+        if all(map(math.isfinite, lit)):
+            values, scale = lit, _RANGE_UNITS["range_mm"]
+        else:
+            scale = unit
+        if all(map(math.isfinite, [frame, *values])):
+            found[int(frame)] = (values[0] * scale, values[1], values[2])
+    return found
+
+
+def _frames(path: Path) -> set[int]:
+    numbers = (_number(row["frame"]) for row in _rows(path))
+    return {int(number) for number in numbers if math.isfinite(number)}
+
+
+def _rows(path: Path) -> list[dict[str, str | None]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise SourceError(f"{path}: not a CSV file; check the path") from fault
+
+
+def _range_column(path: Path, rows: list[dict[str, str | None]]) -> str:
+    """Return the range column, after a check that the others are there as well."""
+    if not rows:
+        raise SourceError(f"{path}: holds no rows; give a CSV with one row for every frame")
+    columns = rows[0].keys()
+    for name in ("frame", "pitch_deg", "yaw_deg"):
+        if name not in columns:
+            raise SourceError(f"{path}: no column {name}; name it in the first line")
+    for name in _RANGE_UNITS:
+        if name in columns:
+            return name
+    raise SourceError(f"{path}: no column range_m or range_mm; name it in the first line")
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan
+
+
+def _deviation(values: FloatArray) -> Deviation:
+    return Deviation(rms=float(np.sqrt(np.mean(values**2))), max=float(np.abs(values).max()))
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of frames, postures and refusals, and the ranges found.
+
+    Attributes
+    ----------
+    n_frames : int
+    refused : counter
+        Frames without posture, by reason.
+    ranges : array of float
+        Metres, one for each valid frame.
+    agreement : LaserAgreement or None
+        What watches over the lasers, if anything does.
+    net_check : NetCheck or None
+        What compares the net with the target file's, if the file describes one.
+    """
+
+    n_frames: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    ranges: "array[float]" = field(default_factory=lambda: array("d"))
+    agreement: LaserAgreement | None = None
+    net_check: NetCheck | None = None
+
+    @property
+    def n_valid(self) -> int:
+        """Frames with a posture."""
+        return len(self.ranges)
+
+    def add(self, scan: Scan) -> None:
+        """Count one frame."""
+        self.n_frames += 1
+        if self.agreement is not None:
+            self.agreement.add(scan)
+        if self.net_check is not None:
+            self.net_check.add(scan)
+        if isinstance(scan.posture, Posture):
+            self.ranges.append(scan.posture.range)
+        else:
+            self.refused[scan.posture.reason.value] += 1
+
+    def facts(self) -> dict[str, Any]:
+        """Return the summary for `run.yaml`; ranges are absent where no frame is valid."""
+        found: dict[str, Any] = {"n_frames": self.n_frames, "n_valid": self.n_valid}
+        if self.n_frames:
+            found["valid_share"] = round(self.n_valid / self.n_frames, 4)
+        if self.ranges:
+            found["range_median_m"] = round(statistics.median(self.ranges), 6)
+            found["range_min_m"] = round(min(self.ranges), 6)
+            found["range_max_m"] = round(max(self.ranges), 6)
+        if self.refused:
+            found["refused"] = dict(self.refused.most_common())
+        if self.agreement is not None:
+            found["laser_agreement"] = self.agreement.verdict().facts()
+        if self.net_check is not None:
+            found["net_check"] = self.net_check.facts()
+        return found
+
+    def lines(self) -> list[str]:
+        """Return the summary in words."""
+        if not self.n_frames:
+            return ["no frame was measured"]
+        share = 100 * self.n_valid / self.n_frames
+        text = [f"posture in {self.n_valid} of {self.n_frames} frames ({share:.1f} %)"]
+        if self.ranges:
+            low, high = min(self.ranges), max(self.ranges)
+            middle = statistics.median(self.ranges)
+            text.append(f"range {middle:.3f} m (median), from {low:.3f} to {high:.3f} m")
+        if self.refused:
+            counts = (f"{n} {reason}" for reason, n in self.refused.most_common())
+            text.append(f"no posture: {', '.join(counts)}")
+        sentence = "" if self.agreement is None else self.agreement.verdict().sentence()
+        about_net = "" if self.net_check is None else self.net_check.sentence()
+        return [*text, *(words for words in (sentence, about_net) if words)]
+
+
+def tally_of(posture_csv: Path) -> Tally:
+    """Gather the summary of a run from its `posture.csv`; damaged and cut rows are left out."""
+    tally = Tally()
+    with (
+        posture_csv.open(newline="", encoding="ascii", errors="replace") as file,
+        contextlib.suppress(csv.Error),
+    ):
+        for row in csv.DictReader(file):
+            if row.get("n_water") is None:
+                continue
+            if row.get("valid") != "1":
+                tally.refused[str(row.get("reason"))] += 1
+            else:
+                try:
+                    tally.ranges.append(float(row.get("range_m") or math.nan))
+                except ValueError:
+                    continue
+            tally.n_frames += 1
+    return tally

@@ -1,0 +1,423 @@
+"""What a run leaves behind: its folder's files, its report, and how it compares with the truth.
+
+The state of the net while a dive is run, if it is wanted.
+
+`dive.mcap`: the recording that a run writes on request.
+
+The video that shows what the scanner saw.
+
+What ignoring the dome would have made of a run, frame by frame.
+
+Everything that a run writes, frame by frame.
+"""
+
+import statistics
+import time
+from array import array
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aqualvs.closing import Closing
+from aqualvs.errors import OptionError
+from aqualvs.nets.target_file import NetRequest
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.report.overlay import OverlayWriter, draw_overlay
+from aqualvs.report.run_page import write_report
+from aqualvs.results.files import Claim, writing
+from aqualvs.results.folder import (
+    DIVE_MCAP,
+    NET_MAP_PNG,
+    OVERLAY_MP4,
+    POSTURE_BARE_CSV,
+    POSTURE_CSV,
+    RUN_FILES,
+    PostureCsv,
+    RunOutputs,
+    prepare_folder,
+)
+from aqualvs.results.net_survey import NetPass
+from aqualvs.results.run_request import RunRequest, Status, source_facts
+from aqualvs.results.summary import Tally, TruthComparison, compare_with_truth
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.laser_bands import SearchAxis
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.stripe import Returns
+from aqualvs.sources import FrameSource
+from aqualvs.sources.base import bgr_of
+from aqualvs.terminal import StopSignals, Tick
+from aqualvs.workers.frame_results import Measured, ScansFrames
+from aqualvs.workers.replay import Replay
+from aqualvs.workers.water_index import WaterFollowingScanner
+
+if TYPE_CHECKING:
+    from aqualvs.recording import Recording
+    from aqualvs.recording.sample import LiveSample
+
+
+class RunNet:
+    """Evaluates the net as the frames come; does nothing where nobody asked.
+
+    Parameters
+    ----------
+    rig : Rig
+        Of the run.
+    request : NetRequest or None
+        What to find out, if anything.
+
+    Raises
+    ------
+    AqualvsError
+        If the log that the request names cannot be read.
+    """
+
+    def __init__(self, rig: Rig, request: NetRequest | None) -> None:
+        self._net = None if request is None else NetPass(rig, request)
+
+    def add(self, scan: Scan) -> None:
+        """Take the next scan."""
+        if self._net is not None:
+            self._net.add(scan)
+
+    def write(self, folder: Path, source: str) -> list[str]:
+        """Finish, write the net's files and return the summary in words.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the run.
+        source : str
+            Of the frames; the clock of a video may help to lay a log on it.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written.
+        """
+        if self._net is None:
+            return []
+        video = Path(source) if Path(source).is_file() else None
+        result = self._net.write(folder, video)
+        return [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]
+
+
+MeasuredFrame = tuple[Rig, Scan, dict[SearchAxis, Returns]]
+
+
+class RunMcap(Closing):
+    """Writes `dive.mcap` while a run goes on, or does nothing; a context manager.
+
+    Parameters
+    ----------
+    folder : Path
+    rig : Rig
+        For frames that were lost.
+    options : ScannerOptions
+        That the run measures with.
+    wanted : bool
+        False makes it measure frames and nothing else.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the file cannot be written.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, options: ScannerOptions, *, wanted: bool) -> None:
+        self._path, self._rig = folder / DIVE_MCAP, rig
+        self._began_ns = time.time_ns()
+        self._recording: Recording | None = None
+        if wanted:
+            with writing(self._path):
+                self._recording = _recording(self._path, options)
+
+    def recorded(self, scanner: ScansFrames) -> ScansFrames:
+        """Return a scanner that measures as this one does, and has what it finds recorded."""
+        return scanner if self._recording is None else _RecordedScanner(self, scanner)
+
+    def write(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> None:
+        """Record a scan with the rig and the stripes that it was made from."""
+        if self._recording is not None:
+            with writing(self._path):
+                self._recording.write(self._sample(rig, scan, returns))
+
+    def lost(self, scan: Scan) -> None:
+        """Record the scan of a frame that was lost."""
+        self.write(self._rig, scan, {})
+
+    def _sample(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> "LiveSample":
+        from aqualvs.recording.sample import Instants, LiveSample
+        from aqualvs.sources.base import Health
+
+        at_ns = round(1e9 * scan.time_s)
+        return LiveSample(
+            rig=rig,
+            scan=scan,
+            returns=returns,
+            frame=None,
+            # As if the dive had begun with the run.
+            utc_ns=self._began_ns + at_ns,
+            instants=Instants(at_ns, at_ns, at_ns),
+            filtered=None,
+            health=Health(),
+        )
+
+    def close(self) -> None:
+        """Close the file; readable in any case."""
+        if self._recording is not None:
+            with writing(self._path):
+                self._recording.close()
+
+
+class _RecordedScanner:
+    """Measures as another scanner does, and records what it finds."""
+
+    def __init__(self, mcap: RunMcap, scanner: ScansFrames) -> None:
+        self._mcap, self._scanner = mcap, scanner
+
+    def process(self, frame: Frame) -> Scan:
+        rig, scan, returns = _measured(self._scanner, frame)
+        self._mcap.write(rig, scan, returns)
+        return scan
+
+
+def _recording(path: Path, options: ScannerOptions) -> "Recording":
+    """Open a recording; what records is imported here and above, as few runs write one."""
+    from aqualvs.recording import RecorderOptions, Recording
+
+    return Recording(path, RecorderOptions(scanner=options))
+
+
+def check_source_stays(folder: Path, source: str) -> None:
+    """Make sure that a run in a folder does not replace what it reads.
+
+    Raises
+    ------
+    OptionError
+        If the run's own source would be replaced.
+    """
+    path = Path(source)
+    is_ours = path.is_file() and path.name in RUN_FILES
+    if is_ours and path.resolve().parent == folder.resolve():
+        raise OptionError(f"{path}: is what the run reads; write to another folder")
+
+
+def _measured(scanner: ScansFrames, frame: Frame) -> MeasuredFrame:
+    """Return the scan of a frame, and what it was made with and of."""
+    if isinstance(scanner, Replay):
+        return scanner.measured(frame)
+    if isinstance(scanner, WaterFollowingScanner):
+        if scanner.is_due(frame):
+            scanner.look(frame)
+        scanner = scanner.scanner
+    if not isinstance(scanner, Scanner):
+        raise TypeError(f"{type(scanner).__name__} does not tell its stripes")
+    returns = scanner.detect(frame)
+    return scanner.rig, scanner.measure(frame.index, frame.time_s, returns), returns
+
+
+_FPS_WITHOUT_CLOCK = 25.0
+
+
+class RunOverlay(Closing):
+    """Writes `overlay.mp4` while a run goes on, or does nothing; a context manager.
+
+    Parameters
+    ----------
+    folder : Path
+    rig : Rig
+    source : FrameSource
+        Gives size and rate of the video.
+    wanted : bool
+        False makes `write` do nothing.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the video cannot be written.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, source: FrameSource, *, wanted: bool) -> None:
+        self._path = folder / OVERLAY_MP4
+        self._rig = rig
+        self._writer: OverlayWriter | None = None
+        if wanted:
+            fps = source.fps or _FPS_WITHOUT_CLOCK
+            self._writer = OverlayWriter(self._path, source.size_px, fps)
+
+    def write(self, frame: Frame | None, scan: Scan) -> None:
+        """Append a picture; a lost frame gives a black one, so that frames keep their number."""
+        if self._writer is None:
+            return
+        width, height = self._rig.size_px
+        image = np.zeros((height, width, 3), np.uint8) if frame is None else bgr_of(frame)
+        with writing(self._path):
+            self._writer.write(draw_overlay(image, scan.points, scan.posture, self._rig))
+
+    def close(self) -> None:
+        """Finish the video."""
+        if self._writer is not None:
+            with writing(self._path):
+                self._writer.close()
+
+
+class RunBareLens(Closing):
+    """Writes `posture_bare.csv` while a run goes on, or does nothing for a rig without a dome.
+
+    Parameters
+    ----------
+    folder : Path
+    rig : Rig
+
+    Raises
+    ------
+    OutputError
+        From every method, if the file cannot be written.
+    """
+
+    def __init__(self, folder: Path, rig: Rig) -> None:
+        self._path = folder / POSTURE_BARE_CSV
+        self._ratios = array("d")
+        self._file: PostureCsv | None = None
+        if rig.dome is not None:
+            with writing(self._path):
+                self._file = PostureCsv(self._path)
+
+    def write(self, *found: Measured) -> None:
+        """Append the rows of frames."""
+        if self._file is None:
+            return
+        rows = []
+        for measured in found:
+            scan, posture = measured.scan, measured.bare
+            if isinstance(posture, Posture) and isinstance(scan.posture, Posture):
+                self._ratios.append(posture.range / scan.posture.range)
+            if posture is not None:
+                rows.append(replace(scan, posture=posture))
+        with writing(self._path):
+            self._file.write(*rows)
+
+    def lines(self) -> list[str]:
+        """Say in words what the dome is worth."""
+        if not self._ratios:
+            return []
+        percent = 100.0 * (statistics.median(self._ratios) - 1.0)
+        return [f"without the dome model the range would read {percent:+.1f} % (median)"]
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+class RunWriters:
+    """The folder's files, the overlay, the recording and the state of the net, as one.
+
+    Parameters
+    ----------
+    outputs : RunOutputs
+    overlay : RunOverlay
+    bare_lens : RunBareLens
+    mcap : RunMcap
+    net : RunNet
+    """
+
+    def __init__(
+        self,
+        outputs: RunOutputs,
+        overlay: RunOverlay,
+        bare_lens: RunBareLens,
+        mcap: RunMcap,
+        net: RunNet,
+    ) -> None:
+        self._outputs, self._overlay, self._bare_lens = outputs, overlay, bare_lens
+        self._mcap, self._net = mcap, net
+
+    @property
+    def tally(self) -> Tally:
+        """Summary so far."""
+        return self._outputs.tally
+
+    def recorded(self, scanner: ScansFrames) -> ScansFrames:
+        """Return the scanner to measure with: it has what it finds recorded, if that is wanted."""
+        return self._mcap.recorded(scanner)
+
+    def write(self, *found: Measured) -> None:
+        """Write what was found in frames, and what stands for lost ones, in their order."""
+        self._outputs.write(*(measured.scan for measured in found))
+        self._bare_lens.write(*found)
+        for measured in found:
+            self._overlay.write(measured.frame, measured.scan)
+            if measured.is_lost:
+                self._mcap.lost(measured.scan)
+            else:
+                self._net.add(measured.scan)
+
+    def interrupt(self) -> None:
+        """Note that the run ends before its source does."""
+        self._outputs.status = Status.INTERRUPTED
+
+    def dome_lines(self) -> list[str]:
+        """Say what the dome model is worth."""
+        return self._bare_lens.lines()
+
+    def net_lines(self, folder: Path, source: str) -> list[str]:
+        """Write the state of the net, if it was wanted, and say it in words."""
+        return self._net.write(folder, source)
+
+
+def prepare(request: RunRequest) -> Claim:
+    """Make sure that the run can be written; returns the claim to be closed at its end.
+
+    Raises
+    ------
+    OutputError
+        If it cannot, or its folder holds another that may not be replaced.
+    """
+    check_source_stays(request.out, request.source)
+    return prepare_folder(request.out, overwrite=request.overwrite)
+
+
+@contextmanager
+def writers(
+    request: RunRequest, rig: Rig, source: FrameSource, net: RunNet
+) -> Iterator[RunWriters]:
+    """Open everything that the run writes; it is completed however the run ends."""
+    facts, options = source_facts(source), request.facts()
+    with (
+        RunOutputs(request.out, source=facts, rig=rig_to_mapping(rig), options=options) as outputs,
+        RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
+        RunBareLens(request.out, rig) as bare_lens,
+        RunMcap(request.out, rig, request.scanner, wanted=request.mcap) as mcap,
+    ):
+        yield RunWriters(outputs, overlay, bare_lens, mcap, net)
+
+
+def write_all(
+    blocks: Iterable[list[Measured]], writers: RunWriters, stop: StopSignals, tick: Tick
+) -> None:
+    """Write what is found until it ends, or a signal stops it."""
+    for block in blocks:
+        writers.write(*block)
+        tick(len(block))
+        if stop.caught:
+            writers.interrupt()
+            return
+
+
+def report(request: RunRequest) -> Path | None:
+    """Write the report, if it is wanted."""
+    return write_report(request.out, truth=request.truth) if request.report else None
+
+
+def comparison(request: RunRequest) -> TruthComparison | None:
+    """Compare the postures with the truth, where there is one."""
+    if request.truth is None:
+        return None
+    return compare_with_truth(request.out / POSTURE_CSV, request.truth)

@@ -1,0 +1,253 @@
+"""The main path: a frame in, posture and points out."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.camera import Camera
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
+from aqualvs.optics.solved import completed_uncertainty
+from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Verdict, widened
+from aqualvs.scanning.candidates import Chunks, Readings, read_returns
+from aqualvs.scanning.detection import DetectorOptions, FrameDetector
+from aqualvs.scanning.labels import label_readings
+from aqualvs.scanning.laser_bands import SearchAxis, plan_searches, searched_range
+from aqualvs.scanning.paper.detector import PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+from aqualvs.scanning.patch import fitted_patch
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureMeter
+from aqualvs.scanning.scan import Frame, Scan, ScanPoints
+from aqualvs.scanning.stripe import Returns, StripeOptions
+from aqualvs.scanning.surfaces import (
+    MIN_LINES_PER_LASER,
+    Surface,
+    find_surfaces,
+    shares_light,
+    surface_on,
+)
+from aqualvs.scanning.target import TargetKind, choose_target, read_as_wanted
+from aqualvs.scanning.triangulate import Triangulator
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScannerOptions:
+    """What a user may choose; the defaults need no tuning.
+
+    Attributes
+    ----------
+    detector : StripeOptions or ThresholdOptions
+        Which stripe detector, and how.
+    mesh_filter : MeshFilterOptions or None
+        The paper's mesh filter; off by default. What it rejects is dropped, and the frame is
+        measured once more from the rest.
+    target : TargetKind
+        What the posture is measured to.
+    fit : FitMethod
+        How the plane is fitted.
+    """
+
+    detector: DetectorOptions = field(default_factory=StripeOptions)
+    mesh_filter: MeshFilterOptions | None = None
+    target: TargetKind = TargetKind.AUTO
+    fit: FitMethod = FitMethod.ROBUST
+
+
+class Scanner:
+    """Turns frames into postures; a frame's answer depends on nothing but the frame.
+
+    Parameters
+    ----------
+    rig : Rig
+        Camera, housing, water and lasers.
+    options : ScannerOptions, optional
+        Defaults if left out.
+    camera : Camera, optional
+        In place of `rig.camera()`, such as `rig.bare_camera()` to see what ignoring the dome costs.
+    """
+
+    def __init__(
+        self, rig: Rig, options: ScannerOptions | None = None, camera: Camera | None = None
+    ) -> None:
+        self.rig = rig
+        self.options = options or ScannerOptions()
+        camera = camera or rig.camera()
+        self._searches = plan_searches(rig, camera)
+        self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
+        self._triangulator = Triangulator(rig, camera)
+        self._meter = PostureMeter(rig, self._searches, self.options.fit)
+        self._paper_filter = self._make_paper_filter(camera)
+        self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
+        self._assignment = AssignmentTest(
+            self._searches, self._triangulator, searched_range(rig.working_range)
+        )
+
+    def process(self, frame: Frame) -> Scan:
+        """Measure the posture in one frame.
+
+        Parameters
+        ----------
+        frame : Frame
+            Of the rig's image size.
+
+        Returns
+        -------
+        Scan
+            Posture or refusal, and every stripe point with its label.
+
+        Raises
+        ------
+        ValueError
+            If the frame has another size than the rig's image.
+        """
+        return self.measure(frame.index, frame.time_s, self.detect(frame))
+
+    def detect(self, frame: Frame) -> dict[SearchAxis, Returns]:
+        """Find the sub-pixel returns along the search lines, within the lasers' bands.
+
+        Raises
+        ------
+        ValueError
+            If the frame has another size than the rig's image.
+        """
+        return self._detector.detect(frame)
+
+    def measure(self, index: int, time_s: float, returns: dict[SearchAxis, Returns]) -> Scan:
+        """Measure the posture from the returns of one frame.
+
+        Parameters
+        ----------
+        index : int
+            Of the frame.
+        time_s : float
+            Of the frame.
+        returns : dict
+            From `detect`; as they were recorded, they give what the frame gave.
+        """
+        # Each return read as a point of every laser that could have made it.
+        readings = read_returns(returns, self._searches, self._triangulator)
+        found, points, listed = self._measured(readings)
+        if self._paper_filter is not None:
+            # The paper's filter wants to know the laser of each return, which is known by now.
+            kept = np.zeros(len(readings), np.bool_)
+            kept[listed] = _on_mesh(self._paper_filter, points)
+            readings = readings.where(kept)
+            found, points, _ = self._measured(readings)
+        posture = self._with_rig_covariance(found, readings)
+        return Scan(index, time_s, posture, points, self.rig.n_water)
+
+    def _make_paper_filter(self, camera: Camera) -> PaperFilter | None:
+        options = self.options.mesh_filter
+        if options is None:
+            return None
+        every_pixel = isinstance(self.options.detector, ThresholdOptions)
+        return PaperFilter(self.rig, camera, self._searches, options, every_pixel=every_pixel)
+
+    def _measured(self, readings: Readings) -> tuple[Measurement, ScanPoints, IntArray]:
+        """Return the posture, the labelled points, and the rows of their readings."""
+        # Planes that several lasers agree on, and the one that is the target.
+        chunks, chunk_index = readings.chunks()
+        surfaces = find_surfaces(
+            chunks,
+            chunk_index,
+            readings.pixels,
+            len(self.rig.lasers),
+            searched_range(self.rig.working_range),
+            self.rig.focal_px,
+        )
+        surfaces = read_as_wanted(surfaces, self.options.target)
+        target = choose_target(surfaces, self.options.target, self.rig.working_range)
+        tested = UNTESTED
+        if target is not None:
+            # The same peaks, read as other lasers', may make a plane that is as good or better.
+            tested = self._assignment.test(readings, chunks, chunk_index, target)
+            if tested.verdict is Verdict.RIVAL and tested.other is not None:
+                surfaces = self._with_rival(surfaces, target, tested.other, chunks)
+                target = choose_target(surfaces, self.options.target, self.rig.working_range)
+        # The posture from the target's points outside crossing zones.
+        if target is None:
+            found = _no_target(readings, surfaces, self.options.target)
+        elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
+            found = _by_chance(readings)
+        elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
+            found = _ambiguous(readings, target.plane, tested.other)
+        else:
+            found = self._meter.measure(readings, chunk_index, target)
+            found = widened(found, tested)
+            # The mean plane of folds takes all of a net's light, a nearer part of it too.
+            other = None if found.folded else self._assignment.outweighed(chunks, surfaces, target)
+            if other is not None and found.posture:
+                found = _ambiguous(readings, target.plane, other.plane)
+        points, listed = label_readings(
+            readings, chunk_index, surfaces, target, found, self.rig.working_range
+        )
+        return found, points, listed
+
+    def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
+        """Return the posture with what the rig's own uncertainty makes of it."""
+        posture = found.posture
+        if not isinstance(posture, Posture) or found.weights is None:
+            return posture
+        m, points, weights = posture.normal_in_dome / posture.range, readings.points, found.weights
+        surface = fitted_plane(m, points)
+        if found.patch is not None:
+            # Heights over a patch are in metres, m·X is in ranges.
+            surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
+        covariance = self._rig_errors.covariance_of(
+            surface, readings.pixels, readings.laser, points, weights
+        )
+        return replace(posture, rig_covariance=covariance)
+
+    def _with_rival(
+        self, surfaces: list[Surface], target: Surface, other: Plane, chunks: Chunks
+    ) -> list[Surface]:
+        """Put the rival that explains the picture better in place of a surface."""
+        rival = surface_on(other, chunks, len(self.rig.lasers), self.rig.focal_px)
+        kept = [
+            one for one in surfaces if one is not target and not shares_light(one, rival, chunks)
+        ]
+        return read_as_wanted([rival, *kept], self.options.target)
+
+
+def _on_mesh(paper_filter: PaperFilter, points: ScanPoints) -> BoolArray:
+    laser = points.laser.astype(np.int64)
+    return paper_filter.apply(points.pixels, points.width, laser).returns_on_mesh(len(points))
+
+
+def _by_chance(readings: Readings) -> Measurement:
+    detail = "the best plane is small, and lasers that should be seen on it are not"
+    return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(readings), np.bool_))
+
+
+def _ambiguous(readings: Readings, one: Plane, other: Plane) -> Measurement:
+    apart = np.rad2deg(np.arccos(min(float(one.normal @ other.normal), 1.0)))
+    detail = (
+        f"planes at {one.offset:.3f} m and {other.offset:.3f} m, {apart:.1f} deg apart, explain "
+        "the stripes about as well"
+    )
+    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(readings), np.bool_))
+
+
+def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Measurement:
+    refusal = _why_no_target(readings, surfaces, wanted)
+    return Measurement(refusal, np.zeros(len(readings), np.bool_))
+
+
+def _why_no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Refusal:
+    returns, reading, readings_of = np.unique(
+        readings.source, return_index=True, return_counts=True
+    )
+    if not len(returns):
+        return Refusal(Reason.NO_STRIPES, "no laser stripe in the picture")
+    if surfaces:
+        return Refusal(Reason.NO_TARGET, f"surfaces in view, but none of kind {wanted.value}")
+    if len(returns) < MIN_LINES:
+        return Refusal(Reason.TOO_FEW_POINTS, f"only {len(returns)} stripe points")
+    # Lasers that a good many returns can only belong to.
+    own = np.bincount(readings.laser[reading[readings_of == 1]])
+    if np.count_nonzero(own >= MIN_LINES_PER_LASER) == 1:
+        return Refusal(Reason.ONE_LASER, "stripes of one laser only")
+    return Refusal(Reason.NOT_A_PLANE, f"{len(returns)} stripe points share no plane")

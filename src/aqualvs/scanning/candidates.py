@@ -1,0 +1,561 @@
+"""Readings: every return, read as a point of each laser that could have made it.
+
+The arithmetic of `read_returns`: what a laser makes of the returns of its search direction.
+
+The arithmetic of `Readings`: chunks of stripe, and averages over groups of readings.
+
+Chunks: pieces of stripe, the units that agree with a surface or do not.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.quantile import element_at
+from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.segments import (
+    StretchShapes,
+    describe_stretches,
+    is_curved,
+    run_end,
+    segment_returns,
+    stretch_shapes,
+)
+from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.triangulate import Triangulator
+
+SOURCE, LASER, LINE, STRETCH, CHUNK, ALONG_X = range(6)
+"""Rows of a table of readings' whole numbers, the last 1 where the search runs along x."""
+N_NUMBERS = 6
+HEIGHT, WIDTH, SIGMA_PX, TRUST = range(4)
+"""Rows of a table of readings' measures."""
+N_MEASURES = 4
+
+# Position noise of a return: a floor (texture, compression), and what grey-level noise makes of
+# the two flanks of a stripe of given width and height.
+_FLOOR_PX = 0.1
+_FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
+
+
+@kernel
+def read_laser(
+    line: IntArray,
+    position: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    likelihood: FloatArray,
+    lowest: IntArray,
+    highest: IntArray,
+    slope_low: FloatArray,
+    slope_high: FloatArray,
+    laser: int,
+    along_x: int,
+    line_px: int,
+    best_height: float,
+    begin: int,
+    numbers: IntArray,
+    measures: FloatArray,
+    pixels: FloatArray,
+) -> int:
+    """Append one laser's readings to the tables from column `begin` on; returns where they end.
+
+    Parameters
+    ----------
+    line, position, height, width, likelihood
+        As in `Returns`, of the laser's search direction.
+    lowest, highest, slope_low, slope_high, line_px
+        As in the laser's `StripeSearch`.
+    laser : int
+        Its index.
+    along_x : int
+        1 where its search lines run along x.
+    best_height : float
+        Of the frame's best returns.
+    begin : int
+        How many readings other lasers have.
+    numbers : int array, shape (6, N), measures : array, shape (4, N)
+        Written, see `SOURCE` and `HEIGHT`.
+    pixels : array, shape (N, 2)
+        Written.
+    """
+    found = np.empty((3, line.shape[0]), np.int64)
+    n = segment_returns(line, position, lowest, highest, slope_low, slope_high, found)
+    # Stretches and chunks of different lasers must differ.
+    first_stretch, first_chunk = 0, 0
+    for i in range(begin):
+        first_stretch = max(first_stretch, numbers[STRETCH, i] + 1)
+    if begin > 0:
+        first_chunk = numbers[CHUNK, begin - 1] + 1
+    across, along = (1, 0) if along_x else (0, 1)
+    height_share = 1.0 / best_height
+    for k in range(n):
+        i, r = begin + k, found[0, k]
+        # Returns of the two search directions get odd and even numbers.
+        numbers[SOURCE, i] = 2 * r + along_x
+        numbers[LASER, i] = laser
+        numbers[LINE, i] = line[r]
+        numbers[STRETCH, i] = first_stretch + found[1, k]
+        numbers[CHUNK, i] = first_chunk + found[2, k]
+        numbers[ALONG_X, i] = along_x
+        measures[HEIGHT, i] = height[r]
+        measures[WIDTH, i] = width[r]
+        flank = _FLANK_NOISE * width[r] / height[r]
+        measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
+        measures[TRUST, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
+        # The middle of a search line that is several pixels wide.
+        pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
+        pixels[i, along] = position[r]
+    return begin + n
+
+
+# Position noise of a chunk's centroid beyond that: a floor that neighbouring returns share, and a
+# share of the spread, because a strand's light may be cut off on one side by a knot or the border.
+_CHUNK_FLOOR_PX = 0.08
+_SPREAD_SHARE = 0.12
+# A stretch has at most this many times the typical voice when surfaces are sought, but a voice of
+# at least so many search lines.
+_LOUDEST_SHARE = 2.0
+_LOUD_ENOUGH = 16.0
+# What is left of the voice of a curved stretch: a fish is no plane, though it has tangent ones.
+_CURVED_VOICE = 0.2
+# Shorter stretches are specks; they do not say what is typical.
+_SPECK_LINES = 3.0
+
+
+@borrowing_kernel
+def count_chunks(chunk: IntArray) -> int:
+    """Count chunks whose numbers ascend."""
+    n = 0
+    for i in range(chunk.shape[0]):
+        n += i == 0 or chunk[i] != chunk[i - 1]
+    return n
+
+
+@kernel
+def chunk_readings(
+    chunk: IntArray,
+    line: IntArray,
+    laser: IntArray,
+    stretch: IntArray,
+    trust: FloatArray,
+    height: FloatArray,
+    width: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    index: IntArray,
+    table: FloatArray,
+    light: FloatArray,
+    facts: IntArray,
+) -> FloatArray:
+    """Summarise N readings in C chunks, whose numbers ascend.
+
+    Parameters
+    ----------
+    chunk, line, laser, stretch, trust, height, width, points, sensitivity
+        As in `Readings`.
+    index : int array, shape (N,)
+        Written: row of each reading's chunk.
+    table : array, shape (7, C), light : array, shape (C,)
+        Written, as in `Chunks`.
+    facts : int array, shape (4, C)
+        Written: (n_lines, first_line, last_line, laser).
+
+    Returns
+    -------
+    array, shape (6, S)
+        The stretches as `describe_stretches` tells them.
+    """
+    begin = 0
+    for c in range(light.shape[0]):
+        end = run_end(chunk, begin)
+        for i in range(begin, end):
+            index[i] = c
+        facts[0, c], facts[1, c], facts[2, c] = end - begin, line[begin], line[end - 1]
+        facts[3, c] = laser[begin]
+        total = 0.0
+        for i in range(begin, end):
+            total += trust[i]
+        light[c] = total
+        _write_centroid(height, width, points, sensitivity, begin, end, table, c)
+        begin = end
+    shapes = describe_stretches(stretch, line, points, sensitivity, width, height)
+    _write_voices(facts[0], stretch, light, shapes, table[6])
+    return shapes
+
+
+@inline_borrowing_kernel
+def _write_centroid(
+    height: FloatArray,
+    width: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    begin: int,
+    end: int,
+    table: FloatArray,
+    c: int,
+) -> None:
+    """Write the mean point and sensitivity of a chunk, weighted by the light in each return."""
+    total, x, y, z, jx, jy, jz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(begin, end):
+        light = height[i] * width[i]
+        total += light
+        x += light * points[i, 0]
+        y += light * points[i, 1]
+        z += light * points[i, 2]
+        jx += light * sensitivity[i, 0]
+        jy += light * sensitivity[i, 1]
+        jz += light * sensitivity[i, 2]
+    share = 1.0 / total
+    table[0, c], table[1, c], table[2, c] = share * x, share * y, share * z
+    table[3, c], table[4, c], table[5, c] = share * jx, share * jy, share * jz
+
+
+@kernel
+def _write_voices(
+    n_lines: IntArray, stretch: IntArray, light: FloatArray, table: FloatArray, voice: FloatArray
+) -> None:
+    """Write the voice of each chunk: its light, less where its stretch is long or curved."""
+    shapes = StretchShapes(table[0], table[1], table[2], table[3], table[4], table[5])
+    strands = shapes.n_lines[shapes.n_lines >= _SPECK_LINES]
+    typical = np.median(strands) if strands.shape[0] else 0.0
+    loudest = max(_LOUDEST_SHARE * typical, _LOUD_ENOUGH)
+    begin = 0
+    for c in range(n_lines.shape[0]):
+        s = stretch[begin]
+        voice[c] = light[c] * min(1.0, loudest / shapes.n_lines[s])
+        if is_curved(shapes, s):
+            voice[c] *= _CURVED_VOICE
+        begin += n_lines[c]
+
+
+@kernel
+def summarise(
+    index: IntArray,
+    laser: IntArray,
+    line: IntArray,
+    height: FloatArray,
+    width: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    normal: FloatArray,
+    centroid: FloatArray,
+    mean_sensitivity: FloatArray,
+    group_sigma_px: FloatArray,
+    group_line: FloatArray,
+    group_laser: IntArray,
+) -> None:
+    """Write the centroids, mean sensitivities, position errors and lasers of groups."""
+    n = group_sigma_px.shape[0]
+    total, spread = np.zeros(n), np.zeros(n)
+    for i in range(index.shape[0]):
+        c = index[i]
+        if c < 0:
+            continue
+        light = height[i] * width[i]
+        total[c] += light
+        for k in range(3):
+            centroid[c, k] += light * points[i, k]
+            mean_sensitivity[c, k] += light * sensitivity[i, k]
+        # Error of a weighted mean of independent positions.
+        group_sigma_px[c] += (light * sigma_px[i]) ** 2
+        group_line[c] += light * line[i]
+        group_laser[c] = laser[i]
+    middle = np.empty(n)
+    for c in range(n):
+        share = 1.0 / total[c]
+        middle[c] = 0.0
+        for k in range(3):
+            centroid[c, k] *= share
+            mean_sensitivity[c, k] *= share
+            middle[c] += normal[k] * centroid[c, k]
+        group_sigma_px[c] *= share * share
+        group_line[c] *= share
+    for i in range(index.shape[0]):
+        c = index[i]
+        if c >= 0:
+            off = -middle[c]
+            for k in range(3):
+                off += normal[k] * points[i, k]
+            spread[c] += height[i] * width[i] * off * off
+    for c in range(n):
+        per_px = 0.0
+        for k in range(3):
+            per_px += normal[k] * mean_sensitivity[c, k]
+        scatter = spread[c] / (total[c] * per_px * per_px)
+        variance = group_sigma_px[c] + _SPREAD_SHARE**2 * scatter
+        group_sigma_px[c] = np.sqrt(variance + _CHUNK_FLOOR_PX**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Chunks:
+    """Pieces of stripe, C of them, ordered by laser.
+
+    Attributes
+    ----------
+    table : array, shape (7, C)
+        Rows as `plane_search` names them: centroid in `dome` (m), mean derivative of the points by
+        the stripe's position (m/px), and voice: its light, but a long stretch has no more
+        voice than a few strands, because all of it may follow one strand off the sheet's middle.
+    light : array, shape (C,)
+        Search lines in it, each as far as its return looks like laser light.
+    n_lines : int array, shape (C,)
+        Search lines in it.
+    first_line, last_line : int array, shape (C,)
+        Its extent in search lines; tells lit from dark stretches.
+    laser : int array, shape (C,)
+        Index of the laser; ascending.
+    """
+
+    table: FloatArray
+    light: FloatArray
+    n_lines: IntArray
+    first_line: IntArray
+    last_line: IntArray
+    laser: IntArray
+
+    def __len__(self) -> int:
+        """Return the number of chunks."""
+        return len(self.laser)
+
+
+# The best returns of a frame are those from this quantile on.
+_BEST_SHARE = 0.95
+_AXES = (SearchAxis.ALONG_X, SearchAxis.ALONG_Y)
+_NOTHING = np.empty(0)
+_NO_RETURNS = Returns(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
+
+FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
+"""The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Triangulated readings, N of them, ordered by laser, segment and chunk.
+
+    Attributes
+    ----------
+    source : int array, shape (N,)
+        Number of the return; equal for several readings of one return.
+    laser : int array, shape (N,)
+        Index of the laser that the return is read as.
+    line : int array, shape (N,)
+        Search line.
+    stretch, chunk : int array, shape (N,)
+        Numbers of the stretch and the chunk of stripe; those of the chunks ascend.
+    pixels : array, shape (N, 2)
+        In `image`.
+    height, width : array, shape (N,)
+        Of the return: grey levels, pixels.
+    sigma_px : array, shape (N,)
+        Standard deviation of the position along the search line.
+    trust : array, shape (N,)
+        How much the return looks like laser light: its height as a share of the frame's best, and
+        its likelihood; 0 to 1.
+    points : array, shape (N, 3)
+        In `dome`, metres.
+    sensitivity : array, shape (N, 3)
+        Derivative of the point by the position, m/px.
+    """
+
+    source: IntArray
+    laser: IntArray
+    line: IntArray
+    stretch: IntArray
+    chunk: IntArray
+    pixels: FloatArray
+    height: FloatArray
+    width: FloatArray
+    sigma_px: FloatArray
+    trust: FloatArray
+    points: FloatArray
+    sensitivity: FloatArray
+    # Asked for by the search for surfaces and by the labels.
+    _shapes: StretchShapes | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.source)
+
+    def where(self, mask: BoolArray) -> "Readings":
+        """Return the readings that a mask of shape (N,) selects."""
+        return Readings(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
+
+    def chunks(self) -> tuple[Chunks, IntArray]:
+        """Summarise the chunks by their centroids.
+
+        Returns
+        -------
+        Chunks
+            C of them, ordered by laser.
+        index : int array, shape (N,)
+            Row of each reading's chunk.
+        """
+        n = count_chunks(self.chunk)
+        index, facts = np.empty(len(self), np.int64), np.empty((4, n), np.int64)
+        table, light = np.empty((7, n)), np.empty(n)
+        shapes = chunk_readings(
+            self.chunk,
+            self.line,
+            self.laser,
+            self.stretch,
+            self.trust,
+            self.height,
+            self.width,
+            self.points,
+            self.sensitivity,
+            index,
+            table,
+            light,
+            facts,
+        )
+        object.__setattr__(self, "_shapes", StretchShapes(*shapes))
+        return Chunks(table, light, *facts), index
+
+    def shapes(self) -> StretchShapes:
+        """Describe the shape of every stretch."""
+        if self._shapes is None:
+            found = stretch_shapes(
+                self.stretch, self.line, self.points, self.sensitivity, self.width, self.height
+            )
+            object.__setattr__(self, "_shapes", found)
+            return found
+        return self._shapes
+
+    def observations(self, index: IntArray, n: int, normal: FloatArray) -> "Observations":
+        """Average groups of readings, weighted by the light in each return.
+
+        A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the
+        centroid of that light lies on the sheet whatever the strand's direction.
+
+        Parameters
+        ----------
+        index : int array, shape (N,)
+            Group of each reading, 0 to n - 1, or -1 to leave it out; no group is empty.
+        n : int
+            Number of groups.
+        normal : array, shape (3,)
+            Normal of the surface as far as it is known; spread is measured along it.
+        """
+        seen = Observations(
+            points=np.zeros((n, 3)),
+            sensitivity=np.zeros((n, 3)),
+            sigma_px=np.zeros(n),
+            line=np.zeros(n),
+            laser=np.empty(n, np.int64),
+        )
+        summarise(
+            index,
+            self.laser,
+            self.line,
+            self.height,
+            self.width,
+            self.points,
+            self.sensitivity,
+            self.sigma_px,
+            normal,
+            seen.points,
+            seen.sensitivity,
+            seen.sigma_px,
+            seen.line,
+            seen.laser,
+        )
+        return seen
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Independent observations of a surface: centroids of pieces of stripe, M of them.
+
+    Attributes
+    ----------
+    points, sensitivity : array, shape (M, 3)
+        Centroid in `dome` (m) and its derivative by the stripe's position (m/px).
+    sigma_px : array, shape (M,)
+        Standard deviation of that position.
+    line : array, shape (M,)
+        Mean search line.
+    laser : int array, shape (M,)
+        Index of the laser.
+    """
+
+    points: FloatArray
+    sensitivity: FloatArray
+    sigma_px: FloatArray
+    line: FloatArray
+    laser: IntArray
+
+
+def read_returns(
+    returns: Mapping[SearchAxis, Returns],
+    searches: Sequence[StripeSearch],
+    triangulator: Triangulator,
+) -> Readings:
+    """Link each laser's candidates to segments and triangulate them.
+
+    Parameters
+    ----------
+    returns : mapping of SearchAxis to Returns
+        As `FrameDetector.detect` gives them.
+    searches : sequence of StripeSearch
+        One for each laser.
+    triangulator : Triangulator
+        Of the same rig.
+
+    Returns
+    -------
+    Readings
+        Only those whose ray meets the laser's sheet in front of the camera.
+    """
+    along_x, along_y = (returns.get(axis, _NO_RETURNS) for axis in _AXES)
+    by_search = [along_x if one.axis is SearchAxis.ALONG_X else along_y for one in searches]
+    capacity = sum(map(len, by_search))
+    numbers, measures = np.empty((N_NUMBERS, capacity), np.int64), np.empty((N_MEASURES, capacity))
+    pixels = np.empty((capacity, 2))
+    best_height = element_at(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
+    n = 0
+    for i, (search, found) in enumerate(zip(searches, by_search, strict=True)):
+        n = read_laser(
+            found.line,
+            found.position,
+            found.height,
+            found.width,
+            found.likelihood,
+            search.lowest,
+            search.highest,
+            search.slope_low,
+            search.slope_high,
+            i,
+            found is along_x,
+            search.line_px,
+            best_height,
+            n,
+            numbers,
+            measures,
+            pixels,
+        )
+    points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
+    source, laser, line, stretch, chunk, along = numbers[:, :n]
+    height, width, sigma_px, trust = measures[:, :n]
+    pixels = pixels[:n]
+    all_valid = triangulator.triangulate_into(
+        pixels, along, laser, chunk, points, sensitivity, valid
+    )
+    readings = Readings(
+        source,
+        laser,
+        line,
+        stretch,
+        chunk,
+        pixels,
+        height,
+        width,
+        sigma_px,
+        trust,
+        points,
+        sensitivity,
+    )
+    return readings if all_valid else readings.where(valid)

@@ -1,0 +1,433 @@
+"""Whether the stripes on a surface are broken as those on a net are, and how far they reach.
+
+How two surfaces share the stripes: side by side, or the one seen through the other.
+
+A net is the only surface that another one is seen through: along a stripe, light on it takes turns
+with light behind it. The flanks of a fold, which are found as planes of their own, lie side by
+side, and the one begins where the other ends.
+
+The mean plane of a net that is mostly folds, and the doubt that it casts on another.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
+from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.candidates import Chunks
+from aqualvs.scanning.plane_fit import PlaneFit, normal_equations
+from aqualvs.scanning.plane_search import WEIGHT, X, Z
+from aqualvs.scanning.posture import Posture
+
+# Turns along the stripes, as a share of those that light in random order takes: fewer are side by
+# side, more are seen through each other if there are enough of them.
+_MOST_TURNS = 0.5
+_LEAST_TURNS = 0.6
+_ENOUGH_TURNS = 8
+# The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
+# share of the range.
+_STEEPEST = 2.0
+_LOOSE_SHARE = 0.01
+# Share of the turns at which the one must begin where the other ends.
+_MOST = 0.5
+# With this share of a net's light a plane is the net's, and the rest is folds in it.
+_MAIN_SHARE = 0.5
+
+
+def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
+    """Tell whether what lies on one surface goes on, side by side, as another one.
+
+    Parameters
+    ----------
+    plane : Plane
+        Of the first.
+    first, second : bool array, shape (C,)
+        Chunks on them.
+    chunks : Chunks
+        C of them.
+    """
+    packed = np.append(plane.normal, plane.offset)
+    turns, at_random, met = _turns(
+        chunks.table, chunks.laser, chunks.first_line, first, second, packed
+    )
+    return bool(0 < turns <= max(_MOST_TURNS * at_random, 1.0) and met >= _MOST * turns)
+
+
+def seen_through(first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
+    """Tell whether one surface is seen through the gaps of another.
+
+    Parameters
+    ----------
+    first, second : bool array, shape (C,)
+        Chunks on them.
+    chunks : Chunks
+        C of them.
+    """
+    turns, at_random, _ = _turns(
+        chunks.table, chunks.laser, chunks.first_line, first, second, np.zeros(4)
+    )
+    return bool(turns >= _ENOUGH_TURNS and turns >= _LEAST_TURNS * at_random)
+
+
+@kernel
+def _turns(
+    table: FloatArray,
+    laser: IntArray,
+    first_line: IntArray,
+    first: BoolArray,
+    second: BoolArray,
+    plane: FloatArray,
+) -> tuple[int, float, int]:
+    """Count the turns from one surface to the other along the stripes.
+
+    Also how many there would be in random order, and at how many the step over the plane is one
+    that a fold makes.
+    """
+    rows = np.flatnonzero(first | second)
+    order = rows[np.argsort(laser[rows] * 1_000_000 + first_line[rows])]
+    turns, met, n, n_second = 0, 0, 0, 0
+    at_random = 0.0
+    for k in range(order.shape[0]):
+        c = order[k]
+        n += 1
+        n_second += second[c]
+        if k + 1 == order.shape[0] or laser[order[k + 1]] != laser[c]:
+            at_random += 2.0 * n_second * (n - n_second) / n
+            n, n_second = 0, 0
+        elif second[order[k + 1]] != second[c]:
+            turns += 1
+            met += _meet(table, c, order[k + 1], plane)
+    return turns, at_random, met
+
+
+@kernel
+def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
+    """Tell whether the step from one chunk to another is one that a fold makes."""
+    square = 0.0
+    step = 0.0
+    for k in range(3):
+        apart = table[k, b] - table[k, a]
+        square += apart * apart
+        step += plane[k] * apart
+    beside = np.sqrt(max(square - step * step, 0.0))
+    return bool(abs(step) <= _STEEPEST * beside + _LOOSE_SHARE * plane[3])
+
+
+def joined_plane(planes: Sequence[Plane], members: Sequence[BoolArray], chunks: Chunks) -> Plane:
+    """Return the plane of a net in several pieces: that of the main one, else the mean.
+
+    Parameters
+    ----------
+    planes : sequence of Plane
+        Of the pieces.
+    members : sequence of bool array, shape (C,)
+        Chunks on them.
+    chunks : Chunks
+        C of them.
+    """
+    voice = np.array([chunks.table[WEIGHT] @ mine for mine in members])
+    main = int(np.argmax(voice))
+    if voice[main] > _MAIN_SHARE * voice.sum():
+        return planes[main]
+    mine = np.logical_or.reduce(members)
+    weight = np.sqrt(chunks.table[WEIGHT, mine])
+    points = chunks.table[X : Z + 1, mine].T
+    m = np.linalg.lstsq(weight[:, None] * points, weight)[0]
+    length = float(np.linalg.norm(m))
+    return Plane(m / length, 1.0 / length)
+
+
+_TUKEY = 4.685  # 95 % efficiency for normal errors
+_ITERATIONS = 5
+_EXACT = 1e-9
+
+
+def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
+    """Fit m·X = 1 to the strands of a folded net: all alike, whatever the errors of their places.
+
+    Their scatter about the plane is that of the folds, and gives the covariance.
+
+    Parameters
+    ----------
+    points : array, shape (N, 3)
+        Of the strands, in `dome`, metres.
+    start : Plane
+        A first guess: tells outliers.
+
+    Returns
+    -------
+    PlaneFit or None
+        None where the points do not determine a plane.
+    """
+    if len(points) <= 3:
+        return None
+    m, weights, covariance = start.normal / start.offset, np.empty(len(points)), np.empty((3, 3))
+    rms = _fit_mean(points, m, weights, covariance)
+    return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
+
+
+@kernel
+def _fit_mean(
+    points: FloatArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
+) -> float:
+    """Refine m in place, write weights and covariance; the rms, NaN where no plane is fixed."""
+    n, one = points.shape[0], np.ones(points.shape[0])
+    off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for _ in range(_ITERATIONS):
+        _distances(points, m, off)
+        cut = _TUKEY * 1.4826 * max(np.median(np.abs(off)), _EXACT)
+        for i in range(n):
+            weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
+        normal_equations(points, one, weights, normal, right)
+        if not solve_symmetric(normal, right, inverse, m):
+            return np.nan
+    if not invert_symmetric(normal, covariance):
+        return np.nan
+    _distances(points, m, off)
+    square, weight = 0.0, 0.0
+    for i in range(n):
+        square += weights[i] * off[i] * off[i]
+        weight += weights[i]
+    covariance *= square / (weight * (1.0 - 3.0 / n))
+    return float(np.sqrt(square / weight / (m[0] * m[0] + m[1] * m[1] + m[2] * m[2])))
+
+
+@kernel
+def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
+    """Write m·X - 1 of each point."""
+    for i in range(points.shape[0]):
+        off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
+
+
+def doubted(posture: Posture, other: Posture, share: float) -> Posture:
+    """Return a posture with its covariance widened by another opinion.
+
+    Parameters
+    ----------
+    posture, other : Posture
+        Both opinions.
+    share : float
+        Of the light that holds the other one.
+    """
+    apart = np.array(
+        [other.range - posture.range, other.pitch - posture.pitch, other.yaw - posture.yaw]
+    )
+    return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
+
+
+# A typical lit stretch over itself and a typical gap: below, it is a mesh. Strands of a net leave
+# longer gaps than they light; a wall behind a net is lit between short shadows.
+_MESH_DUTY = 0.6
+# Below this the gaps are at least no specks: a dense net, or a wall in a net's shadows.
+_GAPPY_DUTY = 0.9
+# Lit stretches with fewer dark search lines between them are one.
+_MIN_GAP_LINES = 3
+_MIN_STRETCHES = 3
+# So many short stretches on all lasers, and none longer, are a net of which little is seen.
+_FEW_STRETCHES = 5
+LONGEST_STRETCH = 0.03
+"""The light on one strand is typically shorter than this, in metres."""
+# A stripe with this share of its light in stretches so much longer lies on something solid that is
+# partly hidden or broken by its texture; growth and strands along a laser make few of them.
+_UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
+# A chunk with a smaller share of its light as voice lies in a curved stretch.
+_CURVED_VOICE = 0.21
+# Share of the lines at each end of a stripe that may be stragglers.
+_STRAGGLERS = 0.1
+
+
+class Pattern(NamedTuple):
+    """How the stripes on a surface are broken.
+
+    Attributes
+    ----------
+    is_mesh : bool
+        As on a net: two lasers (or the only one asked) show short lit stretches between longer
+        gaps. One laser may run along a strand and look unbroken even on a net. Where little is
+        seen, a few short stretches and nothing longer are enough.
+    is_gappy : bool
+        As on a dense net, or as on a wall in the shadows of a net: short stretches at any gaps.
+    is_unbroken : bool
+        As on something solid, if need be with gaps: on two lasers (or the only one asked) much
+        of the light is in stretches longer than those on strands.
+    extent : float
+        Search lines over which the gappy stripes reach, summed over the lasers.
+    on_strands : array, shape (n_lasers,)
+        Light in stretches as short as those on a strand, and not curved.
+    """
+
+    is_mesh: bool
+    is_gappy: bool
+    is_unbroken: bool
+    extent: float
+    on_strands: FloatArray
+
+
+def describe_pattern(
+    chunks: Chunks, members: BoolArray, n_lasers: int, min_lines: int, focal_px: float
+) -> Pattern:
+    """Describe the stripes on a surface.
+
+    Parameters
+    ----------
+    chunks : Chunks
+        C of them.
+    members : bool array, shape (C,)
+        Those on the surface.
+    n_lasers : int
+        Lasers of the rig.
+    min_lines : int
+        Lasers with fewer search lines on the surface are not asked.
+    focal_px : float
+        Pixels per radian, roughly.
+
+    Returns
+    -------
+    Pattern
+    """
+    on_strands = np.zeros(n_lasers)
+    is_mesh, is_gappy, is_unbroken, extent = _describe(
+        chunks.table,
+        chunks.light,
+        chunks.n_lines,
+        chunks.first_line,
+        chunks.last_line,
+        chunks.laser,
+        members,
+        min_lines,
+        focal_px,
+        on_strands,
+    )
+    return Pattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
+
+
+@kernel
+def _describe(
+    table: FloatArray,
+    light: FloatArray,
+    n_lines: IntArray,
+    first_line: IntArray,
+    last_line: IntArray,
+    laser: IntArray,
+    members: BoolArray,
+    min_lines: int,
+    focal_px: float,
+    on_strands: FloatArray,
+) -> tuple[bool, bool, bool, float]:
+    """Write the light on strands; returns the rest of a `Pattern`."""
+    asked, broken, gappy, long, unbroken, n_stretches = 0, 0, 0, 0, 0, 0
+    total = 0.0
+    for index in range(on_strands.shape[0]):
+        order, n_mine = _in_order(first_line, n_lines, laser, members, index)
+        if n_mine < min_lines:
+            continue
+        asked += 1
+        n, duty, length, extent, on_strands[index], share = _describe_stripe(
+            table, light, n_lines, first_line, last_line, order, focal_px
+        )
+        n_stretches += n
+        unbroken += share >= _UNBROKEN_SHARE
+        is_short = length < LONGEST_STRETCH
+        long += not is_short
+        is_gappy = n >= _MIN_STRETCHES and is_short and duty < _GAPPY_DUTY
+        gappy += is_gappy
+        broken += is_gappy and duty < _MESH_DUTY
+        total += extent if is_gappy else 0.0
+    few = not long and gappy == broken and n_stretches >= _FEW_STRETCHES
+    enough = min(2, asked)
+    return broken >= enough or few, gappy >= enough or few, unbroken >= enough, total
+
+
+@kernel
+def _in_order(
+    first_line: IntArray, n_lines: IntArray, laser: IntArray, members: BoolArray, index: int
+) -> tuple[IntArray, int]:
+    """Return a laser's chunks on a surface in their order along the stripe, and their lines."""
+    order, n, total = np.empty(members.shape[0], np.int64), 0, 0
+    for c in range(members.shape[0]):
+        if not members[c] or laser[c] != index:
+            continue
+        # Chunks come almost in order.
+        at = n
+        while at > 0 and first_line[order[at - 1]] > first_line[c]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = c
+        n += 1
+        total += n_lines[c]
+    return order[:n], total
+
+
+@kernel
+def _describe_stripe(
+    table: FloatArray,
+    light: FloatArray,
+    n_lines: IntArray,
+    first_line: IntArray,
+    last_line: IntArray,
+    order: IntArray,
+    focal_px: float,
+) -> tuple[int, float, float, float, float, float]:
+    """Stretches of one laser's stripe: number, duty, typical length (m), extent, light on strands.
+
+    Last the share of the lit search lines that are in stretches much longer than a strand's light.
+
+    Medians, so that what hides behind a fish or a box for a while does not count.
+    """
+    n = order.shape[0]
+    lit, dark, distance, bright = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    n_stretches = 0
+    begin = first_line[order[0]]
+    end = last_line[order[0]] + 1
+    for k in range(n):
+        c = order[k]
+        distance[k] = np.sqrt(table[0, c] ** 2 + table[1, c] ** 2 + table[2, c] ** 2)
+        gap = first_line[c] - end
+        if gap >= _MIN_GAP_LINES:
+            lit[n_stretches] = end - begin
+            dark[n_stretches] = gap
+            n_stretches += 1
+            begin = first_line[c]
+        end = max(end, last_line[c] + 1)
+        if table[WEIGHT, c] > _CURVED_VOICE * light[c]:
+            bright[n_stretches] += light[c]
+    extent = _extent(n_lines, first_line, last_line, order)
+    gap = np.median(dark[:n_stretches]) if n_stretches else 0.0
+    lit[n_stretches] = end - begin
+    n_stretches += 1
+    stretch = np.median(lit[:n_stretches])
+    m_per_line = np.median(distance) / focal_px
+    on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
+    for k in range(n_stretches):
+        all_lines += lit[k]
+        if lit[k] * m_per_line < LONGEST_STRETCH:
+            on_strands += bright[k]
+        elif lit[k] * m_per_line > _UNBROKEN_LENGTHS * LONGEST_STRETCH:
+            unbroken += lit[k]
+    share = float(unbroken / all_lines)
+    duty = float(stretch / (stretch + gap))
+    return n_stretches, duty, float(stretch * m_per_line), extent, on_strands, share
+
+
+@kernel
+def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order: IntArray) -> float:
+    """Search lines between the 10 % and the 90 % point of one laser's light."""
+    total = 0
+    for k in range(order.shape[0]):
+        total += n_lines[order[k]]
+    seen = 0
+    begin = 0
+    end = 0
+    for k in range(order.shape[0]):
+        c = order[k]
+        if seen <= _STRAGGLERS * total:
+            begin = first_line[c]
+        if seen < (1.0 - _STRAGGLERS) * total:
+            end = last_line[c]
+        seen += n_lines[c]
+    return float(end - begin + 1)

@@ -1,0 +1,1 @@
+"""The paper's own stripe detector and mesh filter, kept for comparison."""

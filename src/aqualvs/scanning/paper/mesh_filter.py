@@ -1,0 +1,500 @@
+"""The paper's filter for mesh-like structures (section 4).
+
+A laser plane cuts the threads of a net at intervals that lie between two limits. Seen in the laser
+plane, a reflection of a thread therefore has a small lit core, nothing around it, and the right
+amount of light in the ring where its two neighbours must be. docs/mesh-filter.md tells how the
+paper's text was read where it leaves a choice.
+
+Counting lit cells near lit cells, with a spatial hash; what `mesh.mesh_filter` compiles to.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, as_vectors
+from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.transforms import SE3
+
+
+class Limits(NamedTuple):
+    """When a cell belongs to the mesh (paper, Algorithm 1).
+
+    Attributes
+    ----------
+    a, b, c : int
+        Greatest squared distance, in cells, of the cells of the regions A, B and C.
+    least_in_a, most_in_a : int
+        Lit cells in A.
+    most_in_ab : int
+        Lit cells in A and B together.
+    least_in_c, most_in_c : int
+        Lit cells in C.
+    reach : int
+        Side of the blocks of the hash, in cells; not below the radius of C.
+    """
+
+    a: int
+    b: int
+    c: int
+    least_in_a: int
+    most_in_a: int
+    most_in_ab: int
+    least_in_c: int
+    most_in_c: int
+    reach: int
+
+
+class _Numbering(NamedTuple):
+    """Distinct pairs of integers, numbered in the order in which they first appear.
+
+    Attributes
+    ----------
+    table : int64 array
+        Hash table of the numbers; -1 in empty slots.
+    number : int64 array, shape (N,)
+        Number of every pair.
+    first : int64 array, shape (n,)
+        Where every numbered pair first appears.
+    """
+
+    table: IntArray
+    number: IntArray
+    first: IntArray
+
+
+class _Blocks(NamedTuple):
+    """Cells sorted by the block that they lie in.
+
+    Attributes
+    ----------
+    m, n : array, shape (n_cells,)
+        The cells, block by block. Whole numbers kept as floats, which processors square faster.
+    start : int64 array, shape (n_blocks + 1,)
+        Where every block begins.
+    place : int64 array, shape (n_cells,)
+        Where every cell went.
+    """
+
+    m: FloatArray
+    n: FloatArray
+    start: IntArray
+    place: IntArray
+
+
+@kernel
+def keep_points(columns: IntArray, rows: IntArray, limits: Limits, out: BoolArray) -> None:
+    """Decide Algorithm 1 of the paper for points in cells (columns, rows), each of shape (N,)."""
+    cells = _number_pairs(columns, rows)
+    m, n = columns[cells.first], rows[cells.first]
+    block_m, block_n = m // limits.reach, n // limits.reach
+    known = _number_pairs(block_m, block_n)
+    blocks = _sort_by_block(m, n, known)
+    keep = np.empty(m.shape[0], dtype=np.bool_)
+    near = np.empty(9, dtype=np.int64)
+    for i_block in range(known.first.shape[0]):
+        home = known.first[i_block]
+        n_near = _neighbours(block_m, block_n, home, known, near)
+        for place in range(blocks.start[i_block], blocks.start[i_block + 1]):
+            keep[place] = _belongs(blocks, place, near, n_near, limits)
+    for k in range(columns.shape[0]):
+        out[k] = keep[blocks.place[cells.number[k]]]
+
+
+@inline_kernel
+def _slot(x: int, y: int, mask: int) -> int:
+    """Hash two integers to a slot (constants of Teschner et al., VMV 2003)."""
+    mixed = x * 73856093 ^ y * 19349663
+    return (mixed ^ (mixed >> 15)) & mask
+
+
+@inline_kernel
+def _number_pairs(x: IntArray, y: IntArray) -> _Numbering:
+    size = 8
+    while size < 2 * x.shape[0]:
+        size *= 2
+    table = np.full(size, -1, dtype=np.int64)
+    number = np.empty(x.shape[0], dtype=np.int64)
+    first = np.empty(x.shape[0], dtype=np.int64)
+    n_known = 0
+    for k in range(x.shape[0]):
+        slot = _find(x, y, x[k], y[k], table, first)
+        if table[slot] < 0:
+            table[slot] = n_known
+            first[n_known] = k
+            n_known += 1
+        number[k] = table[slot]
+    return _Numbering(table, number, first[:n_known])
+
+
+@inline_kernel
+def _find(x: IntArray, y: IntArray, at_x: int, at_y: int, table: IntArray, first: IntArray) -> int:
+    """Return the slot of a pair, or the empty slot where it would go."""
+    mask = table.shape[0] - 1
+    slot = _slot(at_x, at_y, mask)
+    while table[slot] >= 0:
+        known = first[table[slot]]
+        if x[known] == at_x and y[known] == at_y:
+            break
+        slot = (slot + 1) & mask
+    return slot
+
+
+@inline_kernel
+def _sort_by_block(m: IntArray, n: IntArray, known: _Numbering) -> _Blocks:
+    n_cells, n_blocks = m.shape[0], known.first.shape[0]
+    start = np.zeros(n_blocks + 1, dtype=np.int64)
+    for i in range(n_cells):
+        start[known.number[i] + 1] += 1
+    for i in range(n_blocks):
+        start[i + 1] += start[i]
+    free = start.copy()
+    place = np.empty(n_cells, dtype=np.int64)
+    sorted_m, sorted_n = np.empty(n_cells), np.empty(n_cells)
+    for i in range(n_cells):
+        at = free[known.number[i]]
+        free[known.number[i]] += 1
+        place[i], sorted_m[at], sorted_n[at] = at, m[i], n[i]
+    return _Blocks(sorted_m, sorted_n, start, place)
+
+
+@inline_kernel
+def _neighbours(
+    block_m: IntArray, block_n: IntArray, home: int, known: _Numbering, near: IntArray
+) -> int:
+    """Write the numbers of the blocks around a cell's block, and itself; return how many."""
+    count = 0
+    for bm in range(block_m[home] - 1, block_m[home] + 2):
+        for bn in range(block_n[home] - 1, block_n[home] + 2):
+            slot = _find(block_m, block_n, bm, bn, known.table, known.first)
+            if known.table[slot] >= 0:
+                near[count] = known.table[slot]
+                count += 1
+    return count
+
+
+@inline_kernel
+def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: Limits) -> bool:
+    """Compare the lit cells in the regions around a cell with the limits."""
+    m, n = blocks.m[place], blocks.n[place]
+    in_a, in_ab, in_abc = 0, 0, 0
+    for i in range(n_near):
+        for k in range(blocks.start[near[i]], blocks.start[near[i] + 1]):
+            dm, dn = blocks.m[k] - m, blocks.n[k] - n
+            distance = dm * dm + dn * dn
+            in_a += distance <= limits.a
+            in_ab += distance <= limits.b
+            in_abc += distance <= limits.c
+        # Counts only grow: a cell amid a wall or a fish needs no further look.
+        if in_abc > limits.most_in_ab + limits.most_in_c:
+            return False
+    in_c = in_abc - in_ab
+    return (
+        limits.least_in_a <= in_a <= limits.most_in_a
+        and in_ab <= limits.most_in_ab
+        and limits.least_in_c <= in_c <= limits.most_in_c
+    )
+
+
+_FORWARD, _UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+# A forward axis whose projection into the laser plane is shorter has no direction worth following.
+_DEGENERATE = 1e-6
+# Lengths that are whole numbers of cells must not fall beside them by a rounding.
+_ROUNDING = 1e-9
+# Farther than any laser reaches, near enough for cells to be whole numbers.
+_FARTHEST = 1e6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeshFilterOptions:
+    """Parameters of the mesh filter, in metres; defaults from section 5.2 of the paper.
+
+    Attributes
+    ----------
+    rd_theta : float
+        Size of a thread's reflection along the stripe.
+    dd : float
+        Side of a cell of the laser-plane image.
+    r_min, r_max : float
+        Least and greatest distance between consecutive threads, centre to centre, in the laser
+        plane.
+
+    Raises
+    ------
+    OptionError
+        If a length is not positive, r_min is not below r_max, or rd_theta is not below r_max.
+    """
+
+    rd_theta: float = 10e-3
+    dd: float = 1e-3
+    r_min: float = 15e-3
+    r_max: float = 35e-3
+
+    def __post_init__(self) -> None:
+        for name in ("rd_theta", "dd", "r_min", "r_max"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise OptionError(f"mesh filter: {name} is {value * 1e3:g} mm; it must be positive")
+        if not self.r_min < self.r_max:
+            raise OptionError(
+                f"mesh filter: r_min is {self.r_min * 1e3:g} mm and r_max {self.r_max * 1e3:g} mm; "
+                "r_min must be the smaller"
+            )
+        if not self.rd_theta < self.r_max:
+            raise OptionError(
+                f"mesh filter: rd_theta is {self.rd_theta * 1e3:g} mm, not below r_max of "
+                f"{self.r_max * 1e3:g} mm; reflections as long as the mesh show no period"
+            )
+
+    @classmethod
+    def from_thread(
+        cls, *, d_theta: float, theta_lt: float, dd: float, r_min: float, r_max: float
+    ) -> "MeshFilterOptions":
+        """Make options from a thread's diameter and its angle to the laser plane.
+
+        Parameters
+        ----------
+        d_theta : float
+            Thread diameter in metres.
+        theta_lt : float
+            Angle in radians, as the paper uses it: rd_theta = d_theta / cos(theta_lt). The
+            paper's 2 mm thread with a reflection of 10 mm has acos(2/10), 78 degrees.
+        dd, r_min, r_max : float
+            As the attributes.
+        """
+        return cls(rd_theta=d_theta / math.cos(theta_lt), dd=dd, r_min=r_min, r_max=r_max)
+
+    @property
+    def dg_theta(self) -> int:
+        """Most cells that a thread's reflection can light, dg_theta = ceil(rd_theta / dd) + 1."""
+        return math.ceil(self.rd_theta / self.dd - _ROUNDING) + 1
+
+    @property
+    def squared_radii(self) -> tuple[int, int, int]:
+        """Greatest squared distance, in cells, of cells in the regions A, B and C.
+
+        B and C begin where the region before them ends; B is empty when r_min <= rd_theta.
+        """
+        half = self.rd_theta / 2.0
+        radii = (half, max(self.r_min - half, half), self.r_max + half)
+        a, b, c = (math.floor((r / self.dd) ** 2 * (1.0 + _ROUNDING)) for r in radii)
+        return a, b, c
+
+    @property
+    def padding(self) -> int:
+        """rho_pad, in cells: how far the regions reach, ceil((r_max + rd_theta / 2) / dd)."""
+        return math.ceil((self.r_max + self.rd_theta / 2.0) / self.dd - _ROUNDING)
+
+
+@dataclass(frozen=True, slots=True)
+class LaserImage:
+    """The laser-plane image (paper, Eq. 41-42).
+
+    Attributes
+    ----------
+    lit : bool array, shape (n_x, n_y)
+        Im(m, n): whether a cell holds points.
+    cells : int64 array, shape (N, 2)
+        Cell (m, n) of every point: S_idx(m, n) is where `cells` equals (m, n).
+    """
+
+    lit: BoolArray
+    cells: IntArray
+
+
+def laser_frame(plane: Plane) -> SE3:
+    """Return `laser_from_dome` of a laser plane (paper, Eq. 37-40).
+
+    e_z is the plane's normal, e_y the dome's forward axis projected into the plane, and
+    e_x = e_y x e_z. A plane square to the forward axis has no such projection: there e_y is the
+    dome's z axis, so that e_x points right or left as the normal points forward or back.
+
+    Parameters
+    ----------
+    plane : Plane
+        In `dome`.
+
+    Returns
+    -------
+    SE3
+        Its origin is the foot of the perpendicular from the dome's centre; points on the plane
+        have z = 0 in `laser`.
+    """
+    e_z = plane.normal
+    square_to_forward = math.hypot(e_z[0], e_z[2]) < _DEGENERATE
+    e_y = _in_plane(_UP if square_to_forward else _FORWARD, e_z)
+    rotation = np.stack([np.cross(e_y, e_z), e_y, e_z])
+    return SE3(rotation, np.array([0.0, 0.0, -plane.offset]))
+
+
+def _in_plane(axis: FloatArray, normal: FloatArray) -> FloatArray:
+    """Direction of an axis projected into a plane to which it is not square."""
+    direction = axis - normal * (normal @ axis)
+    direction /= np.linalg.norm(direction)
+    # What the first projection left along the normal grew when a short result became a unit.
+    direction -= normal * (normal @ direction)
+    unit: FloatArray = direction / np.linalg.norm(direction)
+    return unit
+
+
+def laser_cells(points_in_laser: FloatArray, dd: float) -> IntArray:
+    """Return the cell (m, n) of every point, shape (N, 2), counted from the least x and y.
+
+    Eq. 41 with its erratum: m·dx <= x - x_L < (m + 1)·dx, and so for n.
+    """
+    xy = points_in_laser[:, :2]
+    low = xy.min(axis=0) if len(xy) else np.zeros(2)
+    return np.floor((xy - low) / dd).astype(np.int64)
+
+
+def laser_plane_image(points_in_laser: FloatArray, dd: float) -> LaserImage:
+    """Rasterise the points of one laser (N, 2 or 3) in its plane (paper, Eq. 41-42)."""
+    cells = laser_cells(points_in_laser, dd)
+    n_x, n_y = cells.max(axis=0) + 1 if len(cells) else (0, 0)
+    lit = np.zeros((n_x, n_y), dtype=np.bool_)
+    lit[cells[:, 0], cells[:, 1]] = True
+    return LaserImage(lit, cells)
+
+
+def structuring_elements(options: MeshFilterOptions) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return Str_A, Str_B and Str_C, each of shape (2 rho_pad + 1, 2 rho_pad + 1).
+
+    A is the disc of diameter rd_theta, B the ring from A out to r_min - rd_theta/2, C the ring
+    from B out to r_max + rd_theta/2; a cell belongs where its centre lies.
+    """
+    offsets = np.arange(-options.padding, options.padding + 1)
+    squared = offsets[:, None] ** 2 + offsets[None, :] ** 2
+    a, b, c = options.squared_radii
+    return squared <= a, (squared > a) & (squared <= b), (squared > b) & (squared <= c)
+
+
+def mesh_filter_dense(
+    points: ArrayLike,
+    plane: Plane,
+    options: MeshFilterOptions | None = None,
+    *,
+    working_range: tuple[float, float] | None = None,
+) -> BoolArray:
+    """Return which points belong to a mesh: Algorithm 1 of the paper, line by line.
+
+    The reference for `mesh_filter`, whose parameters and result it has; its cost grows with the
+    area of the laser-plane image.
+    """
+    options = options or MeshFilterOptions()
+    in_laser, usable = _usable_in_laser(points, plane, working_range)
+    image = laser_plane_image(in_laser[usable], options.dd)
+    kept = _algorithm_1(image.lit, options)
+    keep = np.zeros(len(usable), dtype=np.bool_)
+    keep[usable] = kept[image.cells[:, 0], image.cells[:, 1]]
+    return keep
+
+
+def _algorithm_1(lit: BoolArray, options: MeshFilterOptions) -> BoolArray:
+    """Im'' from Im (paper, Algorithm 1, lines 1-10)."""
+    str_a, str_b, str_c = structuring_elements(options)
+    pad, dg = options.padding, options.dg_theta
+    padded = np.pad(lit, pad)
+    kept = np.zeros_like(lit)
+    for m in range(lit.shape[0]):
+        for n in range(lit.shape[1]):
+            window = padded[m : m + 2 * pad + 1, n : n + 2 * pad + 1]
+            in_a = np.count_nonzero(window & str_a)
+            in_b = np.count_nonzero(window & str_b)
+            in_c = np.count_nonzero(window & str_c)
+            kept[m, n] = (
+                math.ceil(dg / 2) <= in_a <= dg
+                and 0 <= in_b <= dg - in_a
+                and math.ceil(3 * dg / 2) <= in_c <= 2 * dg
+            )
+    return kept
+
+
+def mesh_filter(
+    points: ArrayLike,
+    plane: Plane,
+    options: MeshFilterOptions | None = None,
+    *,
+    working_range: tuple[float, float] | None = None,
+) -> BoolArray:
+    """Return which points of one laser belong to a mesh (paper, section 4).
+
+    Parameters
+    ----------
+    points : array, shape (N, 3) or (N, 2)
+        Points of one laser in metres: in `dome`, or with two columns in `laser` of `plane`.
+        Rows that are not finite are not kept.
+    plane : Plane
+        The laser's plane in `dome`.
+    options : MeshFilterOptions, optional
+        The paper's values if left out.
+    working_range : (float, float), optional
+        Points whose distance from the dome's centre lies outside, in metres, are dropped before
+        the filter sees them: they neither count nor are kept.
+
+    Returns
+    -------
+    keep : bool array, shape (N,)
+
+    Raises
+    ------
+    ValueError
+        If the points have another shape.
+
+    Notes
+    -----
+    Equal to `mesh_filter_dense` point by point. Only cells that hold points are visited, so the
+    cost grows with the number of points and not with the area they span.
+    """
+    options = options or MeshFilterOptions()
+    in_laser, usable = _usable_in_laser(points, plane, working_range)
+    cells = laser_cells(in_laser[usable], options.dd)
+    kept = np.empty(len(cells), dtype=np.bool_)
+    columns, rows = np.ascontiguousarray(cells.T)
+    keep_points(columns, rows, _limits(options), kept)
+    keep = np.zeros(len(usable), dtype=np.bool_)
+    keep[usable] = kept
+    return keep
+
+
+def _limits(options: MeshFilterOptions) -> Limits:
+    a, b, c = options.squared_radii
+    dg = options.dg_theta
+    return Limits(
+        a=a,
+        b=b,
+        c=c,
+        least_in_a=math.ceil(dg / 2),
+        most_in_a=dg,
+        most_in_ab=dg,
+        least_in_c=math.ceil(3 * dg / 2),
+        most_in_c=2 * dg,
+        reach=options.padding,
+    )
+
+
+def _usable_in_laser(
+    points: ArrayLike, plane: Plane, working_range: tuple[float, float] | None
+) -> tuple[FloatArray, BoolArray]:
+    """Points (N, 2) in `laser`, and which of them the filter may see."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.size == 0:
+        array = array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f"points has shape {array.shape} but expected (N, 3) or (N, 2)")
+    in_laser = as_vectors(array, 2, "points") if array.shape[1] == 2 else _flatten(array, plane)
+    with np.errstate(invalid="ignore", over="ignore"):
+        distance = np.sqrt(in_laser[:, 0] ** 2 + in_laser[:, 1] ** 2 + plane.offset**2)
+    near, far = (0.0, _FARTHEST) if working_range is None else working_range
+    # Comparisons with NaN are false, so points that do not exist are not usable.
+    usable: BoolArray = (distance >= near) & (distance <= min(far, _FARTHEST))
+    return in_laser, usable
+
+
+def _flatten(points_in_dome: FloatArray, plane: Plane) -> FloatArray:
+    with np.errstate(invalid="ignore"):
+        return np.ascontiguousarray(laser_frame(plane).apply(points_in_dome)[:, :2])

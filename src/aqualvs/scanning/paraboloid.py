@@ -1,0 +1,535 @@
+"""Curved nets: a paraboloid where a plane leaves too much over.
+
+Over the plane that the search found, the net is a height
+
+    h(u, v) = a + b u + c v + (p u² + 2 q u v + r v²) / 2
+
+with u to the right and v upward in that plane. The plane touches the net along a band only; the fit
+starts there and grows outward, because what it has learned in the band predicts the net beside it.
+
+The arithmetic of `quadric`: weighted least squares in six coefficients.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
+from aqualvs.geometry.planes import Plane
+from aqualvs.scanning.candidates import Observations
+from aqualvs.scanning.patch import (
+    COEFFICIENTS,
+    FLAT,
+    NORMAL,
+    OFFSET,
+    RIGHT,
+    SIGMA_CURVATURE,
+    SIGMA_TWIST,
+    UP,
+    Patch,
+    PatchFit,
+    flat_patch,
+    nearest_tangent,
+    packed_plane,
+    tangent_covariance,
+)
+from aqualvs.scanning.plane_fit import SharedError
+
+N = 6
+"""Coefficients a, b, c, p, q, r."""
+GATE_SHARE, GATE_PX = 0.004, 1.2
+"""What lies on a patch is so near to it: in shares of the range, and in pixels."""
+MIN_PIECES = 12
+"""Observations that a patch needs."""
+
+_STEPS = 16
+_TUKEY = 4.685  # 95 % efficiency for normal errors
+_REWEIGHTS = 6
+# Steeper bends than a radius of half a metre are something else.
+_STRONGEST = 2.0
+# The residual asks for curvature when it gains so much of the light or of the scatter ...
+_MORE_LIGHT = 1.10
+_LESS_SCATTER = 0.6
+# ... and the curvature is no chance.
+_SIGNIFICANT = 6.0
+# A pivot below this share of its diagonal is rounding, not information.
+_LEAST_PIVOT = 1e-13
+
+
+@kernel
+def fit_over(
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    line: FloatArray,
+    laser: IntArray,
+    gates: float,
+    shift_px: float,
+    tilt_px: float,
+    least_bend: float,
+    inside: BoolArray,
+    patch: FloatArray,
+    covariance: FloatArray,
+    weights: FloatArray,
+) -> tuple[bool, bool, float]:
+    """Fit a patch over its base plane, grown from what lies near the plane, or from `inside`.
+
+    Parameters
+    ----------
+    points, sensitivity, sigma_px, line, laser
+        Of M observations.
+    gates : float
+        The fit begins with what is so many gates from the base; 0 for what is marked.
+    shift_px, tilt_px : float
+        What each laser's stripe shares, as standard deviations.
+    least_bend : float
+        Share of the range by which the net must bend where it is seen.
+    inside : bool array, shape (M,)
+        Where the fit begins, unless `gates` says so; then what it has taken in.
+    patch : array, shape (16,)
+        The base, as `write_flat` writes it; completed by the coefficients.
+    covariance : array, shape (6, 6), weights : array, shape (M,)
+        Written.
+
+    Returns
+    -------
+    found, asked_for : bool
+        Whether there is a fit, and whether the base leaves too much over for a plane.
+    rms : float
+        Weighted root mean square distance from the patch, in metres.
+    """
+    n, coefficients = line.shape[0], patch[COEFFICIENTS:]
+    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
+    over_plane(points, sensitivity, patch, terms, height, per_px)
+    gate, sigma, pull, inverse = np.empty(n), np.empty(n), np.empty(n), np.empty((N, N))
+    by_range = GATE_SHARE * patch[OFFSET]
+    n_on_plane = 0
+    for i in range(n):
+        by_pixel = GATE_PX * per_px[i]
+        gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
+        sigma[i] = per_px[i] * sigma_px[i]
+        n_on_plane += abs(height[i]) < gate[i]
+        inside[i] = abs(height[i]) < gates * gate[i] if gates > 0.0 else inside[i]
+    if not grow(terms, height, gate, inside, coefficients):
+        return False, False, np.nan
+    scale, rms = reweight(terms, height, sigma, inside, coefficients, weights, inverse)
+    for j in range(N):
+        for k in range(N):
+            covariance[j, k] = inverse[j, k] * max(scale, 1.0) ** 2
+    for i in range(n):
+        pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
+    add_shared(terms, pull, line, laser, shift_px, tilt_px, inverse, covariance)
+    enough = least_bend * patch[OFFSET]
+    asked = _asked_for(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
+    return True, asked, rms
+
+
+@borrowing_kernel
+def _asked_for(
+    terms: FloatArray,
+    height: FloatArray,
+    inside: BoolArray,
+    coefficients: FloatArray,
+    covariance: FloatArray,
+    n_on_plane: int,
+    least_bend: float,
+    rms: float,
+) -> bool:
+    """Tell whether the residual of the base plane asks for curvature."""
+    n_inside, square = 0, 0.0
+    least, most = np.inf, -np.inf
+    for i in range(height.shape[0]):
+        if inside[i]:
+            bend = 0.0
+            for k in range(3, N):
+                bend += terms[i, k] * coefficients[k]
+            least, most = min(least, bend), max(most, bend)
+            square += height[i] * height[i]
+            n_inside += 1
+    if most - least < least_bend:
+        return False
+    sigmas = 0.0
+    for k in range(3, N):
+        sigmas = max(sigmas, abs(coefficients[k]) / np.sqrt(covariance[k, k]))
+    if sigmas < _SIGNIFICANT:
+        return False
+    less = rms < _LESS_SCATTER * np.sqrt(square / n_inside)
+    return bool(n_inside >= _MORE_LIGHT * n_on_plane or less)
+
+
+@kernel
+def hinted_curvature(
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    weights: FloatArray,
+    patch: FloatArray,
+) -> float:
+    """Return the strongest curvature that M observations show over a patch's base, over its sigma.
+
+    0 for too few.
+    """
+    n = weights.shape[0]
+    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
+    over_plane(points, sensitivity, patch, terms, height, per_px)
+    for i in range(n):
+        per_px[i] *= sigma_px[i]
+    return curvature_in_sigmas(terms, height, per_px, weights)
+
+
+@borrowing_kernel
+def over_plane(
+    points: FloatArray,
+    sensitivity: FloatArray,
+    patch: FloatArray,
+    terms: FloatArray,
+    height: FloatArray,
+    per_px: FloatArray,
+) -> None:
+    """Write what a fit over a patch's base needs of M observations.
+
+    Parameters
+    ----------
+    points, sensitivity : array, shape (M, 3)
+        In `dome`: metres, and m/px.
+    patch : array, shape (16,)
+        Whose base counts.
+    terms : array, shape (M, 6)
+        Written.
+    height, per_px : array, shape (M,)
+        Written: distance behind the plane, and its change by the stripe's position.
+    """
+    for i in range(points.shape[0]):
+        u, v, h, d = 0.0, 0.0, -patch[OFFSET], 0.0
+        for k in range(3):
+            u += patch[RIGHT + k] * points[i, k]
+            v += patch[UP + k] * points[i, k]
+            h += patch[NORMAL + k] * points[i, k]
+            d += patch[NORMAL + k] * sensitivity[i, k]
+        terms[i, 0], terms[i, 1], terms[i, 2] = 1.0, u, v
+        terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v
+        height[i], per_px[i] = h, abs(d)
+
+
+@kernel
+def _solve(
+    terms: FloatArray,
+    height: FloatArray,
+    weight: FloatArray,
+    factor: FloatArray,
+    coefficients: FloatArray,
+) -> bool:
+    """Fit the coefficients; `factor` gets the Cholesky factor of the normal matrix.
+
+    False where the observations do not determine them.
+    """
+    right = np.zeros(N)
+    factor[:] = 0.0
+    for k in (3, 5):
+        factor[k, k] = 1.0 / SIGMA_CURVATURE**2
+    factor[4, 4] = 1.0 / SIGMA_TWIST**2
+    for i in range(terms.shape[0]):
+        w = weight[i]
+        if w == 0.0:
+            continue
+        for j in range(N):
+            part = w * terms[i, j]
+            right[j] += part * height[i]
+            for k in range(j + 1):
+                factor[j, k] += part * terms[i, k]
+    if not factorise(factor, 0.0, _LEAST_PIVOT, factor):
+        return False
+    solve_factorised(factor, right, coefficients)
+    return True
+
+
+@kernel
+def curvature_in_sigmas(
+    terms: FloatArray, height: FloatArray, sigma: FloatArray, weights: FloatArray
+) -> float:
+    """Return the strongest curvature that M observations show, over its sigma; 0 for too few."""
+    n = height.shape[0]
+    weight, factor, coefficients = np.empty(n), np.empty((N, N)), np.empty(N)
+    for i in range(n):
+        weight[i] = weights[i] / (sigma[i] * sigma[i])
+    if not _solve(terms, height, weight, factor, coefficients) or n <= N:
+        return 0.0
+    square = 0.0
+    for i in range(n):
+        off = height[i]
+        for k in range(N):
+            off -= terms[i, k] * coefficients[k]
+        square += weight[i] * off * off
+    scale = max(np.sqrt(square / (n - N)), 1.0)
+    inverse = inverse_of(factor)
+    most = 0.0
+    for k in range(3, N):
+        most = max(most, abs(coefficients[k]) / (np.sqrt(inverse[k, k]) * scale))
+    return most
+
+
+@kernel
+def grow(
+    terms: FloatArray,
+    height: FloatArray,
+    gate: FloatArray,
+    inside: BoolArray,
+    coefficients: FloatArray,
+) -> bool:
+    """Refit and take in what the fit predicts until nothing changes; False where it comes to none.
+
+    `inside` is where the fit begins and then what it has taken in.
+    """
+    n = height.shape[0]
+    weight, factor = np.empty(n), np.empty((N, N))
+    for _ in range(_STEPS):
+        for i in range(n):
+            weight[i] = 1.0 / (gate[i] * gate[i]) if inside[i] else 0.0
+        if np.sum(inside) < MIN_PIECES or not _solve(terms, height, weight, factor, coefficients):
+            return False
+        if np.abs(coefficients[3:]).max() > _STRONGEST:
+            return False
+        changed = False
+        for i in range(n):
+            off = height[i]
+            for k in range(N):
+                off -= terms[i, k] * coefficients[k]
+            now = abs(off) < gate[i]
+            changed |= now != inside[i]
+            inside[i] = now
+        if not changed:
+            break
+    return bool(np.sum(inside) >= MIN_PIECES)
+
+
+@kernel
+def reweight(
+    terms: FloatArray,
+    height: FloatArray,
+    sigma: FloatArray,
+    inside: BoolArray,
+    coefficients: FloatArray,
+    weights: FloatArray,
+    covariance: FloatArray,
+) -> tuple[float, float]:
+    """Go on from a grown fit with Tukey's biweight, in place; the scale, and the rms in metres.
+
+    `covariance` gets the inverse of the normal matrix.
+    """
+    n = height.shape[0]
+    z, weight = np.empty(n), np.empty(n)
+    factor, known, better = np.empty((N, N)), np.eye(N), np.empty(N)
+    scale = 1.0
+    for _ in range(_REWEIGHTS):
+        for i in range(n):
+            off = height[i]
+            for k in range(N):
+                off -= terms[i, k] * coefficients[k]
+            z[i] = off / sigma[i]
+        scale = max(1.4826 * np.median(np.abs(z[inside])), 0.1)
+        for i in range(n):
+            rest = max(1.0 - (z[i] / (_TUKEY * scale)) ** 2, 0.0)
+            weights[i] = rest * rest if inside[i] else 0.0
+            weight[i] = weights[i] / (sigma[i] * sigma[i])
+        if not _solve(terms, height, weight, factor, better):
+            break
+        coefficients[:] = better
+        known[:] = factor
+    covariance[:] = inverse_of(known)
+    square, total = 0.0, 0.0
+    for i in range(n):
+        off = height[i]
+        for k in range(N):
+            off -= terms[i, k] * coefficients[k]
+        square += weights[i] * off * off
+        total += weights[i]
+    return scale, np.sqrt(square / total)
+
+
+@kernel
+def add_shared(
+    terms: FloatArray,
+    pull: FloatArray,
+    line: FloatArray,
+    laser: IntArray,
+    shift_px: float,
+    tilt_px: float,
+    inverse: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Add the covariance of a shift and a tilt that all of a laser's stripe may share.
+
+    Parameters
+    ----------
+    terms : array, shape (M, 6)
+    pull : array, shape (M,)
+        Weight of each observation times its height by the stripe's position.
+    line : array, shape (M,)
+        Search lines.
+    laser : int array, shape (M,)
+    shift_px, tilt_px : float
+        Standard deviations.
+    inverse : array, shape (6, 6)
+        Of the normal matrix.
+    covariance : array, shape (6, 6)
+        Completed in place.
+    """
+    for index in range(laser.max() + 1):
+        low, high = np.inf, -np.inf
+        for i in range(laser.shape[0]):
+            if laser[i] == index:
+                low, high = min(low, line[i]), max(high, line[i])
+        if low == np.inf:
+            continue
+        sums = np.zeros((2, N))
+        for i in range(laser.shape[0]):
+            if laser[i] == index:
+                along = 2.0 * (line[i] - low) / max(high - low, 1.0) - 1.0
+                for k in range(N):
+                    sums[0, k] += shift_px * pull[i] * terms[i, k]
+                    sums[1, k] += tilt_px * pull[i] * terms[i, k] * along
+        for mode in range(2):
+            moved = np.empty(N)
+            for j in range(N):
+                total = 0.0
+                for k in range(N):
+                    total += inverse[j, k] * sums[mode, k]
+                moved[j] = total
+            for j in range(N):
+                for k in range(N):
+                    covariance[j, k] += moved[j] * moved[k]
+
+
+__all__ = (
+    "FLAT",
+    "LEAST_BEND",
+    "Patch",
+    "PatchFit",
+    "fit_patch",
+    "flat_patch",
+    "hints_at_curvature",
+    "nearest_tangent",
+    "refit_at_nearest",
+    "tangent_covariance",
+)
+
+LEAST_BEND = 0.003
+"""By so much of the range a net must bend where it is seen, or it is flat."""
+
+_WIDE_GATE = 3.0
+_HINT = 2.0
+# Strands on a bend err together more than on a plane: found on simulated nets.
+_LOOSENED = 1.5
+
+
+def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
+    """Whether the residuals of a plane fit look bent: a cheap look before the fit of a patch.
+
+    Parameters
+    ----------
+    seen : Observations
+        Those that the plane was fitted to, M of them.
+    weights : array, shape (M,)
+        Their weights in that fit.
+    plane : Plane
+        The fit.
+    """
+    flat = packed_plane(plane)
+    hint = hinted_curvature(seen.points, seen.sensitivity, seen.sigma_px, weights, flat)
+    return bool(hint > _HINT)
+
+
+def fit_patch(
+    seen: Observations, plane: Plane, shared: SharedError, least_bend: float = LEAST_BEND
+) -> PatchFit | None:
+    """Fit a patch to what lies on it among M observations, if they ask for one.
+
+    Parameters
+    ----------
+    seen : Observations
+        Of strands on the target and of any others that may lie on it, wrong readings included.
+    plane : Plane
+        As the search found it.
+    shared : SharedError
+        What each laser's stripe shares.
+    least_bend : float
+        Share of the range by which the net must bend where it is seen.
+
+    Returns
+    -------
+    PatchFit or None
+        None where a plane is as good, or the curvature is not determined.
+    """
+    # Of a coarse net few strands are on the plane, and the others not far from it.
+    first = _fit_over(seen, plane, shared, 1.0, least_bend)
+    first = first or _fit_over(seen, plane, shared, _WIDE_GATE, least_bend)
+    return first.fit if first is not None and first.asked_for else None
+
+
+def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> PatchFit | None:
+    """Fit a patch once more, over the plane that touches it at its point nearest to the vehicle.
+
+    p and r are then the curvatures of the net at that point. The covariance is widened.
+
+    Parameters
+    ----------
+    fit : PatchFit
+        From `fit_patch`.
+    seen, shared
+        As there.
+
+    Returns
+    -------
+    PatchFit or None
+        None where there is no such point.
+    """
+    m = nearest_tangent(fit.patch)
+    if m is None:
+        return None
+    inside = fit.weights > 0.0
+    length = float(np.linalg.norm(m))
+    again = _fit_over(seen, Plane(m / length, 1.0 / length), shared, inside)
+    best = fit if again is None else again.fit
+    return replace(best, covariance=_LOOSENED**2 * best.covariance)
+
+
+class _Attempt(NamedTuple):
+    """A patch over one base plane, and whether the base leaves too much over."""
+
+    fit: PatchFit
+    asked_for: bool
+
+
+def _fit_over(
+    seen: Observations,
+    plane: Plane,
+    shared: SharedError,
+    start: BoolArray | float,
+    least_bend: float = LEAST_BEND,
+) -> _Attempt | None:
+    """Fit a patch over a plane, grown from some observations or from those in so many gates."""
+    n = len(seen.line)
+    inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
+    patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)
+    found, asked_for, rms = fit_over(
+        seen.points,
+        seen.sensitivity,
+        seen.sigma_px,
+        seen.line,
+        seen.laser,
+        start if isinstance(start, float) else 0.0,
+        shared.shift_px,
+        shared.tilt_px,
+        least_bend,
+        inside,
+        patch,
+        covariance,
+        weights,
+    )
+    if not found:
+        return None
+    bent = Patch(plane, patch[RIGHT:UP], patch[UP:COEFFICIENTS], patch[COEFFICIENTS:])
+    return _Attempt(PatchFit(bent, covariance, weights, rms), asked_for)

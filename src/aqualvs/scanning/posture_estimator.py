@@ -1,0 +1,675 @@
+"""The posture to one surface: which readings it rests on, and the fit to them.
+
+The arithmetic of `PostureMeter`: what is measured of a surface, and what a fit rests on.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
+from aqualvs.scanning.candidates import Observations, Readings
+from aqualvs.scanning.laser_bands import StripeSearch
+from aqualvs.scanning.net_surfaces import doubted, fit_mean
+from aqualvs.scanning.paraboloid import LEAST_BEND, fit_patch, hints_at_curvature, refit_at_nearest
+from aqualvs.scanning.patch import (
+    Patch,
+    heights_over,
+    nearest_in_view,
+    nearest_tangent,
+    packed_plane,
+    share_near,
+    tangent_covariance,
+)
+from aqualvs.scanning.plane_fit import (
+    MESH_ERROR,
+    SOLID_ERROR,
+    PlaneFit,
+    fit_pseudo_inverse,
+    fit_robust,
+)
+from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, believable, posture_of
+from aqualvs.scanning.region_growing import SOME, follow_net, much_beside
+from aqualvs.scanning.surfaces import Surface
+
+# Two stripes disturb each other within this many full widths, and this many pixels more.
+_CROSSING_WIDTHS = 1.2
+_CROSSING_PX = 2.0
+
+
+@kernel
+def select_pieces(
+    points: FloatArray,
+    laser: IntArray,
+    width: FloatArray,
+    piece: IntArray,
+    min_lines: int,
+    on_target: BoolArray,
+    planes: FloatArray,
+    bent: FloatArray | None,
+    focal_px: float,
+    group: IntArray,
+) -> tuple[int, int]:
+    """Give numbers to pieces of stripe on the target, -1 to readings elsewhere or in crossings.
+
+    A piece belongs as a whole: a part of a strand's light would have its centre off the sheet.
+
+    Parameters
+    ----------
+    points, laser, width
+        Of N readings.
+    piece : int array, shape (N,)
+        Number of each reading's piece: its stretch or its chunk.
+    min_lines : int
+        Shorter pieces are left out.
+    on_target : bool array, shape (N,)
+        Readings on the target.
+    planes : array, shape (n_lasers, 4)
+        The lasers' sheets, normal and offset.
+    bent : array, shape (n_lasers, COLUMNS), or None
+        The sheets, if windows bend any of them.
+    focal_px : float
+        Pixels per radian, roughly.
+    group : int array, shape (N,)
+        Written.
+
+    Returns
+    -------
+    n_groups, n_readings : int
+        How many groups there are, and readings in them.
+    """
+    number = _pieces_on(piece, min_lines, on_target)
+    mean_width = _mean_widths(laser, width, piece, number, planes.shape[0])
+    n_groups = 0
+    n_readings = 0
+    for i in range(piece.shape[0]):
+        group[i] = -1
+        p = piece[i]
+        if number[p] == -1 or in_crossing(points, i, laser[i], planes, bent, mean_width, focal_px):
+            continue
+        if number[p] == -2:
+            number[p] = n_groups
+            n_groups += 1
+        group[i] = number[p]
+        n_readings += 1
+    return n_groups, n_readings
+
+
+@kernel
+def _pieces_on(piece: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
+    """Return -2 for each piece on the target that is long enough, -1 for others."""
+    n_pieces = 0
+    for i in range(piece.shape[0]):
+        n_pieces = max(n_pieces, piece[i] + 1)
+    number, lines = np.full(n_pieces, -1), np.zeros(n_pieces, np.int64)
+    for i in range(piece.shape[0]):
+        lines[piece[i]] += 1
+        if on_target[i]:
+            number[piece[i]] = -2
+    for p in range(n_pieces):
+        if lines[p] < min_lines:
+            number[p] = -1
+    return number
+
+
+@kernel
+def _mean_widths(
+    laser: IntArray, width: FloatArray, piece: IntArray, number: IntArray, n_lasers: int
+) -> FloatArray:
+    """Mean stripe width of each laser; a single width is inflated by the crossing itself."""
+    total, count = np.zeros(n_lasers), np.zeros(n_lasers)
+    for i in range(piece.shape[0]):
+        if number[piece[i]] != -1:
+            total[laser[i]] += width[i]
+            count[laser[i]] += 1.0
+    for index in range(n_lasers):
+        total[index] = total[index] / count[index] if count[index] > 0.0 else -1.0
+    return total
+
+
+@inline_borrowing_kernel
+def in_crossing(
+    points: FloatArray,
+    i: int,
+    own: int,
+    planes: FloatArray,
+    bent: FloatArray | None,
+    mean_width: FloatArray,
+    focal_px: float,
+) -> bool:
+    """Whether another laser's stripe crosses the target here (paper, section 3.1)."""
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
+    for b in range(planes.shape[0]):
+        if b == own or mean_width[b] < 0.0:
+            continue
+        gap = planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3]
+        if bent is not None:
+            gap = sheet_distance(bent[b], x, y, z)
+        wide = max(mean_width[b], mean_width[own])
+        if abs(gap) < (_CROSSING_WIDTHS * wide + _CROSSING_PX) * m_per_px:
+            return True
+    return False
+
+
+@borrowing_kernel
+def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: FloatArray) -> None:
+    """Write places along the stripes, from -1 at one image border to 1 at the other.
+
+    `n_lines`, shape (n_lasers,), are the search lines in the picture.
+    """
+    for k in range(line.shape[0]):
+        along[k] = 2.0 * line[k] / n_lines[laser[k]] - 1.0
+
+
+@kernel
+def mark_rested_on(
+    group: IntArray,
+    laser: IntArray,
+    weights: FloatArray,
+    of_all: bool,
+    points: FloatArray,
+    rests_on: BoolArray,
+) -> tuple[int, float, int]:
+    """Mark the readings that a fit rests on.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_pieces`.
+    laser : int array, shape (M,), weights : array, shape (M,)
+        Of the observations.
+    of_all : bool
+        Whether observations without weight count for `second`.
+    points : array, shape (N, 3)
+        Of the readings.
+    rests_on : bool array, shape (N,)
+        Written.
+
+    Returns
+    -------
+    n_points : int
+        How many are marked.
+    nearest : float
+        Distance of the nearest of them from the origin.
+    second : int
+        Observations that the second best laser has, those without weight counted if asked for.
+    """
+    n, square = 0, np.inf
+    for i in range(group.shape[0]):
+        rests_on[i] = group[i] >= 0 and weights[group[i]] > 0.0
+        if rests_on[i]:
+            n += 1
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            square = min(square, x * x + y * y + z * z)
+    n_lasers = 0
+    for k in range(laser.shape[0]):
+        n_lasers = max(n_lasers, laser[k] + 1)
+    pieces = np.zeros(n_lasers, np.int64)
+    for k in range(laser.shape[0]):
+        pieces[laser[k]] += of_all or weights[k] > 0.0
+    best, second = 0, 0
+    for index in range(n_lasers):
+        second = max(second, min(best, pieces[index]))
+        best = max(best, pieces[index])
+    return n, np.sqrt(square), second
+
+
+@borrowing_kernel
+def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: FloatArray) -> None:
+    """Write the distances of points (N, 3) from a plane, as shares of its own."""
+    nx, ny, nz = normal[0] / offset, normal[1] / offset, normal[2] / offset
+    for i in range(points.shape[0]):
+        off[i] = abs(nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - 1.0)
+
+
+@kernel
+def mark_beside(
+    source: IntArray, whole: BoolArray, off: FloatArray, most: float, beside: BoolArray
+) -> None:
+    """Mark the readings of a net, and those near its plane whose light the net does not explain.
+
+    Parameters
+    ----------
+    source : int array, shape (N,)
+        Number of each reading's return.
+    whole : bool array, shape (N,)
+        Readings of the net.
+    off : array, shape (N,)
+        From `distances_off`.
+    most : float
+        What is farther off is not near.
+    beside : bool array, shape (N,)
+        Written.
+    """
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    explained = np.zeros(last + 1, np.bool_)
+    for i in range(source.shape[0]):
+        if whole[i]:
+            explained[source[i]] = True
+    for i in range(source.shape[0]):
+        beside[i] = whole[i] or (off[i] < most and not explained[source[i]])
+
+
+@kernel
+def light_share_near(
+    group: IntArray, trust: FloatArray, points: FloatArray, patch: FloatArray, near: float
+) -> float:
+    """Return the share of the light that is in pieces nearer to a patch than `near`, in metres.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_pieces`.
+    trust : array, shape (N,)
+        Of the readings.
+    points : array, shape (M, 3)
+        Of the pieces.
+    patch : array, shape (16,)
+        As `Patch.packed` gives it.
+    """
+    height = np.empty(points.shape[0])
+    heights_over(points, patch, height)
+    total, on = 0.0, 0.0
+    for i in range(group.shape[0]):
+        if group[i] >= 0:
+            total += trust[i]
+            on += trust[i] if abs(height[group[i]]) < near else 0.0
+    return on / max(total, 1e-12)
+
+
+@kernel
+def weigh_readings(
+    group: IntArray,
+    m: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    fit_weights: FloatArray,
+    alike: bool,
+    weights: FloatArray,
+) -> None:
+    """Write what each reading weighs in a fit of m·X = 1, its piece's weight in equal shares.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_pieces`.
+    m : array, shape (3,)
+        Of the plane.
+    sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)
+        Of the observations.
+    alike : bool
+        Whether the fit took all observations alike, and not by their errors.
+    weights : array, shape (N,)
+        Written: 1 over the variance of m·X; 0 where the fit does not rest on a reading.
+    """
+    count, weight = np.zeros(sigma_px.shape[0]), np.empty(sigma_px.shape[0])
+    for i in range(group.shape[0]):
+        if group[i] >= 0:
+            count[group[i]] += 1.0
+    for c in range(sigma_px.shape[0]):
+        per_px = m[0] * sensitivity[c, 0] + m[1] * sensitivity[c, 1] + m[2] * sensitivity[c, 2]
+        sigma = 1.0 if alike else abs(per_px) * sigma_px[c] + 1e-12
+        weight[c] = fit_weights[c] / (sigma * sigma * count[c])
+    for i in range(group.shape[0]):
+        weights[i] = weight[group[i]] if group[i] >= 0 else 0.0
+
+
+MIN_LINES = 30
+"""Stripe points that a posture needs."""
+
+# The light on a strand covers this many search lines; less is a fragment, off the strand's middle.
+_SHORTEST_STRAND = 3
+# A net bends out of the plane that touches it by at most this share of the range.
+_DEEPEST_BEND = 0.15
+_FEW_STRANDS, _STRONG_BEND = 36, 0.02
+# With less than this share of a net's light a surface does not stand for the net: its mean plane
+# does. Up to the greater share that casts doubt.
+_MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
+# Fewer strands do not show that a net is folded.
+_LEAST_FOLDED = 12
+# So far, as a share of the range, strands may scatter about the mean plane of a folded net.
+_FOLDED_RMS_SHARE = 0.04
+_NEAR_SHARE = 0.005
+# Light that lies so near the plane (share of the range) may be the net's where nothing else
+# explains it. A net with less than the first shares of its strands and of their light on the
+# surface is folds; with more than the last of light there is doubt only, as beside a single fold.
+# Found on simulated nets: folded ones reach 0.43 and 0.51, with a single fold 0.37 and 0.48; flat
+# ones in strong sun and those with growth come down to 0.34 and 0.57, or to 0.56 and 0.29.
+_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT, _DOUBTED_LIGHT = 0.06, 0.45, 0.54, 0.47
+# Independent pieces of stripe that the second best laser must show.
+_MIN_PIECES = 3
+
+
+class FitMethod(StrEnum):
+    """How the plane is fitted to the target's points."""
+
+    ROBUST = "robust"
+    """Weighted by each point's uncertainty, outliers rejected."""
+    PSEUDO_INVERSE = "pseudo_inverse"
+    """The paper's Eq. 24, for comparison: all points alike."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A posture, or why there is none, and the readings it rests on.
+
+    Attributes
+    ----------
+    posture : Posture or Refusal
+        The answer.
+    rests_on : bool array, shape (N,)
+        Readings in the posture; none where it is refused.
+    patch : Patch or None
+        The curved surface, where the net is none that a plane describes.
+    whole : bool array, shape (N,), or None
+        Readings on the net, also where its folds leave the surface; None for what is no net.
+    weights : array, shape (N,), or None
+        What each reading weighs in the fit, as 1 over the variance of m·X; None without a posture.
+    folded : bool
+        Whether the posture is that of a folded net's mean plane.
+    """
+
+    posture: Posture | Refusal
+    rests_on: BoolArray
+    patch: Patch | None = None
+    whole: BoolArray | None = None
+    weights: FloatArray | None = None
+    folded: bool = False
+
+
+class PostureMeter:
+    """Measures postures to surfaces with one rig.
+
+    Parameters
+    ----------
+    rig : Rig
+        Lasers, working range and camera axis.
+    searches : sequence of StripeSearch
+        One for each laser.
+    fit : FitMethod
+        How planes are fitted.
+    """
+
+    def __init__(self, rig: Rig, searches: Sequence[StripeSearch], fit: FitMethod) -> None:
+        self._fit_method = fit
+        self._n_lines = np.array([len(search.lowest) for search in searches])
+        self._working_range = rig.working_range
+        sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
+        self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
+        # A kernel that is given None is compiled without the way to bent sheets.
+        self._bent = sheets if sheets[:, WINDOWED].any() else None
+        self._focal_px = rig.focal_px
+        self._line_px = max((search.line_px for search in searches), default=1)
+        self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
+
+    def measure(self, readings: Readings, chunk_index: IntArray, target: Surface) -> Measurement:
+        """Measure the posture to a surface.
+
+        Parameters
+        ----------
+        readings : Readings
+            N of them.
+        chunk_index : int array, shape (N,)
+            Row of each reading's chunk in the surface's `members`.
+        target : Surface
+            What to measure to.
+        """
+        # On a net a stretch is one strand, whose light has one centre; on a wall a chunk is enough
+        # for errors to be independent.
+        mesh = target.is_mesh
+        piece, min_lines = (readings.stretch, _SHORTEST_STRAND) if mesh else (readings.chunk, 1)
+        on_target = target.members[chunk_index]
+        seen = self._observe(readings, piece, min_lines, on_target, target.plane.normal)
+        if seen.n_readings < MIN_LINES:
+            detail = f"only {seen.n_readings} stripe points outside crossings"
+            return _nothing(readings, Refusal(Reason.TOO_FEW_POINTS, detail))
+        fit = self._fit(readings, seen, target)
+        if fit is None:
+            return _nothing(readings, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
+        flat = self._measured(readings, seen, fit)
+        if flat is None:
+            detail = "all lasers but one show too little of the target"
+            return _nothing(readings, Refusal(Reason.ONE_LASER, detail))
+        if mesh and self._fit_method is FitMethod.ROBUST:
+            return self._believed(readings, self._measure_net(readings, seen, fit, flat, target))
+        return self._believed(readings, flat)
+
+    def _believed(self, readings: Readings, found: Measurement) -> Measurement:
+        """Return what was found if a pilot may rely on it, else why not."""
+        if isinstance(found.posture, Refusal):
+            return found
+        max_rms_share = _FOLDED_RMS_SHARE if found.folded else MAX_RMS_SHARE
+        posture = believable(found.posture, self._working_range, max_rms_share)
+        if isinstance(posture, Refusal):
+            return Measurement(posture, np.zeros(len(readings), np.bool_), whole=found.whole)
+        return found
+
+    def _measure_net(
+        self, readings: Readings, seen: "_Seen", fit: PlaneFit, flat: Measurement, target: Surface
+    ) -> Measurement:
+        """Measure the posture to a net, which may bend or fold, and find what is seen of it."""
+        plane = _plane_of(fit)
+        off = np.empty(len(readings))
+        distances_off(readings.points, plane.normal, plane.offset, off)
+        # Few strands hint at nothing; only a strong bend is believed then.
+        few = len(seen.pieces.laser) < _FEW_STRANDS and much_beside(off, SOME)
+        bends = target.n_pieces > 1 or much_beside(off)
+        bends = bends or hints_at_curvature(seen.pieces, fit.weights, plane)
+        least = LEAST_BEND if bends else few * _STRONG_BEND
+        curved = None if least == 0.0 else self._measure_curved(readings, plane, off, least)
+        best = flat if curved is None else curved
+        if curved is not None and not self._tells(readings, curved):
+            # The net bends, but how it stands at its nearest point cannot be told.
+            best = _doubted(flat, curved, 1.0)
+        patch = packed_plane(plane) if best.patch is None else best.patch.packed()
+        whole = self._followed(readings, best.rests_on, plane, patch)
+        folded = self._folded(readings, whole, off, plane, patch, best)
+        best = folded or self._weighed(readings, whole, plane, patch, best, best is curved)
+        return replace(best, whole=whole)
+
+    def _followed(
+        self, readings: Readings, rests_on: BoolArray, plane: Plane, patch: FloatArray
+    ) -> BoolArray:
+        """Mark what is seen of a net, also where its folds leave the surface."""
+        whole, height = rests_on.copy(), np.empty(len(readings))
+        heights_over(readings.points, patch, height)
+        follow_net(
+            readings.points,
+            readings.line,
+            readings.laser,
+            readings.stretch,
+            readings.trust,
+            readings.source,
+            height,
+            plane.offset,
+            plane.offset * self._line_px / self._focal_px,
+            whole,
+        )
+        return whole
+
+    def _folded(
+        self,
+        readings: Readings,
+        whole: BoolArray,
+        off: FloatArray,
+        plane: Plane,
+        patch: FloatArray,
+        best: Measurement,
+    ) -> Measurement | None:
+        """Return the posture to the mean plane of a net most of whose light is off the surface.
+
+        A surface on one flank of a fold explains little of the light that lies about it.
+        """
+        beside = np.empty(len(readings), np.bool_)
+        mark_beside(readings.source, whole, off, _BESIDE_SHARE, beside)
+        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, beside, plane.normal)
+        if len(seen.pieces.laser) < _LEAST_FOLDED:
+            return None
+        near = _NEAR_SHARE * plane.offset
+        if share_near(seen.pieces.points, patch, near) >= _FOLDED_STRANDS:
+            return None
+        light = light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near)
+        mean = self._mean(readings, seen, plane) if light < _FOLDED_LIGHT else None
+        if mean is None or light < _DOUBTED_LIGHT:
+            return mean
+        return _doubted(best, mean, 1.0 - light)
+
+    def _mean(self, readings: Readings, seen: "_Seen", plane: Plane) -> Measurement | None:
+        """Measure the posture to the mean plane of a folded net."""
+        fit = fit_mean(seen.pieces.points, plane)
+        found = None if fit is None else self._measured(readings, seen, fit, of_all=True)
+        return None if found is None else replace(found, folded=True)
+
+    def _weighed(
+        self,
+        readings: Readings,
+        whole: BoolArray,
+        plane: Plane,
+        patch: FloatArray,
+        best: Measurement,
+        is_curved: bool,
+    ) -> Measurement:
+        """Return the measurement, doubted or replaced by a net's mean plane where it is folds."""
+        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, whole, plane.normal)
+        if len(seen.pieces.laser) < _LEAST_FOLDED:
+            return best
+        share = share_near(seen.pieces.points, patch, _NEAR_SHARE * plane.offset)
+        if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or is_curved):
+            return best
+        mean = self._mean(readings, seen, plane)
+        if mean is None:
+            return best
+        return mean if share < _MAIN_SHARE else _doubted(best, mean, 1.0 - share)
+
+    def _tells(self, readings: Readings, curved: Measurement) -> bool:
+        """Tell whether the posture to a curved net may be relied on."""
+        posture = curved.posture
+        return (
+            isinstance(posture, Posture)
+            and bool(believable(posture, self._working_range))
+            and nearest_in_view(
+                posture.normal_in_dome / posture.range, readings.points[curved.rests_on]
+            )
+        )
+
+    def _measure_curved(
+        self, readings: Readings, plane: Plane, off: FloatArray, least_bend: float
+    ) -> Measurement | None:
+        """Measure the posture to a curved net; None where a plane does."""
+        near = off < _DEEPEST_BEND
+        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, near, plane.normal)
+        if not len(seen.pieces.laser):
+            return None
+        fit = fit_patch(seen.pieces, plane, MESH_ERROR, least_bend)
+        fit = fit and refit_at_nearest(fit, seen.pieces, MESH_ERROR)
+        m = None if fit is None else nearest_tangent(fit.patch)
+        if fit is None or m is None:
+            return None
+        tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
+        found = self._measured(readings, seen, tangent)
+        if found is None or isinstance(found.posture, Refusal):
+            return None
+        along = fit.patch.coefficients[[3, 5]].tolist()
+        sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
+        bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
+        return replace(found, posture=bent, patch=fit.patch)
+
+    def _observe(
+        self,
+        readings: Readings,
+        piece: IntArray,
+        min_lines: int,
+        on_target: BoolArray,
+        normal: FloatArray,
+    ) -> "_Seen":
+        """Average the pieces of stripe on a target, those in crossings left out."""
+        group = np.empty(len(readings), np.int64)
+        n_groups, n_readings = select_pieces(
+            readings.points,
+            readings.laser,
+            readings.width,
+            piece,
+            min_lines,
+            on_target,
+            self._planes,
+            self._bent,
+            self._focal_px,
+            group,
+        )
+        return _Seen(group, n_readings, readings.observations(group, n_groups, normal))
+
+    def _fit(self, readings: Readings, seen: "_Seen", target: Surface) -> PlaneFit | None:
+        pieces = seen.pieces
+        along = np.empty(len(pieces.line))
+        places_along(pieces.line, pieces.laser, self._n_lines, along)
+        robust = fit_robust(
+            pieces.points,
+            pieces.sensitivity,
+            pieces.sigma_px,
+            pieces.laser,
+            along,
+            target.plane.normal / target.plane.offset,
+            MESH_ERROR if target.is_mesh else SOLID_ERROR,
+        )
+        if robust is None or self._fit_method is FitMethod.ROBUST:
+            return robust
+        points = readings.points[seen.group >= 0]
+        return fit_pseudo_inverse(points, len(pieces.laser), robust.covariance)
+
+    def _measured(
+        self, readings: Readings, seen: "_Seen", fit: PlaneFit, *, of_all: bool = False
+    ) -> Measurement | None:
+        """Return the posture of a fit; None unless a second laser fixes the plane's turn.
+
+        A line and one point always share a plane: a single piece would not show that it is wrong.
+        With `of_all` pieces count that the fit has rejected.
+        """
+        rests_on = np.empty(len(readings), np.bool_)
+        laser = seen.pieces.laser
+        n_points, nearest, second = mark_rested_on(
+            seen.group, laser, fit.weights, of_all, readings.points, rests_on
+        )
+        if second < _MIN_PIECES:
+            return None
+        weights, pieces = np.empty(len(readings)), seen.pieces
+        # The mean plane of folds and the pseudo-inverse do not look at the errors.
+        alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
+        weigh_readings(
+            seen.group, fit.m, pieces.sensitivity, pieces.sigma_px, fit.weights, alike, weights
+        )
+        posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
+        return Measurement(posture, rests_on, weights=weights)
+
+
+class _Seen(NamedTuple):
+    """Pieces of stripe on a surface; which one each reading is in, -1 for none, how many are."""
+
+    group: IntArray
+    n_readings: int
+    pieces: Observations
+
+
+def _plane_of(fit: PlaneFit) -> Plane:
+    distance = 1.0 / math.hypot(*fit.m.tolist())
+    return Plane(fit.m * distance, distance)
+
+
+def _doubted(found: Measurement, other: Measurement, share: float) -> Measurement:
+    """Widen a posture's covariance by another opinion, which so much of the light holds."""
+    one, two = found.posture, other.posture
+    return replace(found, posture=doubted(one, two, share)) if one and two else found
+
+
+def _nothing(readings: Readings, refusal: Refusal) -> Measurement:
+    return Measurement(refusal, np.zeros(len(readings), np.bool_))

@@ -1,0 +1,360 @@
+"""Following a net where it leaves its plane: from strand to strand along each stripe.
+
+Where a net folds, its light leaves the plane, but not at once: the next strand is about as far
+away as the last one, give or take what a flank of a fold makes of the way between them. Readings
+of other lasers' light, bubbles and what is seen through the net have no such neighbours, or are
+farther off than the right reading of the same light.
+
+Light that belongs to the target although the search for planes left it out.
+
+A plane is sought with a narrow gate, among whole pieces of stripe, so that nothing foreign enters
+the posture. To say what a point lies on, the gate may be wider: a strand's light is off the plane
+by the strand's thickness, a net bulges, and where stripes cross two lasers share the light.
+"""
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
+from aqualvs.scanning.net_surfaces import LONGEST_STRETCH
+
+# Distance from the target at which light belongs to it: a share of the range, and pixels.
+_NEAR_SHARE = 0.010
+_NEAR_PX = 2.0
+# What of a piece must be near.
+_MOST = 0.5
+# Light counts as on a plane, or beside it, within these shares of the range.
+_ON_IT, _BESIDE = 0.008, 0.04
+MUCH, SOME = 0.85, 0.5
+"""Light beside a plane over light on it."""
+
+
+def much_beside(off: FloatArray, much: float = MUCH) -> bool:
+    """Tell whether so much light lies just off a plane that the net may bend away from it.
+
+    Where stripes cross, wrong readings lie there as well.
+
+    Parameters
+    ----------
+    off : array, shape (N,)
+        Distances of the readings from the plane, as shares of the range.
+    much : float
+        Light beside the plane over light on it.
+    """
+    on_it, near = np.count_nonzero(off < _ON_IT), np.count_nonzero(off < _BESIDE)
+    return bool(near - on_it > much * on_it)
+
+
+@kernel
+def recruit(
+    points: FloatArray,
+    sensitivity: FloatArray,
+    chunk_index: IntArray,
+    n_chunks: int,
+    patch: FloatArray,
+    other: BoolArray,
+    taken: BoolArray,
+    on_target: BoolArray,
+) -> None:
+    """Mark readings near the target as on it.
+
+    Parameters
+    ----------
+    points, sensitivity : array, shape (N, 3)
+        Of the readings, in `dome`: metres, and m/px.
+    chunk_index : int array, shape (N,)
+        Chunk of each reading, below `n_chunks`.
+    patch : array, shape (16,)
+        The target as `Patch.packed` gives it.
+    other : bool array, shape (N,)
+        Readings that another surface explains.
+    taken : bool array, shape (N,)
+        Readings of light that another surface explains by some reading.
+    on_target : bool array, shape (N,)
+        Readings on the target; completed in place.
+    """
+    n = points.shape[0]
+    near = np.zeros(n, np.bool_)
+    n_near, n_all = np.zeros(n_chunks), np.zeros(n_chunks)
+    by_range = _NEAR_SHARE * patch[3]
+    for i in range(n):
+        off = -patch[3]
+        per_px = 0.0
+        u = 0.0
+        v = 0.0
+        for k in range(3):
+            off += patch[k] * points[i, k]
+            per_px += patch[k] * sensitivity[i, k]
+            u += patch[4 + k] * points[i, k]
+            v += patch[7 + k] * points[i, k]
+        off -= patch[10] + patch[11] * u + patch[12] * v
+        off -= 0.5 * (patch[13] * u * u + patch[15] * v * v) + patch[14] * u * v
+        by_pixel = _NEAR_PX * per_px
+        near[i] = off * off < by_range * by_range + by_pixel * by_pixel
+        n_all[chunk_index[i]] += 1.0
+        n_near[chunk_index[i]] += near[i]
+    for i in range(n):
+        c = chunk_index[i]
+        if near[i] and n_near[c] >= _MOST * n_all[c] and (other[i] or not taken[i]):
+            on_target[i] = True
+
+
+# Rows of what is known of stretches: search lines, means of height, line and trust, shares of light
+# on the net and of light that is on it by another reading, laser, length in metres.
+LINES, HEIGHT, LINE, TRUST, ON_NET, TAKEN, LASER, SIZE, _N_FACTS = range(9)
+
+# The steepest flank that is followed, and what noise adds to a step, as a share of the range.
+_STEEPEST = 1.2
+_LOOSE_SHARE = 0.006
+# A strand alone is believed within this share of the range; farther off only as one of a flank.
+_LONELY_SHARE = 0.015
+# And a fold has at least so many strands that leave the surface by as much, of all lasers.
+_LEAST_STRANDS = 6
+# The next strand is at most so far: a share of the range, and so many usual distances.
+_FARTHEST_SHARE, _FARTHEST_GAP = 0.15, 2.5
+# A net strays from its plane by at most this share of the range.
+_DEEPEST_SHARE = 0.2
+# And among so many of the stretches before, so that the cost does not grow with clutter.
+_LOOK_BACK = 16
+# A strand continues one of the last so many on the net.
+_MOST_TRIED = 2
+# Light on fewer lines is a speck; what is dimmer than this share of the net's light is none of it.
+_SPECK_LINES = 3
+_DIMMEST = 0.6
+# In a fold the plane itself has no strands: a gap wider than so many usual ones, or half of that
+# where the net's last strand is on one side only.
+_FOLD_GAP = 1.7
+
+
+@kernel
+def follow_net(
+    points: FloatArray,
+    line: IntArray,
+    laser: IntArray,
+    stretch: IntArray,
+    trust: FloatArray,
+    source: IntArray,
+    height: FloatArray,
+    distance: float,
+    m_per_line: float,
+    on_net: BoolArray,
+) -> None:
+    """Mark the strands that continue those on the net.
+
+    Parameters
+    ----------
+    points : array, shape (N, 3)
+        Of the readings, in `dome`, metres.
+    line, laser, stretch : int array, shape (N,)
+        As in `Readings`.
+    trust : array, shape (N,)
+        As in `Readings`.
+    source : int array, shape (N,)
+        Number of the return that is read.
+    height : array, shape (N,)
+        By how much the readings lie behind the net's surface, in metres.
+    distance : float
+        Range, in metres.
+    m_per_line : float
+        Width of a search line at that distance, in metres.
+    on_net : bool array, shape (N,)
+        Readings on the net; completed in place.
+    """
+    n_stretches = 0
+    n_sources = 0
+    for i in range(stretch.shape[0]):
+        n_stretches = max(n_stretches, stretch[i] + 1)
+        n_sources = max(n_sources, source[i] + 1)
+    taken = np.zeros(n_sources, np.bool_)
+    for i in range(stretch.shape[0]):
+        taken[source[i]] |= on_net[i]
+    facts = np.zeros((_N_FACTS, n_stretches))
+    _describe(points, line, laser, stretch, trust, source, height, on_net, taken, facts)
+    order, dimmest = _listed(facts, distance)
+    usual = _drop_between(order, facts)
+    farthest = min(_FARTHEST_SHARE * distance, _FARTHEST_GAP * usual * m_per_line)
+    cost = np.full(n_stretches, np.inf)
+    for way in (1, -1):
+        _sweep(order, way, facts, distance, m_per_line, farthest, dimmest, cost)
+    _drop_few(facts[HEIGHT], _LONELY_SHARE * distance, cost)
+    _settle(stretch, source, cost, taken, on_net)
+
+
+@kernel
+def _describe(
+    points: FloatArray,
+    line: IntArray,
+    laser: IntArray,
+    stretch: IntArray,
+    trust: FloatArray,
+    source: IntArray,
+    height: FloatArray,
+    on_net: BoolArray,
+    taken: BoolArray,
+    facts: FloatArray,
+) -> None:
+    """Write what is known of every stretch of light."""
+    n_stretches = facts.shape[1]
+    first, last = np.full(n_stretches, -1), np.full(n_stretches, -1)
+    for i in range(stretch.shape[0]):
+        s = stretch[i]
+        facts[LINES, s] += 1.0
+        facts[HEIGHT, s] += height[i]
+        facts[LINE, s] += line[i]
+        facts[TRUST, s] += trust[i]
+        facts[ON_NET, s] += on_net[i]
+        facts[TAKEN, s] += taken[source[i]] and not on_net[i]
+        facts[LASER, s] = laser[i]
+        if first[s] < 0:
+            first[s] = i
+        last[s] = i
+    for s in range(n_stretches):
+        if facts[LINES, s] == 0.0:
+            continue
+        for k in (HEIGHT, LINE, TRUST, ON_NET, TAKEN):
+            facts[k, s] /= facts[LINES, s]
+        for k in range(3):
+            facts[SIZE, s] += (points[first[s], k] - points[last[s], k]) ** 2
+        facts[SIZE, s] = np.sqrt(facts[SIZE, s])
+
+
+@kernel
+def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
+    """Return seeds and candidates in their order along the stripes, and the least trust."""
+    n = facts.shape[1]
+    key = np.full(n, np.inf)
+    total = 0.0
+    n_seeds, n_listed = 0, 0
+    for s in range(n):
+        if facts[LINES, s] < _SPECK_LINES:
+            continue
+        seed = facts[ON_NET, s] >= 0.5
+        if seed:
+            total += facts[TRUST, s]
+            n_seeds += 1
+        short = facts[SIZE, s] < LONGEST_STRETCH
+        near = abs(facts[HEIGHT, s]) < _DEEPEST_SHARE * distance
+        loose = facts[TAKEN, s] < 0.5 and facts[ON_NET, s] == 0.0
+        if seed or (short and near and loose):
+            key[s] = facts[LASER, s] * 1e6 + facts[LINE, s]
+            n_listed += 1
+    return np.argsort(key)[:n_listed], _DIMMEST * total / max(n_seeds, 1)
+
+
+@kernel
+def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
+    """Take out what leaves the surface, where it is too little to be a fold."""
+    n_far = 0
+    for s in range(cost.shape[0]):
+        n_far += cost[s] < np.inf and abs(height[s]) >= lonely
+    if n_far < _LEAST_STRANDS:
+        for s in range(cost.shape[0]):
+            if abs(height[s]) >= lonely:
+                cost[s] = np.inf
+
+
+@kernel
+def _drop_between(order: IntArray, facts: FloatArray) -> float:
+    """Take out what lies between strands on the plane that follow one another as they should.
+
+    The answer is their usual distance in search lines; infinite where there are none.
+    """
+    n = order.shape[0]
+    before, after = np.full(n, np.nan), np.full(n, np.nan)
+    gaps = np.empty(n)
+    n_gaps = 0
+    for at in range(n):
+        s = order[at]
+        if at > 0 and facts[LASER, order[at - 1]] == facts[LASER, s]:
+            p = order[at - 1]
+            before[at] = facts[LINE, p] if facts[ON_NET, p] > 0.0 else before[at - 1]
+        if facts[ON_NET, s] > 0.0 and before[at] == before[at]:
+            gaps[n_gaps] = facts[LINE, s] - before[at]
+            n_gaps += 1
+    for at in range(n - 2, -1, -1):
+        s = order[at]
+        if facts[LASER, order[at + 1]] == facts[LASER, s]:
+            p = order[at + 1]
+            after[at] = facts[LINE, p] if facts[ON_NET, p] > 0.0 else after[at + 1]
+    if n_gaps == 0:
+        return np.inf
+    usual = float(np.median(gaps[:n_gaps]))
+    for at in range(n):
+        s = order[at]
+        if facts[ON_NET, s] > 0.0:
+            continue
+        both = after[at] - before[at]
+        one = abs(facts[LINE, s] - (before[at] if after[at] != after[at] else after[at]))
+        wide = both > _FOLD_GAP * usual if both == both else one > 0.5 * _FOLD_GAP * usual
+        if not wide:
+            facts[TRUST, s] = 0.0
+    return usual
+
+
+@kernel
+def _sweep(
+    order: IntArray,
+    way: int,
+    facts: FloatArray,
+    distance: float,
+    m_per_line: float,
+    farthest: float,
+    dimmest: float,
+    cost: FloatArray,
+) -> None:
+    """Go along the stripes one way, from strand to strand; keep the least cost of each.
+
+    The cost of a strand is that of the dearest step that led to it.
+    """
+    n = order.shape[0]
+    n_stretches = cost.shape[0]
+    reached, parent = np.full(n_stretches, np.inf), np.full(n_stretches, -1)
+    has_next = np.zeros(n_stretches, np.bool_)
+    loose = _LOOSE_SHARE * distance
+    for at in range(n):
+        s = order[at] if way > 0 else order[n - 1 - at]
+        if facts[ON_NET, s] > 0.0:
+            reached[s] = 0.0
+            continue
+        if facts[TRUST, s] < dimmest:
+            continue
+        tried = 0
+        for back in range(at - 1, max(at - 1 - _LOOK_BACK, -1), -1):
+            p = order[back] if way > 0 else order[n - 1 - back]
+            if facts[LASER, p] != facts[LASER, s]:
+                break
+            if reached[p] == np.inf:
+                continue
+            # Along the stripe only: where light is across it follows from its height.
+            beside = abs(facts[LINE, s] - facts[LINE, p]) * m_per_line
+            if beside > farthest or tried == _MOST_TRIED:
+                break
+            tried += 1
+            step = abs(facts[HEIGHT, s] - facts[HEIGHT, p])
+            dear = step / (_STEEPEST * beside + loose)
+            if dear < 1.0:
+                reached[s] = max(dear, reached[p])
+                parent[s] = p
+                has_next[p] = True
+                break
+    for at in range(n):
+        s = order[at]
+        if parent[s] < 0:
+            continue
+        alone = facts[ON_NET, parent[s]] > 0.0 and not has_next[s]
+        if not alone or abs(facts[HEIGHT, s]) < _LONELY_SHARE * distance:
+            cost[s] = min(cost[s], reached[s])
+
+
+@kernel
+def _settle(
+    stretch: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
+) -> None:
+    """Mark the readings of the strands that were reached; of one return only the cheapest."""
+    best = np.full(taken.shape[0], np.inf)
+    for i in range(stretch.shape[0]):
+        best[source[i]] = min(best[source[i]], cost[stretch[i]])
+    for i in range(stretch.shape[0]):
+        mine = cost[stretch[i]]
+        if mine < np.inf and mine <= best[source[i]] and not taken[source[i]]:
+            on_net[i] = True

@@ -1,0 +1,481 @@
+"""The public benchmark set: dives by difficulty, at fixed seeds.
+
+A difficulty is laid over the same courses and the same nets as the clear dives, so that what it
+costs can be read off. Whoever changes anything here gives the set the next number: scores are
+compared by name and checksum.
+
+Which points of the stripes a picture truly shows, whoever looks for them.
+
+One dive of the benchmark set on disk: video, truth, rig.
+"""
+
+import csv
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import rig_to_mapping, save_rig
+from aqualvs.optics.solved import with_exact_numbers
+from aqualvs.simulation.cameras import expose, spread
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.scene import Label, Scene
+from aqualvs.simulation.truth import LitPoints, visible_fit
+from aqualvs.simulation.video import VideoWriter
+
+CONTRAST_LIMIT = 10.0
+"""Grey levels by which a visible stripe point is brighter than without its stripe."""
+
+VISIBLE_LIMIT = 40
+"""Visible stripe points from which on a frame can be expected to be measured."""
+
+# A stripe is narrower than this share of the picture's width; the glow of the sheets is wider.
+_WIDEST_STRIPE = 1 / 36
+_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_BEYOND = 1e6
+
+
+def stripe_contrast(
+    renderer: Renderer, scene: Scene, t: float, radiance: NDArray[np.float32], lit: LitPoints
+) -> NDArray[np.float32]:
+    """Return by how many grey levels the stripes lift the pixels around them.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        What the scene is rendered with.
+    scene : Scene
+        With its lasers on.
+    t : float
+        Time in seconds.
+    radiance : float32 array, shape (height, width, 3)
+        Of that scene at that time, from `Renderer.radiance`.
+    lit : LitPoints
+        Of that scene at that time.
+
+    Returns
+    -------
+    contrast : float32 array, shape (height, width)
+        What the lasers add to the luma (ITU-R BT.601) of the picture without noise, above what
+        they add on the lighter side of it, left and right or above and below, whichever is more
+        (a morphological opening). The glow of the sheets in the water shows no stripe, and neither
+        does a place that daylight saturates. Zero away from lit points.
+    """
+    height, width = radiance.shape[:2]
+    size = 2 * round(0.5 * _WIDEST_STRIPE * width) + 1
+    around = _around(lit, (height, width), 2 * size + 1)
+    dark = renderer.radiance(replace(scene, lasers_on=False), t, around)
+    dark[~around] = radiance[~around]
+    images = (
+        expose(spread(x, scene.water, scene.sensor), scene.sensor, None) for x in (radiance, dark)
+    )
+    bright_luma, dark_luma = (image.astype(np.float32) @ _LUMA for image in images)
+    lift = bright_luma - dark_luma
+    across = [_above_flanks(lift, around, window) for window in _windows(size)]
+    return np.where(around, np.maximum(*across), 0.0).astype(np.float32)
+
+
+def _windows(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    return np.ones((1, size), np.uint8), np.ones((size, 1), np.uint8)
+
+
+def _above_flanks(
+    lift: FloatArray, around: BoolArray, window: NDArray[np.uint8]
+) -> NDArray[np.float64]:
+    """Return how far a picture stands above its opening by a window, where it is known."""
+    low = cv2.erode(np.where(around, lift, _BEYOND), window)
+    opened = cv2.dilate(np.where(around, low, -_BEYOND), window)
+    return np.asarray(lift - opened, dtype=np.float64)
+
+
+def visible_points(lit: LitPoints, label: int, contrast: NDArray[np.float32]) -> IntArray:
+    """Return which lit points are visible stripe points of a target.
+
+    A stripe has one point in every pixel along it: in every column where it is rather level, in
+    every row where it is rather upright. A point is visible where the contrast at its pixel, or
+    at one beside it, reaches `CONTRAST_LIMIT`.
+
+    Parameters
+    ----------
+    lit : LitPoints
+        Of the frame.
+    label : int
+        `Label` of the target.
+    contrast : array, shape (height, width)
+        From `stripe_contrast`.
+
+    Returns
+    -------
+    i_points : int array, shape (N,)
+        Indices into `lit`, ordered by laser.
+    """
+    bright = np.asarray(cv2.dilate(contrast, np.ones((3, 3), np.uint8)))
+    x, y = _places(lit.pixels, contrast.shape).T
+    seen: BoolArray = (lit.label == label) & (bright[y, x] >= CONTRAST_LIMIT)
+    chosen = [
+        _one_a_pixel(np.flatnonzero(seen & (lit.laser == k)), lit.pixels)
+        for k in np.unique(lit.laser)
+    ]
+    return np.concatenate([np.empty(0, np.int64), *chosen])
+
+
+def _around(lit: LitPoints, shape: tuple[int, int], size: int) -> BoolArray:
+    """Return the pixels within half of `size` of lit points."""
+    marked = np.zeros(shape, np.uint8)
+    x, y = _places(lit.pixels, shape).T
+    marked[y, x] = 1
+    return np.asarray(cv2.dilate(marked, np.ones((size, size), np.uint8)) > 0)
+
+
+def _places(pixels: FloatArray, shape: tuple[int, ...]) -> IntArray:
+    """Return the pixels (x, y) that exact places lie in, within an image of a shape."""
+    return np.rint(pixels).astype(np.int64).clip(0, [shape[1] - 1, shape[0] - 1])
+
+
+def _one_a_pixel(points: IntArray, pixels: FloatArray) -> IntArray:
+    """Return the first of the points in every column, or in every row if these are more."""
+    places = np.rint(pixels[points]).astype(np.int64)
+    firsts = [np.unique(places[:, axis], return_index=True)[1] for axis in (0, 1)]
+    return np.asarray(points[np.sort(max(firsts, key=len))], dtype=np.int64)
+
+
+BENCHMARK_NAME = "aqualvs-bench-1"
+"""Of the set as a whole; the number rises with every change of a definition."""
+
+N_FRAMES = 20
+"""Frames of every dive."""
+
+_DURATION_S = 5.0
+_WORKING_RANGE = (0.25, 1.35)
+
+LEVELS: Mapping[str, str] = MappingProxyType(
+    {
+        "clear": "clear water, clean nets and a wall",
+        "turbid": "turbid water: glowing sheets, halo, marine snow",
+        "sun": "close below the surface: caustics, glare, overexposure",
+        "fouled": "nets with growth on 45 and 60 % of their twine",
+        "folded": "slack nets that hang in folds",
+        "crowded": "holes, fish, bubbles, a box, a wall behind the net",
+        "empty": "no target in range, or no lasers: nothing may be measured",
+    }
+)
+"""Levels of difficulty, each with one line about it."""
+
+_COURSES: dict[str, dict[str, Any]] = {
+    "near": {
+        "range_mm": {"values": [310, 420, 560, 650], "sway": 4, "period_s": 2.3},
+        "pitch_deg": {"values": [6, -4, 8], "sway": 1.5, "period_s": 3.1},
+        "yaw_deg": {"values": [-10, 12, -4], "sway": 1.5, "period_s": 2.7},
+        "slide_x_mm": [0, 90, 200],
+        "slide_z_mm": [0, -15, 20],
+    },
+    "far": {
+        "range_mm": {"values": [500, 800, 1250, 900], "sway": 6, "period_s": 2.9},
+        "pitch_deg": {"values": [-5, 6, -2], "sway": 1, "period_s": 3.1},
+        "yaw_deg": {"values": [8, -12, 5], "sway": 1, "period_s": 2.3},
+        "slide_x_mm": [0, -120, -260],
+        "slide_z_mm": [0, 30, -20],
+    },
+    "swing": {
+        "range_mm": {"values": [520, 660, 580], "sway": 5, "period_s": 2.6},
+        "pitch_deg": {"values": [-14, 15, -8, 10]},
+        "yaw_deg": {"values": [24, -25, 14, -20]},
+        "slide_x_mm": [0, 60, 20],
+        "slide_z_mm": [0, 40, 90],
+    },
+}
+_COURSES["wall"] = _COURSES["swing"]
+
+_TARGETS: dict[str, dict[str, Any]] = {
+    "near": {"net": {"bar_mm": 25, "twine_mm": 2.2, "roll_deg": 3}},
+    "far": {"net": {"mesh": "square", "bar_mm": 30, "twine_mm": 2.6, "roll_deg": 12}},
+    "swing": {"net": {"mesh": "hexagon", "bar_mm": 18, "twine_mm": 2.0, "roll_deg": 20}},
+    "wall": {"walls": [{"tile_mm": 150}]},
+}
+
+_MURKY: dict[str, Any] = {
+    "attenuation_per_m": [2.0, 1.25, 1.6],
+    "veil": [0.115, 0.235, 0.165],
+    "sheet_scatter_per_m": 1.5,
+    "forward_scatter": 0.16,
+    "halo_px": 12,
+    "snow": 1500,
+}
+_HAZY: dict[str, Any] = {
+    "attenuation_per_m": [1.3, 0.75, 1.0],
+    "veil": [0.095, 0.22, 0.165],
+    "sheet_scatter_per_m": 0.8,
+    "forward_scatter": 0.10,
+    "halo_px": 11,
+    "snow": 900,
+}
+_SUN: dict[str, Any] = {"caustics": 0.65, "glare": 0.5, "ambient": [0.50, 0.82, 0.78]}
+_STRONG_SUN: dict[str, Any] = {"caustics": 0.9, "glare": 1.0, "ambient": [0.8, 1.3, 1.2]}
+# Overexposed: half of a wall is at full scale.
+_BLINDING_SUN: dict[str, Any] = {"caustics": 1.0, "glare": 1.0, "ambient": [1.2, 2.0, 1.9]}
+
+_OVER: dict[str, dict[str, dict[str, Any]]] = {
+    "clear": {"near": {}, "far": {}, "swing": {}, "wall": {}},
+    "turbid": {"near": {"water": _MURKY}, "far": {"water": _MURKY}, "wall": {"water": _HAZY}},
+    "sun": {
+        "near": {"water": _STRONG_SUN, "walls": [{"behind_mm": 200}]},
+        "far": {"water": _STRONG_SUN},
+        "swing": {"water": _SUN},
+        "wall": {"water": _BLINDING_SUN},
+    },
+    "fouled": {
+        "near": {"net": {"fouling": 0.6, "growth": 2.5}, "walls": [{"behind_mm": 200}]},
+        "far": {"net": {"fouling": 0.45, "growth": 1.5}},
+        "swing": {"net": {"fouling": 0.6, "growth": 2.0}},
+    },
+    "folded": {
+        "near": {
+            "net": {
+                "folds": [
+                    {"direction_deg": 10, "height_mm": -24, "width_mm": 45, "every_mm": 90},
+                ]
+            }
+        },
+        "far": {
+            "net": {
+                "folds": [
+                    {"direction_deg": -15, "height_mm": -40, "width_mm": 75, "every_mm": 150},
+                    {"direction_deg": 60, "height_mm": -15, "width_mm": 60, "every_mm": 120},
+                ]
+            }
+        },
+        "swing": {
+            "net": {
+                "folds": [
+                    {"direction_deg": 35, "height_mm": -30, "width_mm": 50, "every_mm": 100},
+                ]
+            }
+        },
+    },
+    "crowded": {
+        "near": {
+            "net": {"bar_mm": 30, "holes_mm": [[60, 40, 35]]},
+            "walls": [{"behind_mm": 450, "yaw_deg": 4, "tile_mm": 150}],
+            "fish": 4,
+            "bubbles": 60,
+        },
+        "far": {
+            "net": {"fouling": 0.1, "missing": 0.05},
+            "walls": [{"behind_mm": 250, "pitch_deg": -5}],
+            "boxes": [{"centre_mm": [330, 120, -60], "heading_deg": 12}],
+            "fish": 5,
+            "bubbles": 40,
+            "water": {"snow": 300},
+        },
+        "swing": {
+            "net": {"fouling": 0.15, "holes_mm": [[-90, 0, 50], [120, -60, 40]]},
+            "boxes": [{"centre_mm": [-260, 220, -80], "heading_deg": -20}],
+            "fish": 4,
+            "bubbles": 80,
+        },
+    },
+    "empty": {
+        "open": {"fish": 3, "bubbles": 25, "water": {"snow": 600}},
+        "dark": {
+            "motion": _COURSES["near"],
+            "net": {"bar_mm": 25, "twine_mm": 2.2, "fouling": 0.3},
+            "water": _SUN,
+            "lasers_on": False,
+        },
+    },
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkDive:
+    """A dive of the set.
+
+    Attributes
+    ----------
+    name : str
+        `LEVEL_COURSE`; the name of its folder and of its row in scores.
+    level : str
+        One of `LEVELS`.
+    scenario : Scenario
+        What is rendered.
+    """
+
+    name: str
+    level: str
+    scenario: Scenario
+
+    def shortened(self, n_frames: int) -> "BenchmarkDive":
+        """Return the same dive in fewer frames, spread over all of its time."""
+        fps = n_frames / self.scenario.duration
+        return replace(self, scenario=replace(self.scenario, fps=fps))
+
+
+def benchmark_rig() -> Rig:
+    """Return the rig of all dives: the example rig, believed from 0.25 to 1.35 m."""
+    return replace(example_rig(), name=BENCHMARK_NAME, working_range=_WORKING_RANGE)
+
+
+def benchmark_dives() -> tuple[BenchmarkDive, ...]:
+    """Return all dives of the set, level after level."""
+    return tuple(
+        BenchmarkDive(name, level, parse_scenario(content, name, name))
+        for name, level, content in _definitions()
+    )
+
+
+def benchmark_checksum() -> str:
+    """Return the first 12 hex digits of the SHA-256 of everything that defines the set.
+
+    The rig counts to nine digits, so that the last bit of a sine changes nothing.
+    """
+    parts = [
+        BENCHMARK_NAME,
+        [VISIBLE_LIMIT, CONTRAST_LIMIT],
+        _rounded(rig_to_mapping(benchmark_rig())),
+        list(_definitions()),
+    ]
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode("ascii")).hexdigest()[:12]
+
+
+def _definitions() -> list[tuple[str, str, dict[str, Any]]]:
+    """Return name, level and scenario mapping of every dive, seeds included."""
+    found: list[tuple[str, str, dict[str, Any]]] = []
+    for level, courses in _OVER.items():
+        for course, over in courses.items():
+            content = _laid_over(_TARGETS.get(course, {}), over)
+            content["motion"] = content.get("motion", _COURSES.get(course, {}))
+            timing = {"duration_s": _DURATION_S, "fps": N_FRAMES / _DURATION_S}
+            seed = 1000 + len(found)
+            found.append((f"{level}_{course}", level, {**timing, "seed": seed, **content}))
+    return found
+
+
+def _laid_over(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Return a mapping with another's values over its own; the net is laid over key by key."""
+    merged = {**base, **over}
+    if "net" in base and "net" in over:
+        merged["net"] = {**base["net"], **over["net"]}
+    return merged
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(part) for part in value]
+    return float(f"{value:.9g}") if isinstance(value, float) else value
+
+
+TRUTH_COLUMNS = (
+    *("frame", "time_s", "range_m", "pitch_deg", "yaw_deg", "n_visible", "n_visible_lasers"),
+    *("residual_mm", "plane_range_m", "plane_pitch_deg", "plane_yaw_deg"),
+)
+"""Columns of the set's `truth.csv`.
+
+Range, pitch and yaw are those of the plane through the visible stripe points on the target (least
+squares), and `residual_mm` is the largest distance of such a point from it. Where the points span
+no plane, they are those of the target's own plane, and the residual is empty. The `plane` columns
+always hold the latter: the axes of a net's twine, without folds. All are empty without a target.
+"""
+
+_LABELS = {"net": Label.NET, "wall": Label.WALL, "none": Label.NONE}
+# A laser with fewer points shows no line.
+_POINTS_OF_A_LINE = 5
+
+Cell: TypeAlias = int | float | str
+
+
+def render_benchmark_dive(
+    dive: BenchmarkDive, renderer: Renderer, folder: Path, *, tick: Callable[[int], None]
+) -> None:
+    """Write `dive.mp4`, `truth.csv` and `rig.yaml` into a folder, which is made.
+
+    Parameters
+    ----------
+    dive : BenchmarkDive
+        What to render.
+    renderer : Renderer
+        For `benchmark_rig()`.
+    folder : Path
+        Files of the same names in it are replaced.
+    tick : callable
+        Called with 1 after every frame.
+
+    Raises
+    ------
+    OSError, OutputError
+        If the folder or a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    save_rig(with_exact_numbers(renderer.rig), folder / "rig.yaml")
+    scenario = dive.scenario
+    with (
+        (folder / "truth.csv").open("w", newline="", encoding="utf-8") as file,
+        VideoWriter(folder / "dive.mp4", renderer.rig.size_px, scenario.fps) as video,
+    ):
+        table = csv.writer(file)
+        table.writerow(TRUTH_COLUMNS)
+        for i, t in enumerate(scenario.times()):
+            scene = scenario.scene_at(t)
+            rng = np.random.default_rng([scenario.seed, i])
+            image, lit = render_with_visible(renderer, scene, t, rng)
+            video.write(image)
+            table.writerow([i, f"{t:.4f}", *truth_cells(scene, lit)])
+            tick(1)
+
+
+def render_with_visible(
+    renderer: Renderer, scene: Scene, t: float, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], LitPoints]:
+    """Return the picture of a scene and the stripe points on its target that it truly shows."""
+    radiance = renderer.radiance(scene, t)
+    image = expose(spread(radiance, scene.water, scene.sensor), scene.sensor, rng)
+    lit = renderer.lit_points(scene, t)
+    label = _LABELS[scene.target]
+    if not np.any(lit.label == label):
+        return image, _part(lit, np.empty(0, np.int64))
+    contrast = stripe_contrast(renderer, scene, t, radiance, lit)
+    return image, _part(lit, visible_points(lit, label, contrast))
+
+
+def truth_cells(scene: Scene, visible: LitPoints) -> list[Cell]:
+    """Return the cells of one frame after frame and time, in the order of `TRUTH_COLUMNS`."""
+    n_lasers = int(np.sum(np.bincount(visible.laser) >= _POINTS_OF_A_LINE)) if len(visible) else 0
+    counts: list[Cell] = [len(visible), n_lasers]
+    if scene.target == "none":
+        return ["", "", "", *counts, "", "", "", ""]
+    plane = scene.target_plane()
+    fit = visible_fit(visible, _LABELS[scene.target])
+    if fit is None:
+        return [*_posture(plane), *counts, "", *_posture(plane)]
+    return [*_posture(fit[0]), *counts, f"{1e3 * fit[1]:.3f}", *_posture(plane)]
+
+
+def _part(lit: LitPoints, points: NDArray[np.int64]) -> LitPoints:
+    return replace(
+        lit,
+        points_in_dome=lit.points_in_dome[points],
+        pixels=lit.pixels[points],
+        laser=lit.laser[points],
+        label=lit.label[points],
+    )
+
+
+def _posture(plane: Plane) -> list[Cell]:
+    """Range in metres, pitch and yaw in degrees (docs/conventions.md)."""
+    nx, ny, nz = plane.normal.tolist()
+    angles = np.rad2deg([np.arctan2(nz, ny), np.arctan2(nx, ny)])
+    return [f"{plane.offset:.6f}", *(f"{angle:.5f}" for angle in angles)]

@@ -1,0 +1,1 @@
+"""Dynamics of a simulated vehicle in moving water."""

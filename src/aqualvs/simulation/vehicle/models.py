@@ -1,0 +1,433 @@
+"""Small remotely operated vehicles to simulate: hull, thrusters, and their own autopilot.
+
+Body axes are forward, right, down (FRD) from the centre of gravity; hydrodynamics are diagonal, as
+all three sources have them. The vehicles are fully under water.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.linear_algebra import Vec
+from aqualvs.geometry.transforms import SE3
+from aqualvs.simulation.vehicle.water_motion import GRAVITY
+
+Six: TypeAlias = tuple[float, float, float, float, float, float]
+
+_COS45 = math.sqrt(0.5)
+# A thruster takes part in a motion if it has so much of its unit force or of its lever in it.
+_TAKES_PART = 0.2
+# Columns of the mixing table.
+ROLL, PITCH, YAW, DOWN, FORWARD, RIGHT = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class Thruster:
+    """A thruster.
+
+    Attributes
+    ----------
+    position : (float, float, float)
+        In body axes, in metres.
+    direction : (float, float, float)
+        Unit vector along which it pushes the vehicle when it runs forward.
+    """
+
+    position: Vec
+    direction: Vec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThrustCurve:
+    """Thrust over command, and how fast it follows.
+
+    Beyond the dead band the thrust is greatest * (linear x + (1 - linear) x²), x being the rest of
+    the command's travel.
+
+    Attributes
+    ----------
+    forward, reverse : float
+        Greatest thrust either way, in newtons. The defaults are a T200's at 14 V, 4.52 and 3.52
+        kgf (Blue Robotics' chart; 5.25 and 4.10 kgf at 16 V).
+    dead_band : float
+        Share of the command's travel that does nothing. 0.07 is 28 of 400 µs.
+    linear : float
+        0.6 follows the same chart at 12 V within 3 % of the greatest thrust, both ways.
+    lag : float
+        Time constant in seconds; 0.1 is a round number for a small propeller, not measured.
+    """
+
+    forward: float = 44.3
+    reverse: float = 34.5
+    dead_band: float = 0.07
+    linear: float = 0.6
+    lag: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (min(self.forward, self.reverse, self.lag) > 0.0 and 0.0 <= self.dead_band < 1.0):
+            raise OptionError(
+                f"thrust curve: forward {self.forward:g} N, reverse {self.reverse:g} N, lag "
+                f"{self.lag:g} s, dead band {self.dead_band:g}; the first three are positive, the "
+                "last is 0 or more and less than 1"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sticks:
+    """What the vehicle makes of stick positions, as ArduSub 4.5 and later of MANUAL_CONTROL.
+
+    Its parameters are RCn_MIN 1100 and RCn_MAX 1900 us and, but for those below, as ArduSub has
+    them after a reset. No axis has an expo.
+
+    Attributes
+    ----------
+    gain : float
+        Pilot gain (JS_GAIN_DEFAULT): share of everything that a full stick asks for.
+    turning_rate : float
+        At a pulse of 1900 us, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
+    climb_rate : float
+        Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
+        reaches; 0.5 is a pilot's choice.
+    yaw_dead_zone : int
+        RC4_DZ, in microseconds; shrinks with the gain, as the next one.
+    throttle_dead_zone : int
+        THR_DZ, in thousandths of the throttle's travel.
+    trims : (int, int, int)
+        RC4_TRIM (yaw), RC5_TRIM (forward) and RC6_TRIM (right), in microseconds.
+    """
+
+    gain: float = 0.5
+    turning_rate: float = math.radians(45.0) * 3.375
+    climb_rate: float = 0.5
+    yaw_dead_zone: int = 40
+    throttle_dead_zone: int = 100
+    trims: tuple[int, int, int] = (1500, 1500, 1500)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.gain <= 1.0:
+            raise OptionError(f"sticks: gain {self.gain:g}; choose more than 0, at most 1")
+        if not (0 <= self.yaw_dead_zone <= 200 and 0 <= self.throttle_dead_zone <= 300):
+            raise OptionError(
+                f"sticks: dead zones {self.yaw_dead_zone} us and {self.throttle_dead_zone}; choose "
+                "0 to 200 for yaw and 0 to 300 for the throttle"
+            )
+        if not all(1400 <= trim <= 1600 for trim in self.trims):
+            raise OptionError(f"sticks: trims {self.trims} us; choose 1400 to 1600")
+
+    def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
+        """Return what stick positions ask for in depth hold.
+
+        Parameters
+        ----------
+        x, y, z, r : int
+            As MANUAL_CONTROL has them: z from 0 (down) over 500 to 1000 (up).
+
+        Returns
+        -------
+        forward, right, down, turn : float
+            Shares of the thrusters' motor input, of the greatest rate of descent and of the
+            greatest turning rate.
+        """
+        yaw_trim, *level = self.trims
+        forward, right = (
+            _thrust_input(_pulse(0.4 * self.gain, one), trim)
+            for one, trim in zip((x, y), level, strict=True)
+        )
+        return forward, right, -self._climb(z), self._turn(r, yaw_trim)
+
+    def _turn(self, r: int, trim: int) -> float:
+        """Return the share of the turning rate (`pwm_to_angle_dz_trim`, whole centidegrees)."""
+        beyond = _pulse(0.4 * self.gain, r) - trim
+        dead = int(self.yaw_dead_zone * self.gain)
+        if abs(beyond) <= dead:
+            return 0.0
+        travel = (_MOST_US - trim if beyond > 0 else trim - _LEAST_US) - dead
+        return math.copysign(int(4500 * (abs(beyond) - dead) / travel) / 4500, beyond)
+
+    def _climb(self, z: int) -> float:
+        """Return the share of the rate of climb (`get_pilot_desired_climb_rate`)."""
+        # The throttle is a range of 1000 from RC3_MIN + RC3_DZ on.
+        low = _LEAST_US + _THROTTLE_DEAD_US
+        control = int(1000 * max(_pulse(0.8 * self.gain, z - 500) - low, 0) / (_MOST_US - low))
+        middle = int(1000 * (0.5 * (_LEAST_US + _MOST_US) - low) / (_MOST_US - low))
+        dead = self.throttle_dead_zone * self.gain
+        if control < middle - dead:
+            return max((control - middle + dead) / (middle - dead), -1.0)
+        if control > middle + dead:
+            return min((control - middle - dead) / (1000.0 - middle - dead), 1.0)
+        return 0.0
+
+
+_LEAST_US, _MOST_US, _THROTTLE_DEAD_US = 1100, 1900, 30
+
+
+def _pulse(unit_us: float, units: int) -> int:
+    """Return the pulse of a stick in microseconds, cut to whole ones (`set_override`)."""
+    return min(max(int(1500 + unit_us * units), _LEAST_US), _MOST_US)
+
+
+def _thrust_input(pulse: int, trim: int) -> float:
+    """Return the share of the way from the trim to the end (`norm_input`)."""
+    return (pulse - trim) / (_MOST_US - trim if pulse > trim else trim - _LEAST_US)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Autopilot:
+    """Gains of the vehicle's own loops, in ArduSub's units: motor input is -1 to 1.
+
+    Structure and defaults of the rate loops are ArduSub's (AC_AttitudeControl_Sub.h) without its
+    filters and small D terms. The outer gains are lower than its 6 and 3 a second, which leave
+    these models, with their thrusters' lag, hardly damped. The heading is held no better than the
+    thrusters' dead band lets it: within dead_band / (rate * angle) where nothing else loads them.
+
+    Attributes
+    ----------
+    angle : float
+        Rate asked for by an angle's error, in rad/s per rad.
+    rate, rate_integral : (float, float, float)
+        Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
+    depth : float
+        Climb rate asked for by a depth's error, in m/s per metre.
+    climb, climb_integral : float
+        Motor input per m/s, and per m/s and second.
+    input_time : float
+        Time constant in which turning rates that are asked for come in, in seconds
+        (ATC_INPUT_TC).
+    acceleration : float
+        With which climb rates come in, in m/s² (PILOT_ACCEL_Z).
+    settle : float
+        So long after the last turn that was asked for, the heading held is the present one, in
+        seconds (ArduSub's mode_althold.cpp).
+    """
+
+    angle: float = 4.5
+    rate: Vec = (0.135, 0.135, 0.18)
+    rate_integral: Vec = (0.09, 0.09, 0.018)
+    depth: float = 1.0
+    climb: float = 1.5
+    climb_integral: float = 0.75
+    input_time: float = 0.15
+    acceleration: float = 1.0
+    settle: float = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleModel:
+    """A vehicle's parameters, in SI units.
+
+    Attributes
+    ----------
+    name : str
+        How reports call it.
+    mass : float
+        In air, in kg.
+    inertia : (float, float, float)
+        About forward, right and down, in kg m².
+    buoyancy : float
+        In newtons; the displaced mass follows from it.
+    centre_of_buoyancy : (float, float, float)
+        In body axes, in metres; above the centre of gravity is negative.
+    added_mass, linear_drag, quadratic_drag : tuple of 6 floats
+        Positive, along forward, right, down and about them.
+    thrusters : sequence of Thruster
+        Any number; all with the same curve.
+    curve : ThrustCurve
+        Of every thruster.
+    sticks : Sticks
+        What an effort asks for.
+    autopilot : Autopilot
+        Gains of the vehicle's own loops.
+    dome_position : (float, float, float)
+        Centre of the camera's dome in body axes, in metres.
+    half_size : (float, float, float)
+        Half length, width and height of the hull, in metres.
+    """
+
+    name: str
+    mass: float
+    inertia: Vec
+    buoyancy: float
+    centre_of_buoyancy: Vec
+    added_mass: Six
+    linear_drag: Six
+    quadratic_drag: Six
+    thrusters: Sequence[Thruster]
+    curve: ThrustCurve = field(default_factory=ThrustCurve)
+    sticks: Sticks = field(default_factory=Sticks)
+    autopilot: Autopilot = field(default_factory=Autopilot)
+    dome_position: Vec = (0.20, 0.0, 0.0)
+    half_size: Vec = (0.2286, 0.169, 0.127)
+
+    def __post_init__(self) -> None:
+        drags = (*self.linear_drag, *self.quadratic_drag, *self.added_mass)
+        if not (self.mass > 0.0 and min(self.inertia) > 0.0 and min(drags) >= 0.0):
+            raise OptionError(
+                f"vehicle {self.name}: mass {self.mass:g} kg, inertia {self.inertia}; masses and "
+                "inertias are positive, drags and added masses 0 or more"
+            )
+
+    @property
+    def weight(self) -> float:
+        """In newtons."""
+        return self.mass * GRAVITY
+
+    @property
+    def body_from_dome(self) -> SE3:
+        """Pose of the dome's axes (right, forward, up) in the body's (forward, right, down)."""
+        turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+        return SE3(turn, np.array(self.dome_position))
+
+    def scaled(self, mass: float = 1.0, drag: float = 1.0) -> "VehicleModel":
+        """Return a vehicle with other mass and drag, by these factors.
+
+        Inertia goes with the mass, and buoyancy too: a vehicle is trimmed before it dives, so the
+        difference of buoyancy and weight stays.
+        """
+        if not (mass > 0.0 and drag > 0.0):
+            raise OptionError(
+                f"vehicle {self.name}: factors {mass:g} and {drag:g}; both are positive"
+            )
+        return replace(
+            self,
+            mass=self.mass * mass,
+            inertia=_scaled3(self.inertia, mass),
+            buoyancy=self.buoyancy + (mass - 1.0) * self.weight,
+            linear_drag=_scaled6(self.linear_drag, drag),
+            quadratic_drag=_scaled6(self.quadratic_drag, drag),
+        )
+
+    def allocation(self) -> FloatArray:
+        """Force and moment on the body of every thruster's unit thrust, shape (6, n)."""
+        positions = np.array([one.position for one in self.thrusters])
+        directions = np.array([one.direction for one in self.thrusters])
+        moments = np.cross(positions, directions)
+        return np.ascontiguousarray(np.vstack([directions.T, moments.T]))
+
+    def mixing(self) -> FloatArray:
+        """Share of each motor input that every thruster takes, shape (n, 6): -1, 0 or 1.
+
+        Columns: roll, pitch, yaw, down, forward, right. As in ArduSub's frames, upright thrusters
+        do roll, pitch and depth, level ones the rest.
+        """
+        table = self.allocation().T
+        mix = np.zeros((len(table), 6))
+        for k, (force, moment) in enumerate(zip(table[:, :3], table[:, 3:], strict=True)):
+            if abs(force[2]) > _TAKES_PART:
+                reach = np.abs(table[:, 3:5]).max(axis=0) + 1e-9
+                mix[k, [ROLL, PITCH]] = _sign(moment[:2] / reach)
+                mix[k, DOWN] = np.sign(force[2])
+            else:
+                reach_yaw = np.abs(table[:, 5]).max() + 1e-9
+                mix[k, YAW] = _sign(moment[2] / reach_yaw)
+                mix[k, [FORWARD, RIGHT]] = _sign(force[:2])
+        return mix
+
+
+def _sign(values: FloatArray) -> FloatArray:
+    signs: FloatArray = np.where(np.abs(values) > _TAKES_PART, np.sign(values), 0.0)
+    return signs
+
+
+def _scaled3(values: Vec, factor: float) -> Vec:
+    a, b, c = (factor * value for value in values)
+    return a, b, c
+
+
+def _scaled6(values: Six, factor: float) -> Six:
+    a, b, c, d, e, f = (factor * value for value in values)
+    return a, b, c, d, e, f
+
+
+def _level_four(x: float, y: float, z: float) -> tuple[Thruster, ...]:
+    """Motors 1 to 4 of ArduSub's vectored frames: front right, front left, rear right, rear left.
+
+    The front ones run in reverse to go forward.
+    """
+    c = _COS45
+    return (
+        Thruster((x, y, z), (-c, c, 0.0)),
+        Thruster((x, -y, z), (-c, -c, 0.0)),
+        Thruster((-x, y, z), (c, c, 0.0)),
+        Thruster((-x, -y, z), (c, -c, 0.0)),
+    )
+
+
+BLUEROV2_HEAVY = VehicleModel(
+    name="bluerov2_heavy",
+    mass=13.5,
+    inertia=(0.26, 0.23, 0.37),
+    buoyancy=0.0134 * 1025.0 * GRAVITY,
+    centre_of_buoyancy=(0.0, 0.0, -0.01),
+    added_mass=(6.36, 7.12, 18.68, 0.189, 0.135, 0.222),
+    linear_drag=(13.7, 0.0, 33.0, 0.0, 0.8, 0.0),
+    quadratic_drag=(141.0, 217.0, 190.0, 1.19, 0.47, 1.5),
+    thrusters=(
+        *_level_four(0.156, 0.111, 0.085),
+        Thruster((0.120, 0.218, 0.0), (0.0, 0.0, -1.0)),
+        Thruster((0.120, -0.218, 0.0), (0.0, 0.0, 1.0)),
+        Thruster((-0.120, 0.218, 0.0), (0.0, 0.0, 1.0)),
+        Thruster((-0.120, -0.218, 0.0), (0.0, 0.0, -1.0)),
+    ),
+    half_size=(0.2286, 0.2875, 0.127),
+)
+"""BlueROV2 Heavy in seawater: von Benzon et al. 2022, doi:10.3390/jmse10121898, Table A1."""
+
+BLUEROV2 = VehicleModel(
+    name="bluerov2",
+    mass=11.5,
+    inertia=(0.16, 0.16, 0.16),
+    buoyancy=114.8,
+    centre_of_buoyancy=(0.0, 0.0, -0.02),
+    added_mass=(5.5, 12.7, 14.57, 0.12, 0.12, 0.12),
+    linear_drag=(4.03, 6.22, 5.18, 0.07, 0.07, 0.07),
+    quadratic_drag=(18.18, 21.66, 36.99, 1.55, 1.55, 1.55),
+    thrusters=(
+        *_level_four(0.1355, 0.1, 0.01),
+        Thruster((0.0, 0.1105, 0.0), (0.0, 0.0, -1.0)),
+        Thruster((0.0, -0.1105, 0.0), (0.0, 0.0, 1.0)),
+    ),
+)
+"""BlueROV2 with six thrusters: Wu 2018, "6-DoF modelling and control of a remotely operated
+vehicle", Flinders University.
+
+Nothing but buoyancy rights its pitch. Its level thrusters are placed 10 mm below the centre of
+gravity, not some 70 mm: with those and a centre of buoyancy 20 mm up, half of the thrust would turn
+the model over. Above about 0.5 m/s ahead its pitch is unstable all the same: the Munk moment of
+added mass beats the righting one.
+"""
+
+VIDEORAY = VehicleModel(
+    name="videoray",
+    mass=3.6,
+    inertia=(0.028, 0.041, 0.043),
+    buoyancy=3.6 * GRAVITY + 0.3,
+    centre_of_buoyancy=(0.0, 0.0, -0.03),
+    added_mass=(1.94, 6.05, 3.95, 0.012, 0.012, 0.0118),
+    linear_drag=(0.95, 5.87, 3.70, 0.023, 0.023, 0.023),
+    quadratic_drag=(6.04, 30.73, 26.36, 0.45, 0.45, 0.45),
+    thrusters=(
+        Thruster((-0.10, 0.085, 0.0), (1.0, 0.0, 0.0)),
+        Thruster((-0.10, -0.085, 0.0), (1.0, 0.0, 0.0)),
+        Thruster((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ),
+    curve=ThrustCurve(forward=5.7, reverse=4.3, lag=0.15),
+    autopilot=Autopilot(angle=2.0, rate=(0.0, 0.0, 0.6), rate_integral=(0.0, 0.0, 0.05), climb=2.0),
+    dome_position=(0.12, 0.0, 0.0),
+    half_size=(0.1525, 0.1125, 0.105),
+)
+"""Like a VideoRay Pro III: two level thrusters and an upright one, no sway.
+
+Added mass and drag of surge, sway, heave and yaw: Wang & Clark 2006, "Modeling and simulation of
+the VideoRay Pro III underwater vehicle", OCEANS Asia Pacific, and W. Wang's
+thesis, as K. DeMarco's `videoray_pro_3_params.m` (SyllogismRXS/syllo-ros) quotes them. Chosen, not
+measured: inertias of a box of that mass and size, roll and pitch as yaw, buoyancy, and thrusts
+that reach 1.3 m/s. It has ArduSub's loops (frame SimpleROV-3) in place of its own.
+"""
+
+VEHICLES = {model.name: model for model in (BLUEROV2_HEAVY, BLUEROV2, VIDEORAY)}
+"""All models by name."""

@@ -1,0 +1,278 @@
+"""How the water moves around a simulated vehicle, and what pulls at its tether.
+
+The world is north, east, down (NED) with its origin at the still surface. A current is the same
+everywhere and wanders slowly; waves are linear (Airy) waves in deep water, whose motion fades
+with depth as exp(-k z); k = omega² / g. They hold where the water is deeper than half a wavelength
+and the waves are not steep.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel, kernel
+from aqualvs.geometry.linear_algebra import Vec, row3
+
+GRAVITY = 9.81
+"""In m/s²."""
+# Columns of the tables: of waves, and of the wandering current.
+_OMEGA, _NUMBER, _NORTH, _EAST, _HEIGHT, _PHASE, _WAVE_COLUMNS = range(7)
+_DRIFT_NORTH, _DRIFT_EAST, _DRIFT_COLUMNS = 2, 3, 4
+_DRIFT_TERMS = 6
+# Steeper waves break (Stokes' limit is 0.44 for amplitude times wave number).
+_STEEPEST = 0.44
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waves:
+    """Surface waves.
+
+    Attributes
+    ----------
+    amplitude : float
+        Half the height from trough to crest, in metres. Irregular waves have the same mean square.
+    period : float
+        In seconds; of irregular waves the middle one.
+    direction : float
+        Where the waves go, in radians clockwise from north.
+    n : int
+        Number of sine waves; 1 is a regular swell.
+    spread : float
+        Periods of irregular waves are spread evenly over this share of the period to either side,
+        directions at random over as many radians.
+    """
+
+    amplitude: float
+    period: float = 5.0
+    direction: float = 0.0
+    n: int = 1
+    spread: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not (self.amplitude >= 0.0 and self.period > 0.0 and self.n >= 1):
+            raise OptionError(
+                f"waves: amplitude {self.amplitude:g} m, period {self.period:g} s, n {self.n}; "
+                "amplitudes are 0 or more, periods positive, and there is at least one wave"
+            )
+        if not 0.0 <= self.spread < 1.0:
+            raise OptionError(f"waves: spread {self.spread:g}; choose 0 or more, less than 1")
+        number = (2.0 * math.pi / self.period) ** 2 / GRAVITY
+        if self.amplitude * number > _STEEPEST:
+            raise OptionError(
+                f"waves: amplitude {self.amplitude:g} m at a period of {self.period:g} s would "
+                f"break; choose at most {_STEEPEST / number:.2f} m"
+            )
+
+    def table(self, rng: np.random.Generator) -> FloatArray:
+        """Return one row for each sine wave, shape (n, 6), phases from `rng`."""
+        rows = np.zeros((self.n, _WAVE_COLUMNS))
+        share = np.linspace(-1.0, 1.0, self.n) if self.n > 1 else np.zeros(1)
+        aside = rng.uniform(-1.0, 1.0, self.n) if self.n > 1 else np.zeros(1)
+        rows[:, _OMEGA] = 2.0 * np.pi / (self.period * (1.0 + self.spread * share))
+        rows[:, _NUMBER] = rows[:, _OMEGA] ** 2 / GRAVITY
+        way = self.direction + self.spread * aside
+        rows[:, _NORTH], rows[:, _EAST] = np.cos(way), np.sin(way)
+        rows[:, _HEIGHT] = self.amplitude / math.sqrt(self.n)
+        rows[:, _PHASE] = rng.uniform(0.0, 2.0 * np.pi, self.n)
+        return rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tether:
+    """A neutrally buoyant cable from a fixed point at the surface straight down to the vehicle.
+
+    Across the flow a piece of it is dragged like a cylinder; the vehicle's end carries what the
+    balance of moments about the upper end gives it, and the cable moves the less the nearer to
+    that end.
+
+    Attributes
+    ----------
+    length : float
+        In the water, in metres; 0 is no drag.
+    diameter : float
+        In metres; 7.6 mm is Blue Robotics' Fathom tether.
+    drag : float
+        Drag coefficient across; about 1.2 for a smooth cylinder at these Reynolds numbers.
+    attached_at : (float, float, float)
+        On the vehicle, in body axes (forward, right, down), in metres.
+    pull : (float, float, float)
+        Steady pull beside the drag, in world axes (north, east, down), in newtons.
+    """
+
+    length: float = 0.0
+    diameter: float = 0.0076
+    drag: float = 1.2
+    attached_at: Vec = (-0.15, 0.0, -0.05)
+    pull: Vec = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (self.length >= 0.0 and self.diameter > 0.0 and self.drag >= 0.0):
+            raise OptionError(
+                f"tether: length {self.length:g} m, diameter {1e3 * self.diameter:g} mm, drag "
+                f"{self.drag:g}; length and drag are 0 or more, the diameter is positive"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WaterMotion:
+    """Everything that moves in the water but the vehicle.
+
+    Attributes
+    ----------
+    current : (float, float, float)
+        Mean velocity of the water in world axes (north, east, down), in m/s.
+    wander, wander_period : float
+        Standard deviation, in m/s along north and along east each, by which the current changes
+        over times of this length, in seconds.
+    waves : Waves, optional
+        None is a calm.
+    tether : Tether
+        Drags and pulls at the vehicle.
+    density : float
+        In kg/m³.
+    seed : int
+        Chooses the phases of waves and wander.
+    """
+
+    current: Vec = (0.0, 0.0, 0.0)
+    wander: float = 0.0
+    wander_period: float = 40.0
+    waves: Waves | None = None
+    tether: Tether = field(default_factory=Tether)
+    density: float = 1025.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.wander >= 0.0 and self.wander_period > 0.0 and self.density > 0.0):
+            raise OptionError(
+                f"water: wander {self.wander:g} m/s, wander period {self.wander_period:g} s, "
+                f"density {self.density:g} kg/m³; the first is 0 or more, the others are positive"
+            )
+
+    def pack(self) -> "Flow":
+        """Return it as kernels need it; the same seed gives the same water."""
+        rng = np.random.default_rng([self.seed, 61])
+        waves = self.waves.table(rng) if self.waves else np.zeros((0, _WAVE_COLUMNS))
+        tether = self.tether
+        thickness = 0.5 * self.density * tether.drag * tether.diameter
+        line = [thickness * tether.length, *tether.attached_at, *tether.pull]
+        return Flow(np.array(self.current, dtype=np.float64), self._drift(rng), waves, _row(line))
+
+    def velocity(self, time_s: float, position: FloatArray) -> FloatArray:
+        """Return the velocity of the water at a place, shape (3,) each, in the world, in m/s."""
+        return self.motion(time_s, position)[0]
+
+    def motion(self, time_s: float, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return velocity (m/s) and acceleration (m/s²) of the water at a place, shape (3,)."""
+        place = np.ascontiguousarray(position, dtype=np.float64)
+        both = _motion(float(time_s), place, self.pack())
+        return np.array(both[0]), np.array(both[1])
+
+    def _drift(self, rng: np.random.Generator) -> FloatArray:
+        """Return a few slow sine waves along north and along east, shape (2 * _DRIFT_TERMS, 4)."""
+        if self.wander == 0.0:
+            return np.zeros((0, _DRIFT_COLUMNS))
+        rows = np.zeros((2 * _DRIFT_TERMS, _DRIFT_COLUMNS))
+        rows[:, 0] = 2.0 * np.pi / (self.wander_period * rng.uniform(0.5, 2.0, len(rows)))
+        rows[:, 1] = rng.uniform(0.0, 2.0 * np.pi, len(rows))
+        size = self.wander * math.sqrt(2.0 / _DRIFT_TERMS)
+        rows[:_DRIFT_TERMS, _DRIFT_NORTH] = size
+        rows[_DRIFT_TERMS:, _DRIFT_EAST] = size
+        return rows
+
+
+class Flow(NamedTuple):
+    """The numbers of `WaterMotion`.
+
+    Attributes
+    ----------
+    current : array, shape (3,)
+        As there.
+    drift : array, shape (m, 4)
+        Angular frequency, phase, amplitudes along north and east.
+    waves : array, shape (n, 6)
+        Angular frequency, wave number, direction as north and east, amplitude, phase.
+    line : array, shape (7,)
+        Of the tether: half density times drag times area; where it is attached; its pull.
+    """
+
+    current: FloatArray
+    drift: FloatArray
+    waves: FloatArray
+    line: FloatArray
+
+
+def _row(values: list[float]) -> FloatArray:
+    return np.array(values, dtype=np.float64)
+
+
+@inline_borrowing_kernel
+def stream_at(t: float, flow: Flow) -> tuple[Vec, Vec]:
+    """Return velocity and acceleration of the water without its waves."""
+    north, east, down = flow.current[0], flow.current[1], flow.current[2]
+    to_north, to_east = 0.0, 0.0
+    for i in range(flow.drift.shape[0]):
+        omega = flow.drift[i, 0]
+        angle = omega * t + flow.drift[i, 1]
+        sine, cosine = np.sin(angle), omega * np.cos(angle)
+        north += flow.drift[i, _DRIFT_NORTH] * sine
+        east += flow.drift[i, _DRIFT_EAST] * sine
+        to_north += flow.drift[i, _DRIFT_NORTH] * cosine
+        to_east += flow.drift[i, _DRIFT_EAST] * cosine
+    return (north, east, down), (to_north, to_east, 0.0)
+
+
+@inline_borrowing_kernel
+def orbit_at(t: float, place: Vec, flow: Flow) -> tuple[Vec, Vec]:
+    """Return velocity and acceleration of the water by its waves (Airy, deep water)."""
+    north, east, down = 0.0, 0.0, 0.0
+    to_north, to_east, to_down = 0.0, 0.0, 0.0
+    for i in range(flow.waves.shape[0]):
+        omega, number = flow.waves[i, _OMEGA], flow.waves[i, _NUMBER]
+        c, s = flow.waves[i, _NORTH], flow.waves[i, _EAST]
+        angle = number * (c * place[0] + s * place[1]) - omega * t + flow.waves[i, _PHASE]
+        speed = flow.waves[i, _HEIGHT] * omega * np.exp(-number * max(place[2], 0.0))
+        sine, cosine = speed * np.sin(angle), speed * np.cos(angle)
+        north, east, down = north + c * cosine, east + s * cosine, down - sine
+        to_north += omega * c * sine
+        to_east += omega * s * sine
+        to_down += omega * cosine
+    return (north, east, down), (to_north, to_east, to_down)
+
+
+# Three-point Gauss rule on 0..1: exact for the quintic that a line in one direction gives.
+_GAUSS_AT = (0.5 - math.sqrt(0.15), 0.5, 0.5 + math.sqrt(0.15))
+_GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
+
+
+@inline_borrowing_kernel
+def tether_force(stream: Vec, velocity: Vec, flow: Flow) -> Vec:
+    """Return what the tether does to the vehicle, in the world, in newtons.
+
+    Parameters
+    ----------
+    stream, velocity : (float, float, float)
+        Of the water without waves, and of the vehicle, in the world, in m/s.
+    flow : Flow
+        With the tether.
+    """
+    north, east = 0.0, 0.0
+    for i in range(3):
+        s = _GAUSS_AT[i]
+        u, v = stream[0] - s * velocity[0], stream[1] - s * velocity[1]
+        weight = _GAUSS_WEIGHT[i] * s * flow.line[0] * np.sqrt(u * u + v * v)
+        north, east = north + weight * u, east + weight * v
+    return north + flow.line[4], east + flow.line[5], flow.line[6]
+
+
+@kernel
+def _motion(t: float, place: FloatArray, flow: Flow) -> tuple[Vec, Vec]:
+    """Return velocity and acceleration of the water at a place."""
+    at = row3(place.reshape(1, 3), 0, 0)
+    stream, orbit = stream_at(t, flow), orbit_at(t, at, flow)
+    v, w, a, b = stream[0], orbit[0], stream[1], orbit[1]
+    return (v[0] + w[0], v[1] + w[1], v[2] + w[2]), (a[0] + b[0], a[1] + b[1], a[2] + b[2])

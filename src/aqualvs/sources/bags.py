@@ -1,0 +1,390 @@
+"""Images from MCAP files: Foxglove's messages, and those of ROS 1 and ROS 2.
+
+Images from ROS bags: `.bag` of ROS 1, `.db3` and MCAP folders of ROS 2.
+"""
+
+import contextlib
+import errno
+import functools
+import shutil
+import struct
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, Any, BinaryIO, TypeAlias, cast
+
+from aqualvs.errors import OptionError, SourceError
+from aqualvs.sources.image_messages import (
+    ImageMessage,
+    image_of_json,
+    image_of_protobuf,
+    image_of_ros,
+    kind_of_schema,
+)
+from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, decompressed
+from aqualvs.sources.message_source import MAX_BYTES, Logged, MessageSource, Topic, choose_topic
+from aqualvs.special_files import refuse_special
+
+# Room that is left on the disk where bags are unpacked that are packed as whole files.
+_FREE_BYTES = 1 << 30
+_REMEDY = "check it with ros2 bag info or rosbag reindex"
+
+
+def open_bag(path: Path, topic: str | None = None) -> MessageSource:
+    """Open the images of a ROS bag.
+
+    Parameters
+    ----------
+    path : Path
+        A `.bag` file, a folder with `metadata.yaml`, or a `.db3` file within such a folder.
+    topic : str or None
+        Needed where several topics have images.
+
+    Returns
+    -------
+    source : MessageSource
+
+    Raises
+    ------
+    SourceError
+        If the bag cannot be read or has no images.
+    OptionError
+        If the topic is missing or wrong, or a package is missing.
+    """
+    try:
+        import rosbags.highlevel  # noqa: F401
+    except ImportError:
+        raise OptionError(
+            f"{path}: ROS bags need a package; type pip install 'aqualvs[bags]'"
+        ) from None
+    folder = path.parent if path.suffix.lower() == ".db3" else path
+    if folder != path and not (folder / "metadata.yaml").is_file():
+        raise SourceError(
+            f"{path}: its metadata.yaml is missing; make it with ros2 bag reindex, "
+            "and give the folder"
+        )
+    for one in folder.iterdir() if folder.is_dir() else ():
+        refuse_special(one)
+    chosen = choose_topic(str(path), _image_topics(folder), topic)
+
+    def messages() -> Iterator[Logged]:
+        return _messages(folder, chosen.name)
+
+    return MessageSource(f"{path}#{chosen.name}", messages, chosen.n_messages)
+
+
+def _image_topics(path: Path) -> list[Topic]:
+    counts: dict[str, int] = {}
+    with _opened(path) as reader:
+        for connection in reader.connections:
+            if kind_of_schema(connection.msgtype):
+                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    return [Topic(name, n) for name, n in counts.items()]
+
+
+def _messages(path: Path, topic: str) -> Iterator[Logged]:
+    with _opened(path) as reader:
+        wanted = [c for c in reader.connections if c.topic == topic]
+        try:
+            for connection, log_ns, content in reader.messages(connections=wanted):
+                yield log_ns, _image(reader, content, connection.msgtype)
+        # The package lets through whatever damage leads to, from AssertionError to ZstdError.
+        except Exception as fault:
+            raise SourceError(f"{path}: the bag breaks off ({_words(fault)})") from fault
+
+
+def _image(reader: Any, content: bytes, kind: str) -> ImageMessage | None:
+    try:
+        return image_of_ros(reader.deserialize(content, kind))
+    except Exception:
+        return None
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    _bound_unpacking()
+    # Bags of ROS 2 before Iron do not define their messages; those of images never changed.
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    try:
+        reader = AnyReader([path], default_typestore=store)
+        reader.open()
+    except Exception as fault:
+        raise SourceError(f"{path}: no ROS bag, or damaged ({_words(fault)}); {_REMEDY}") from fault
+    with contextlib.closing(reader):
+        # Metadata are passed on as they are.
+        if not all(
+            isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int)
+            for c in reader.connections
+        ):
+            raise SourceError(f"{path}: damaged (no name, type or count of a topic); {_REMEDY}")
+        yield reader
+
+
+@functools.cache
+def _bound_unpacking() -> None:
+    """Have `rosbags` unpack no more at once than `MAX_BYTES`, and no more than the disk takes.
+
+    It has no such option, and a megabyte of packed zeros would fill the memory. What is replaced
+    is the package's own, for the whole process.
+    """
+    import bz2
+
+    import lz4.frame
+    import rosbags.rosbag1.reader as ros1
+    import rosbags.rosbag2.reader as ros2
+    import rosbags.rosbag2.storage_mcap as mcap
+
+    zstd: Any = vars(ros2)["zstd"]
+
+    class File(zstd.ZstdFile):  # type: ignore[misc]
+        """A file that is packed as a whole; it is unpacked to the disk."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            if shutil.disk_usage(tempfile.gettempdir()).free < _FREE_BYTES:
+                raise OSError(errno.ENOSPC, "unpacked, it would fill the disk")
+            return bytes(super().read(size))
+
+    by_bz2 = _bounded(bz2.BZ2Decompressor)
+    by_lz4 = _bounded(lz4.frame.LZ4FrameDecompressor)
+    by_zstd = _bounded(zstd.ZstdDecompressor)
+    ros1.decompressors.update(bz2=by_bz2, lz4=by_lz4)
+    mcap.DECOMPRESSORS.update(lz4=by_lz4, zstd=by_zstd)
+    vars(ros2)["zstd"] = SimpleNamespace(decompress=by_zstd, open=File)
+
+
+def _bounded(unpacker: Callable[[], Any]) -> Callable[..., bytes]:
+    """Return what unpacks bytes that are whole and not too many."""
+
+    def unpack(packed: bytes, _size: int = 0) -> bytes:
+        one = unpacker()
+        found = bytes(one.decompress(packed, MAX_BYTES))
+        if not one.eof:
+            raise ValueError(f"torn, or unpacked more than {MAX_BYTES >> 20} MB")
+        return found
+
+    return unpack
+
+
+def _words(fault: Exception) -> str:
+    return f"{type(fault).__name__}: {fault}".splitlines()[0][:120]
+
+
+_Reader: TypeAlias = Callable[[bytes], ImageMessage]
+
+_INSTALL = "pip install 'aqualvs[bags]'"
+
+
+def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
+    """Open the images of an MCAP file.
+
+    Parameters
+    ----------
+    path : Path
+    topic : str or None
+        Needed where several topics have images.
+
+    Returns
+    -------
+    source : MessageSource
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or has no images.
+    OptionError
+        If the topic is missing or wrong, or a package is missing.
+    """
+    try:
+        import mcap.reader  # noqa: F401
+    except ImportError:
+        raise OptionError(f"{path}: MCAP files need a package; type {_INSTALL}") from None
+    chosen = choose_topic(str(path), _mcap_image_topics(path), topic)
+
+    def messages() -> Iterator[Logged]:
+        return _mcap_messages(path, chosen.name)
+
+    return MessageSource(f"{path}#{chosen.name}", messages, chosen.n_messages)
+
+
+def _mcap_image_topics(path: Path) -> list[Topic]:
+    with _opened_mcap(path) as stream:
+        summary = _summary(stream)
+        if summary is None:
+            return _listed(path, stream)
+        counts = summary.statistics.channel_message_counts if summary.statistics else {}
+        return [
+            Topic(channel.topic, counts.get(channel.id))
+            for channel in summary.channels.values()
+            if channel.schema_id in summary.schemas
+            and kind_of_schema(summary.schemas[channel.schema_id].name)
+        ]
+
+
+def _listed(path: Path, stream: "_Bounded") -> list[Topic]:
+    """Find the topics of a file without index by reading it to its end, or as far as it goes."""
+    found: dict[str, Topic] = {}
+    try:
+        for schema, channel, _ in _read(path, stream, None):
+            if schema is not None and kind_of_schema(schema.name):
+                found[channel.topic] = Topic(channel.topic, None)
+    except SourceError:
+        if not found:
+            raise
+    return list(found.values())
+
+
+def _mcap_messages(path: Path, topic: str) -> Iterator[Logged]:
+    readers: dict[int, _Reader] = {}
+    with _opened_mcap(path) as stream:
+        for schema, channel, message in _read(path, stream, topic):
+            if schema is None:
+                continue
+            if schema.id not in readers:
+                readers[schema.id] = _reader(path, schema, channel.message_encoding)
+            try:
+                yield message.log_time, readers[schema.id](message.data)
+            except (ValueError, struct.error, IndexError, AssertionError):
+                yield message.log_time, None
+
+
+def _read(path: Path, stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield schemas, channels and messages; says in one line where the file breaks off."""
+    summary = _summary(stream)
+    try:
+        if summary is not None and summary.chunk_indexes:
+            yield from _by_index(stream, summary, topic)
+        else:
+            yield from _by_order(stream, topic)
+    except _mcap_faults() as fault:
+        raise SourceError(
+            f"{path}: no MCAP file, damaged, or cut short ({type(fault).__name__}); "
+            "what could be read was, copy it again for the rest"
+        ) from fault
+
+
+def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[tuple[Any, ...]]:
+    """Yield what the chunks of a topic hold, in the order of their times."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Chunk, Message
+
+    wanted = {n for n, one in summary.channels.items() if topic is None or one.topic == topic}
+    for index in sorted(summary.chunk_indexes, key=lambda one: int(one.message_start_time)):
+        listed = index.message_index_offsets
+        if listed and wanted.isdisjoint(listed):
+            continue
+        stream.seek(index.chunk_start_offset + HEAD_BYTES)
+        records = _records_of(Chunk.read(ReadDataStream(cast("IO[bytes]", stream))))
+        found = [one for one in records if isinstance(one, Message) and one.channel_id in wanted]
+        for message in sorted(found, key=lambda one: int(one.log_time)):
+            channel = summary.channels[message.channel_id]
+            yield summary.schemas.get(channel.schema_id), channel, message
+
+
+def _by_order(stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield what a file without index holds, from its beginning on."""
+    from mcap.records import Channel, Chunk, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    schemas, channels = {}, {}
+    stream.seek(0)
+    for record in StreamReader(cast("IO[bytes]", stream), emit_chunks=True).records:
+        for one in _records_of(record) if isinstance(record, Chunk) else [record]:
+            if isinstance(one, Schema):
+                schemas[one.id] = one
+            elif isinstance(one, Channel):
+                channels[one.id] = one
+            elif isinstance(one, Message):
+                channel = channels[one.channel_id]
+                if topic is None or channel.topic == topic:
+                    yield schemas.get(channel.schema_id), channel, one
+
+
+def _records_of(chunk: Any) -> list[Any]:
+    """Return the records in a chunk; the package would take any amount of memory for them."""
+    from mcap.stream_reader import breakup_chunk
+
+    # Of the smallest messages, records take ten times the room that their bytes take.
+    if max(chunk.uncompressed_size, len(chunk.data)) > MAX_BYTES:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+    return list(breakup_chunk(replace(chunk, compression="", data=raw)))
+
+
+def _summary(stream: "_Bounded") -> Any:
+    """Return the summary of a file, None where it has none that can be read."""
+    from mcap.reader import SeekingReader
+
+    try:
+        stream.seek(0)
+        return SeekingReader(cast("IO[bytes]", stream)).get_summary()
+    except _mcap_faults():
+        return None
+
+
+def _mcap_faults() -> tuple[type[Exception], ...]:
+    """Return what a damaged file raises, here and in the package that reads it."""
+    from mcap.exceptions import McapError
+    from pyarrow import ArrowException
+
+    return (McapError, ArrowException, struct.error, OSError, EOFError, ValueError, LookupError)
+
+
+class _Bounded:
+    """A file of which no more is read at once than a record may hold."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, n: int = -1) -> bytes:
+        """Return the next bytes.
+
+        Raises
+        ------
+        ValueError
+            If these are too many.
+        """
+        if not 0 <= n <= MAX_RECORD_BYTES:
+            raise ValueError(f"a record of {n} bytes")
+        return self._file.read(n)
+
+
+@contextlib.contextmanager
+def _opened_mcap(path: Path) -> Iterator[_Bounded]:
+    try:
+        file = path.open("rb")
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
+    with file:
+        yield _Bounded(file)
+
+
+def _reader(path: Path, schema: Any, encoding: str) -> _Reader:
+    """Return what reads the messages of a schema."""
+    if encoding == "protobuf":
+        return image_of_protobuf(schema.name)
+    if encoding == "json":
+        return image_of_json
+    if encoding in ("cdr", "ros1"):
+        return _ros_reader(path, schema, encoding)
+    raise SourceError(f"{path}: images in encoding {encoding!r}; known: protobuf, json, cdr, ros1")
+
+
+def _ros_reader(path: Path, schema: Any, encoding: str) -> _Reader:
+    try:
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    except ImportError:
+        raise OptionError(f"{path}: ROS messages need a package; type {_INSTALL}") from None
+    name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/")
+    text = schema.data.decode("utf-8", "replace")
+    store = get_typestore(Stores.EMPTY)
+    store.register(
+        get_types_from_idl(text) if schema.encoding == "ros2idl" else get_types_from_msg(text, name)
+    )
+    decode = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+    return lambda content: image_of_ros(decode(content, name))

@@ -1,0 +1,291 @@
+"""What every source of frames offers.
+
+How well a live run goes: rates, delays, drops, lasers, links.
+
+Frames as colour pictures, for overlays and people.
+
+Luma and chroma of a decoded picture, without copying where its layout allows.
+
+Packets for a decoder, made from bytes that came some other way than through FFmpeg.
+
+What a live run needs of a source of frames.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import TracebackType
+from typing import Protocol, Self, cast
+
+import cv2
+import numpy as np
+from av.packet import Packet
+from av.video.frame import VideoFrame
+from av.video.plane import VideoPlane
+from av.video.reformatter import ColorRange
+from av.video.stream import VideoStream
+
+from aqualvs.scanning.scan import Frame, ImagePlane, Planes
+
+
+class State(StrEnum):
+    """Of a part of the system; a pilot reads it as a colour."""
+
+    OK = "ok"
+    WARN = "warn"
+    """Works, but not as it should."""
+    FAULT = "fault"
+    """Does not work; it is tried again."""
+    OFF = "off"
+    """Not in use."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartHealth:
+    """Of the stream, of one output, of one laser.
+
+    Attributes
+    ----------
+    name : str
+    state : State
+    detail : str
+        In a few words, also for a part that is well.
+    n_dropped : int
+        Samples, or frames, that it could not take.
+    """
+
+    name: str
+    state: State
+    detail: str = ""
+    n_dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class StageDelay:
+    """Delay that a stage adds, over the last seconds, in seconds."""
+
+    name: str
+    median_s: float
+    p99_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Health:
+    """Of a live run, over the last seconds.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Frames measured per second.
+    valid_share : float
+        Share of them with a posture; NaN without frames.
+    n_frames, n_dropped, n_lost : int
+        Since the start: measured; skipped because a newer one had come; not decoded.
+    delays : tuple of StageDelay
+        From the decoded frame on.
+    source : PartHealth
+    lasers, outputs : tuple of PartHealth
+    quality : float
+        Mean stripe quality on the target, 0 to 1; NaN without points.
+    n_water, sigma_n_water : float
+        Refractive index in use, and its standard deviation where it is measured on line (else NaN).
+    """
+
+    rate_hz: float = 0.0
+    valid_share: float = float("nan")
+    n_frames: int = 0
+    n_dropped: int = 0
+    n_lost: int = 0
+    delays: tuple[StageDelay, ...] = ()
+    source: PartHealth = field(default_factory=lambda: PartHealth("source", State.OFF))
+    lasers: tuple[PartHealth, ...] = ()
+    outputs: tuple[PartHealth, ...] = ()
+    quality: float = float("nan")
+    n_water: float = float("nan")
+    sigma_n_water: float = float("nan")
+
+    @property
+    def state(self) -> State:
+        """The worst state of any part in use."""
+        parts = (self.source, *self.lasers, *self.outputs)
+        order = (State.FAULT, State.WARN, State.OK)
+        return next((s for s in order if any(part.state is s for part in parts)), State.OFF)
+
+
+def bgr_of(frame: Frame) -> ImagePlane:
+    """Return a frame as a BGR picture.
+
+    Parameters
+    ----------
+    frame : Frame
+
+    Returns
+    -------
+    image : uint8 array, shape (height, width, 3)
+        A new array; grey where the frame has no chroma.
+    """
+    if frame.chroma is None:
+        return cast(ImagePlane, cv2.cvtColor(frame.luma, cv2.COLOR_GRAY2BGR))
+    height, width = frame.luma.shape
+    rows, columns = frame.chroma[0].shape
+    i420 = np.empty((3 * rows, 2 * columns), np.uint8)
+    # An odd height or width leaves a row or column of the even picture to be cut off again.
+    i420[: 2 * rows] = 0
+    i420[:height, :width] = frame.luma
+    i420[2 * rows :] = np.stack(frame.chroma).reshape(rows, 2 * columns)
+    image = cv2.cvtColor(i420, cv2.COLOR_YUV2BGR_I420)
+    return np.ascontiguousarray(image[:height, :width], dtype=np.uint8)
+
+
+_PLANAR = frozenset({"yuv420p", "yuvj420p"})
+_SEMI_PLANAR = frozenset({"nv12"})
+_GREY = frozenset({"gray"})
+_FULL_RANGE = int(ColorRange.JPEG)
+
+
+def planes_of(picture: VideoFrame) -> Planes:
+    """Return luma and chroma of a decoded picture.
+
+    Parameters
+    ----------
+    picture : VideoFrame
+        Any pixel format; 4:2:0 with 8 bits and 8-bit grey are viewed in place, others converted.
+
+    Returns
+    -------
+    luma : uint8 array, shape (height, width)
+    chroma : (uint8 array, uint8 array) or None
+        U and V, shape (ceil(height/2), ceil(width/2)); None for a grey picture.
+
+    Notes
+    -----
+    The arrays keep the decoder's buffer alive. They are read-only, because the decoder still
+    predicts later pictures from it.
+    """
+    kind = picture.format.name
+    if kind in _PLANAR:
+        y, u, v = picture.planes
+        return _view(y), (_view(u), _view(v))
+    if kind in _SEMI_PLANAR:
+        y, uv = picture.planes
+        return _view(y), (_view(uv, first=0, step=2), _view(uv, first=1, step=2))
+    if kind in _GREY:
+        return _view(picture.planes[0]), None
+    return planes_of(_as_420(picture))
+
+
+def _view(plane: VideoPlane, *, first: int = 0, step: int = 1) -> ImagePlane:
+    """Return a read-only view on every `step`-th byte of a plane's rows."""
+    strides = (plane.line_size, step)
+    shape = (plane.height, plane.width)
+    view: ImagePlane = np.ndarray(shape, np.uint8, memoryview(plane), first, strides)
+    return _read_only(view)
+
+
+def _read_only(array: ImagePlane) -> ImagePlane:
+    array.flags.writeable = False
+    return array
+
+
+def _as_420(picture: VideoFrame) -> VideoFrame:
+    """Convert to 8-bit 4:2:0 in the same range, so that luma keeps its values."""
+    full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
+    return picture.reformat(format="yuvj420p" if full else "yuv420p")
+
+
+def packet_with(data: bytes) -> "Packet[VideoStream]":
+    """Return a packet with a copy of `data`.
+
+    Decoders read a few dozen bytes beyond a packet's end and count on zeros there
+    (AV_INPUT_BUFFER_PADDING_SIZE of FFmpeg). Memory that FFmpeg allocates has them; Python's bytes
+    end where they end, so that a sound picture may be taken for damaged.
+
+    Parameters
+    ----------
+    data : bytes
+        One coded picture.
+    """
+    packet = cast("Packet[VideoStream]", Packet(len(data)))
+    packet.update(data)
+    return packet
+
+
+class Feed(Protocol):
+    """Frames as they come, from a stream that may stall, change its size, go and return.
+
+    Attributes
+    ----------
+    name : str
+        How health and messages call it.
+    """
+
+    @property
+    def name(self) -> str:
+        """How health and messages call it."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until the source ends (a file) or `close` is called (a stream).
+
+        `Frame.index` rises strictly, `Frame.time_s` never falls, also over a reconnection; a gap
+        in the index says that frames were lost. Frames may change their size.
+
+        Raises
+        ------
+        SourceError
+            If it can never work: no such file, no such camera. A stream that is merely not there
+            is tried again.
+        """
+
+    def health(self) -> PartHealth:
+        """Return how the source is; called from another thread."""
+
+    def close(self) -> None:
+        """End the iteration within a second; called from another thread."""
+
+
+class FrameSource(Protocol):
+    """Frames in the order of their time; a context manager that can be iterated once.
+
+    `Frame.index` rises strictly. A gap in it says that the frames in between existed but could
+    not be decoded. A source that ends before its promise, or whose last frames are lost, delivers
+    what it has and then raises `SourceError`.
+
+    Attributes
+    ----------
+    name : str
+        How messages call it: a path or an address.
+    size_px : (int, int)
+        Width and height, the same for every frame.
+    fps : float or None
+        Nominal frame rate; None where there is none.
+    n_frames : int or None
+        Frames that the container promises, perhaps estimated from its duration; None for a live
+        stream.
+    """
+
+    @property
+    def name(self) -> str:
+        """How messages call it."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+
+    @property
+    def fps(self) -> float | None:
+        """Nominal frame rate, if there is one."""
+
+    @property
+    def n_frames(self) -> int | None:
+        """Promised frames, if known."""
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...

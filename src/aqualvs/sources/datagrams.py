@@ -1,0 +1,324 @@
+"""UDP datagrams, taken from the system as they come.
+
+Datagrams of one kind, told by their content.
+"""
+
+import errno
+import queue
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+from aqualvs.errors import SourceError
+from aqualvs.sources.live_frames import Reception
+from aqualvs.sources.rtp import parse_rtp
+from aqualvs.sources.transport_stream import PACKET_BYTES, SYNC
+
+_BUFFER_BYTES = 4 << 20
+"""Asked of the system, which may give less: a key frame comes in one burst."""
+
+_LOOK_S = 0.2
+"""The receiver looks so often whether it shall end."""
+
+_MAX_WAITING = 20_000
+"""Datagrams kept for a reader that does not come; later ones are lost, and counted as such."""
+
+
+@dataclass(frozen=True, slots=True)
+class UdpAddress:
+    """Where to listen.
+
+    Attributes
+    ----------
+    host : str
+        An address of this machine, a multicast group, or empty for every address.
+    port : int
+        0 for any free one.
+    """
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}"
+
+
+def parse_udp(where: str) -> UdpAddress:
+    """Return where to listen, from `udp://HOST:PORT`, `rtp://HOST:PORT` and the like.
+
+    Parameters
+    ----------
+    where : str
+        Host may be missing, or written as `@` or `@HOST`; options after `?` are ignored.
+
+    Raises
+    ------
+    SourceError
+        If there is no port, or the host is no numeric address.
+    """
+    scheme = where.partition("://")[0]
+    try:
+        parts = urlsplit(where)
+        host, port = (parts.hostname or "").strip("@"), parts.port
+    except ValueError:
+        port = None
+    if port is None:
+        raise SourceError(f"{where}: no port; type {scheme}://:5600, for instance")
+    if host == "localhost":
+        host = "127.0.0.1"
+    try:
+        return UdpAddress(str(ip_address(host)) if host else "", port)
+    except ValueError:
+        raise SourceError(
+            f"{where}: listening needs a numeric address of this machine, or none; "
+            f"type {scheme}://:{port}"
+        ) from None
+
+
+class Datagram(NamedTuple):
+    """What came, and when by the monotonic clock (seconds)."""
+
+    content: bytes
+    arrival: float
+
+
+class Datagrams:
+    """Listens on a port; a thread of its own empties the system's buffer.
+
+    Parameters
+    ----------
+    address : UdpAddress
+
+    Raises
+    ------
+    OSError
+        If the system refuses: the port is taken, the address is none of this machine.
+    """
+
+    def __init__(self, address: UdpAddress) -> None:
+        self._socket = _listen(address)
+        self.port: int = self._socket.getsockname()[1]
+        self._waiting: queue.SimpleQueue[Datagram | None] = queue.SimpleQueue()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._receive, name="datagrams", daemon=True)
+        self._thread.start()
+
+    def get(self, timeout: float) -> Datagram | None:
+        """Return the oldest datagram, or None if there is none in time, or after `close`.
+
+        Parameters
+        ----------
+        timeout : float
+            Seconds.
+        """
+        try:
+            return self._waiting.get(timeout=timeout)
+        except queue.Empty:
+            return None
+
+    def forget(self) -> int:
+        """Drop what is waiting; returns how many datagrams that were."""
+        n = self._waiting.qsize()
+        for _ in range(n):
+            self.get(0.0)
+        return n
+
+    def wake(self) -> None:
+        """End a `get` that waits; called from any thread."""
+        self._waiting.put(None)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._closed.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _receive(self) -> None:
+        self._socket.settimeout(_LOOK_S)
+        while not self._closed.is_set():
+            try:
+                content = self._socket.recv(65536)
+            except TimeoutError:
+                continue
+            except OSError:  # Such as an ICMP error that Windows reports here.
+                time.sleep(0.01)
+                continue
+            if self._waiting.qsize() < _MAX_WAITING:
+                self._waiting.put(Datagram(content, time.monotonic()))
+
+
+def why_not(address: UdpAddress, fault: OSError) -> str:
+    """Say in a few words why one cannot listen.
+
+    Parameters
+    ----------
+    address : UdpAddress
+    fault : OSError
+    """
+    if fault.errno == errno.EADDRINUSE:
+        return f"port {address.port} is taken by another program, such as QGroundControl"
+    if fault.errno == errno.EADDRNOTAVAIL:
+        return (
+            f"{address.host} is no address of this machine; connect the tether, "
+            f"or listen on all with udp://:{address.port}"
+        )
+    return f"cannot listen on {address} ({fault.strerror})"
+
+
+def _listen(address: UdpAddress) -> socket.socket:
+    host = ip_address(address.host) if address.host else None
+    family = socket.AF_INET6 if isinstance(host, IPv6Address) else socket.AF_INET
+    made = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        if host is not None and host.is_multicast:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            made.bind(("", address.port))
+            _join(made, address.host, is_v6=family == socket.AF_INET6)
+        else:
+            made.bind((address.host, address.port))
+    except BaseException:
+        made.close()
+        raise
+    return made
+
+
+def _join(made: socket.socket, group: str, *, is_v6: bool) -> None:
+    if is_v6:
+        request = socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0)
+        made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, request)
+    else:
+        request = struct.pack("4s4s", socket.inet_aton(group), socket.inet_aton("0.0.0.0"))
+        made.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
+
+
+RTP, TS, BARE = "RTP H.264", "MPEG-TS", "bare H.264"
+"""Kinds of content, in the words of health."""
+
+_TS_IN_RTP = 33
+
+WAIT_S = 0.2
+"""A wait for datagrams is no longer, so that an end is noticed."""
+
+MAX_FOREIGN = 5
+"""So many datagrams in a row of another kind: the sender sends something else now."""
+
+_MAX_LAG_S = 2.0
+"""What waits longer for decoding is dropped: this machine does not keep up."""
+
+
+def kind_of(datagram: bytes) -> str | None:
+    """Return what a datagram holds, or None if that is none of the kinds known here.
+
+    Parameters
+    ----------
+    datagram : bytes
+
+    Returns
+    -------
+    kind : str or None
+        "RTP H.264", "MPEG-TS" or "bare H.264".
+    """
+    if transport_content(datagram) is not None:
+        return TS
+    if datagram.startswith((b"\x00\x00\x01", b"\x00\x00\x00\x01")):
+        return BARE
+    packet = parse_rtp(datagram)
+    return None if packet is None or packet.payload_type < 96 else RTP
+
+
+def transport_content(datagram: bytes) -> bytes | None:
+    """Return the MPEG-TS packets in a datagram, bare or in RTP (RFC 2250), or None.
+
+    Parameters
+    ----------
+    datagram : bytes
+    """
+    if datagram[:1] != bytes([SYNC]):
+        packet = parse_rtp(datagram)
+        if packet is None or packet.payload_type != _TS_IN_RTP:
+            return None
+        datagram = packet.payload
+    whole = len(datagram) % PACKET_BYTES == 0
+    return datagram if whole and set(datagram[::PACKET_BYTES]) == {SYNC} else None
+
+
+class Inbox:
+    """Datagrams of one kind, until something else comes.
+
+    Parameters
+    ----------
+    datagrams : Datagrams
+    closed : Event
+        Set when the feed ends.
+    reception : Reception
+        Told of what cannot be used.
+    """
+
+    def __init__(self, datagrams: Datagrams, closed: threading.Event, reception: Reception) -> None:
+        self.reception = reception
+        self._datagrams = datagrams
+        self._closed = closed
+        self._peeked: Datagram | None = None
+        self._n_foreign = 0
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the feed ends."""
+        return self._closed.is_set()
+
+    def peek_kind(self) -> str | None:
+        """Look at the next datagram; None if none comes, or one of no known kind."""
+        datagram = self._datagrams.get(WAIT_S)
+        if datagram is None:
+            return None
+        kind = kind_of(datagram.content)
+        if kind is None:
+            self.reception.complain("something comes, but neither RTP H.264 nor MPEG-TS nor H.264")
+        self._peeked = None if kind is None else datagram
+        return kind
+
+    def get(self, timeout: float = WAIT_S) -> Datagram | None:
+        """Return the next datagram, or None if none comes in time.
+
+        Parameters
+        ----------
+        timeout : float
+            Seconds.
+        """
+        peeked, self._peeked = self._peeked, None
+        return peeked or self._datagrams.get(timeout)
+
+    def is_late(self, datagram: Datagram) -> bool:
+        """Return whether decoding lags too far behind; what waits is then dropped.
+
+        Parameters
+        ----------
+        datagram : Datagram
+            The oldest.
+        """
+        if time.monotonic() - datagram.arrival < _MAX_LAG_S:
+            return False
+        self._datagrams.forget()
+        return True
+
+    def is_foreign(self, datagram: Datagram, *, fits: bool) -> bool:
+        """Return whether the sender has changed to another kind.
+
+        Parameters
+        ----------
+        datagram : Datagram
+        fits : bool
+            Whether it is of the kind that is being read.
+        """
+        self._n_foreign = 0 if fits else self._n_foreign + 1
+        if self._n_foreign < MAX_FOREIGN:
+            return False
+        self._n_foreign = 0
+        return kind_of(datagram.content) is not None

@@ -1,0 +1,333 @@
+"""Images as ROS and Foxglove messages carry them.
+
+From the messages of ROS and Foxglove to images.
+"""
+
+import base64
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.scanning.scan import ImagePlane, Planes, planes_of_image
+from aqualvs.sources.images import quiet_decoders
+
+VIDEO_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
+"""FFmpeg's names of the codecs of `CompressedVideo`."""
+
+_GREY = frozenset({"mono8", "8uc1"})
+_GREY_16 = frozenset({"mono16", "16uc1"})
+_TO_BGR = {
+    "bgr8": (3, None),
+    "8uc3": (3, None),
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "8uc4": (4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2BGR),
+}
+"""Channels and OpenCV's conversion; OpenCV names Bayer patterns by their second row."""
+
+_PACKED_422 = {"yuv422_yuy2": 0, "yuyv": 0, "yuv422": 1, "uyvy": 1}
+"""Where luma begins among the bytes of two pixels; ROS's `yuv422` is UYVY."""
+
+ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageMessage:
+    """One picture, or one packet of a video.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of the picture, nanoseconds; 0 if the message tells none.
+    encoding : str
+        Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
+    data : bytes
+    size_px : (int, int) or None
+        Width and height of a picture that is not compressed.
+    step : int
+        Bytes from row to row.
+    is_big_endian : bool
+        Byte order of pixels of 16 bits.
+    """
+
+    stamp_ns: int
+    encoding: str
+    data: bytes
+    size_px: tuple[int, int] | None = None
+    step: int = 0
+    is_big_endian: bool = False
+
+    @property
+    def codec(self) -> str | None:
+        """FFmpeg's name of the codec, if the message is a packet of a video."""
+        return None if self.size_px else VIDEO_CODECS.get(self.encoding.lower())
+
+
+def planes_of_message(message: ImageMessage) -> Planes | None:
+    """Return luma and chroma of a picture, or None if it cannot be decoded.
+
+    Parameters
+    ----------
+    message : ImageMessage
+        Not of a video.
+
+    Returns
+    -------
+    luma, chroma
+        As `planes_of_image`; luma and chroma of a packed 4:2:2 picture keep their values.
+    """
+    if message.size_px is None:
+        return _decompressed(message.data)
+    name = message.encoding.lower()
+    if name in _GREY:
+        rows = _rows(message, 1)
+        return None if rows is None else planes_of_image(rows[..., 0].copy())
+    if name in _GREY_16:
+        return _high_bytes(message)
+    if name in _PACKED_422:
+        return _packed(message, _PACKED_422[name])
+    n_channels, conversion = _TO_BGR.get(name, (0, None))
+    rows = _rows(message, n_channels) if n_channels else None
+    if rows is None:
+        return None
+    image = np.ascontiguousarray(rows)
+    if conversion is not None:
+        image = cast("NDArray[np.uint8]", cv2.cvtColor(image, conversion))
+    return planes_of_image(image)
+
+
+def _decompressed(data: bytes) -> Planes | None:
+    try:
+        with quiet_decoders():
+            pixels = np.frombuffer(data, np.uint8)
+            image = cv2.imdecode(pixels, cv2.IMREAD_ANYCOLOR) if data else None
+    except cv2.error:
+        image = None
+    return None if image is None else planes_of_image(cast("ImagePlane", image))
+
+
+def _rows(message: ImageMessage, n_bytes: int) -> NDArray[np.uint8] | None:
+    """Return the pixels as (height, width, n_bytes), or None if there are too few."""
+    width, height = message.size_px or (0, 0)
+    step = message.step or width * n_bytes
+    # The last row may come without its padding.
+    if width <= 0 or height <= 0 or step < width * n_bytes:
+        return None
+    if len(message.data) < step * (height - 1) + width * n_bytes:
+        return None
+    flat = np.frombuffer(message.data, np.uint8)
+    return np.lib.stride_tricks.as_strided(
+        flat, (height, width, n_bytes), (step, n_bytes, 1), writeable=False
+    )
+
+
+def _high_bytes(message: ImageMessage) -> Planes | None:
+    rows = _rows(message, 2)
+    if rows is None:
+        return None
+    return planes_of_image(rows[..., 0 if message.is_big_endian else 1].copy())
+
+
+def _packed(message: ImageMessage, first: int) -> Planes | None:
+    """Take 4:2:2 apart; chroma of two rows is averaged."""
+    pixels = _rows(message, 2)
+    if pixels is None or pixels.shape[0] % 2 or pixels.shape[1] % 2:
+        return None
+    luma = np.ascontiguousarray(pixels[..., first])
+    both = pixels[..., 1 - first].astype(np.uint16)
+    mean = ((both[0::2] + both[1::2] + 1) >> 1).astype(np.uint8)
+    chroma = np.ascontiguousarray(mean[:, 0::2]), np.ascontiguousarray(mean[:, 1::2])
+    for plane in (luma, *chroma):
+        plane.flags.writeable = False
+    return luma, chroma
+
+
+_KINDS = {
+    "sensor_msgs/Image": "Image",
+    "sensor_msgs/CompressedImage": "CompressedImage",
+    "foxglove.RawImage": "RawImage",
+    "foxglove.CompressedImage": "CompressedImage",
+    "foxglove.CompressedVideo": "CompressedImage",
+    "foxglove_msgs/RawImage": "RawImage",
+    "foxglove_msgs/CompressedImage": "CompressedImage",
+    "foxglove_msgs/CompressedVideo": "CompressedImage",
+}
+"""Foxglove's compressed video and its compressed image have the same fields."""
+
+_TIME, _FORMAT = 1, {"foxglove.CompressedImage": 3, "foxglove.CompressedVideo": 4}
+_DATA = {"foxglove.CompressedImage": 2, "foxglove.CompressedVideo": 3}
+"""Field numbers in Foxglove's Protobuf schemas."""
+
+
+def kind_of_schema(name: str) -> str | None:
+    """Return what kind of image a schema holds, or None.
+
+    Parameters
+    ----------
+    name : str
+        `sensor_msgs/msg/Image`, `foxglove.CompressedVideo` and the like.
+
+    Returns
+    -------
+    kind : str or None
+        "Image", "RawImage" or "CompressedImage".
+    """
+    return _KINDS.get(name.replace("/msg/", "/"))
+
+
+def image_of_ros(message: Any) -> ImageMessage:
+    """Return the image in a decoded ROS message of any kind known here.
+
+    Parameters
+    ----------
+    message : object
+        With the fields of `sensor_msgs` or `foxglove_msgs` as attributes.
+    """
+    stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
+    stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    data = bytes(message.data)
+    if hasattr(message, "format"):
+        return ImageMessage(stamp_ns=stamp_ns, encoding=_still(message.format), data=data)
+    return ImageMessage(
+        stamp_ns=stamp_ns,
+        encoding=str(message.encoding),
+        data=data,
+        size_px=(int(message.width), int(message.height)),
+        step=int(message.step),
+        is_big_endian=bool(getattr(message, "is_bigendian", False)),
+    )
+
+
+def image_of_json(content: bytes) -> ImageMessage:
+    """Return the image in a Foxglove message written as JSON.
+
+    Parameters
+    ----------
+    content : bytes
+
+    Raises
+    ------
+    ValueError
+        If fields are missing or wrong.
+    """
+    try:
+        found = json.loads(content)
+    except RecursionError as fault:
+        raise ValueError("nested too deeply") from fault
+    try:
+        stamp = found["timestamp"]
+        stamp_ns = int(stamp["sec"]) * 1_000_000_000 + int(stamp.get("nsec", 0))
+        data = base64.b64decode(found["data"])
+        if "format" in found:
+            return ImageMessage(stamp_ns=stamp_ns, encoding=_still(found["format"]), data=data)
+        return ImageMessage(
+            stamp_ns=stamp_ns,
+            encoding=found["encoding"],
+            data=data,
+            size_px=(int(found["width"]), int(found["height"])),
+            step=int(found.get("step", 0)),
+        )
+    except (KeyError, TypeError, AttributeError) as fault:
+        raise ValueError(f"no image: {fault}") from fault
+
+
+def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
+    """Return what reads a Foxglove message written as Protobuf.
+
+    Parameters
+    ----------
+    schema : str
+        `foxglove.RawImage`, `foxglove.CompressedImage` or `foxglove.CompressedVideo`.
+    """
+
+    def read(content: bytes) -> ImageMessage:
+        fields = protobuf_fields(content)
+        stamp_ns = _protobuf_time(_bytes(fields.get(_TIME, b"")))
+        if schema == "foxglove.RawImage":
+            return ImageMessage(
+                stamp_ns=stamp_ns,
+                encoding=_bytes(fields.get(4, b"")).decode("utf-8", "replace"),
+                data=_bytes(fields.get(6, b"")),
+                size_px=(_int(fields.get(2, 0)), _int(fields.get(3, 0))),
+                step=_int(fields.get(5, 0)),
+            )
+        encoding = _bytes(fields.get(_FORMAT[schema], b"")).decode("utf-8", "replace")
+        data = _bytes(fields.get(_DATA[schema], b""))
+        return ImageMessage(stamp_ns=stamp_ns, encoding=_still(encoding), data=data)
+
+    return read
+
+
+def protobuf_fields(content: bytes) -> dict[int, int | bytes]:
+    """Return the last value of each field of a Protobuf message, by its number.
+
+    Parameters
+    ----------
+    content : bytes
+
+    Raises
+    ------
+    ValueError
+        If the message is cut short or uses groups.
+    """
+    fields: dict[int, int | bytes] = {}
+    at = 0
+    while at < len(content):
+        key, at = _varint(content, at)
+        wire = key & 7
+        if wire == 0:
+            fields[key >> 3], at = _varint(content, at)
+            continue
+        if wire == 2:
+            size, at = _varint(content, at)
+        elif wire in (1, 5):
+            size = 8 if wire == 1 else 4
+        else:
+            raise ValueError(f"wire type {wire}")
+        piece = content[at : at + size]
+        if len(piece) < size:
+            raise ValueError("cut short")
+        fields[key >> 3] = piece if wire == 2 else int.from_bytes(piece, "little")
+        at += size
+    return fields
+
+
+def _varint(content: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for i in range(10):
+        if at + i >= len(content):
+            break
+        byte = content[at + i]
+        value |= (byte & 0x7F) << (7 * i)
+        if byte < 0x80:
+            return value, at + i + 1
+    raise ValueError("cut short")
+
+
+def _protobuf_time(content: bytes) -> int:
+    fields = protobuf_fields(content)
+    return _int(fields.get(1, 0)) * 1_000_000_000 + _int(fields.get(2, 0))
+
+
+def _int(value: int | bytes) -> int:
+    return value if isinstance(value, int) else 0
+
+
+def _bytes(value: int | bytes) -> bytes:
+    return value if isinstance(value, bytes) else b""
+
+
+def _still(text: str) -> str:
+    """Return the file format of a compressed image: ROS writes `bgr8; jpeg compressed bgr8`."""
+    words = text.replace(";", " ").split()
+    return next((w for w in words if w in ("jpeg", "jpg", "png", "tiff")), text.strip())

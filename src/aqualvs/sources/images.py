@@ -1,0 +1,164 @@
+"""Frames from a folder or a list of images.
+
+Decoders of pictures that print what they think of a file: libpng, libjpeg, libtiff.
+"""
+
+import contextlib
+import os
+import re
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import cast
+
+import cv2
+
+from aqualvs.closing import Closing
+from aqualvs.errors import SourceError
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
+
+_lock = threading.Lock()
+_n_inside = 0
+_before: tuple[int, int] = (-1, 0)
+
+
+@contextlib.contextmanager
+def quiet_decoders() -> Iterator[None]:
+    """Lead nowhere what OpenCV and the libraries below it print to standard error.
+
+    They know nothing of Python's streams, so the file of the process itself is replaced meanwhile,
+    for all of its threads.
+    """
+    global _n_inside, _before
+    with _lock:
+        if _n_inside == 0:
+            level = cv2.utils.logging.setLogLevel(0)
+            _before = _lead_nowhere(), level
+        _n_inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _n_inside -= 1
+            if _n_inside == 0:
+                kept, level = _before
+                cv2.utils.logging.setLogLevel(level)
+                if kept >= 0:
+                    os.dup2(kept, 2)
+                    os.close(kept)
+
+
+def _lead_nowhere() -> int:
+    """Lead standard error nowhere; return a copy of what it was, -1 where it is closed."""
+    try:
+        kept = os.dup(2)
+    except OSError:
+        return -1
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    return kept
+
+
+IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+
+
+class ImageSource(Closing):
+    """Images as frames, in natural order of their names (`img2` before `img10`).
+
+    Parameters
+    ----------
+    paths : Path or sequence of Path
+        A folder, or the images themselves (taken in the order given).
+    fps : float
+        Images have no clock: `Frame.time_s` is the index divided by this.
+
+    Raises
+    ------
+    SourceError
+        If there is no image, or the first one cannot be read.
+    """
+
+    def __init__(self, paths: Path | Sequence[Path], *, fps: float = 1.0) -> None:
+        self.name = str(paths) if isinstance(paths, Path) else f"{len(paths)} images"
+        self.fps = fps
+        self._paths = images_in(paths) if isinstance(paths, Path) else list(paths)
+        if not self._paths:
+            raise SourceError(f"{self.name}: no images; name at least one")
+        first = read_image(self._paths[0])
+        if first is None:
+            raise SourceError(
+                f"{self._paths[0]}: not a readable image, or too large; remove or replace it"
+            )
+        self.size_px = (first.shape[1], first.shape[0])
+        self.n_frames = len(self._paths)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the readable images; unreadable ones leave a gap in the index."""
+        last = -1
+        for index, path in enumerate(self._paths):
+            image = read_image(path)
+            if image is None:
+                continue
+            self._check_size(path, image)
+            luma, chroma = planes_of_image(image)
+            yield Frame(index, index / self.fps, luma, chroma)
+            last = index
+        if last + 1 < self.n_frames:
+            raise SourceError(
+                f"{self._paths[-1]}: not a readable image, or too large; remove or replace it"
+            )
+
+    def _check_size(self, path: Path, image: ImagePlane) -> None:
+        size = (image.shape[1], image.shape[0])
+        if size != self.size_px:
+            raise SourceError(
+                f"{path}: {size[0]}x{size[1]} px, but the first image has "
+                f"{self.size_px[0]}x{self.size_px[1]} px; keep one size a folder"
+            )
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the images in a folder, sorted naturally.
+
+    Raises
+    ------
+    SourceError
+        If the folder holds none, or cannot be listed.
+    """
+    try:
+        found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    except OSError as fault:
+        raise SourceError(f"{folder}: cannot be listed ({fault.strerror})") from fault
+    if not found:
+        kinds = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise SourceError(f"{folder}: no images in this folder; looked for {kinds}")
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key in which runs of digits count by value."""
+    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", path.name)]
+
+
+def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
+    """Return an image, or None if it cannot be decoded.
+
+    Parameters
+    ----------
+    path : Path
+    how : int
+        OpenCV's flag; the default returns grey images as grey.
+
+    Returns
+    -------
+    image : array or None
+        None for pipes and devices too, and for images of more pixels than OpenCV is told to take
+        (`aqualvs/__init__.py`).
+    """
+    try:
+        with quiet_decoders():
+            image = cv2.imread(str(path), how) if path.is_file() else None
+    except cv2.error:
+        return None
+    return cast("ImagePlane | None", image)

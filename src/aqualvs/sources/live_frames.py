@@ -1,0 +1,496 @@
+"""From the packets of a stream to numbered, timed frames.
+
+Time since the start of a stream, from the stream's own clock.
+
+How a stream is received, for the pilot.
+
+A decoder that delivers sound pictures only, without delay.
+"""
+
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+
+import av
+from av.codec.context import Flags
+from av.packet import Packet
+from av.video.codeccontext import VideoCodecContext
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources.base import PartHealth, State, planes_of
+from aqualvs.sources.h264 import FrameNumbers
+from aqualvs.sources.video import Ledger
+
+_DISAGREE_S = 5.0
+"""Stream and arrival differ by less while the sender's clock runs on: buffers hold no more."""
+
+
+class Unwrapper:
+    """Continues a counter of fixed width past its end.
+
+    Parameters
+    ----------
+    bits : int
+        Width of the counter: 32 for the time in RTP, 33 for that in MPEG-TS.
+    """
+
+    def __init__(self, bits: int) -> None:
+        self._span = 1 << bits
+        self._last: int | None = None
+
+    def __call__(self, value: int) -> int:
+        """Return the value on an endless line, nearest to the one before.
+
+        Parameters
+        ----------
+        value : int
+            As received; may lie a little before the last one.
+
+        Returns
+        -------
+        continued : int
+        """
+        if self._last is None:
+            self._last = value
+        else:
+            half = self._span // 2
+            self._last += (value - self._last + half) % self._span - half
+        return self._last
+
+
+class StreamClock:
+    """Time since the first picture, which never falls, also over a sender that starts anew.
+
+    A sender that starts anew counts from any number. Where its time disagrees with the time of
+    arrival by more than 5 s, or falls, the stream goes on as long after the last picture as the
+    new one arrived after it.
+
+    Parameters
+    ----------
+    tick : float
+        Length of a tick in seconds; positive.
+    """
+
+    def __init__(self, tick: float) -> None:
+        self._tick = tick
+        self._anchor = 0.0
+        self._anchor_ticks: int | None = None
+        self._last = 0.0
+        self._last_arrival: float | None = None
+
+    def set_tick(self, tick: float) -> None:
+        """Go on with ticks of another length, after a new connection.
+
+        Parameters
+        ----------
+        tick : float
+            Seconds; positive.
+        """
+        self._tick = tick
+        self._anchor_ticks = None
+
+    def time_of(self, ticks: int | None, arrival: float) -> float:
+        """Return the time of a picture.
+
+        Parameters
+        ----------
+        ticks : int or None
+            By the stream's clock; None where it has none, then the arrival counts.
+        arrival : float
+            Seconds on this machine's monotonic clock.
+
+        Returns
+        -------
+        time : float
+            Seconds since the first picture asked for.
+        """
+        passed = 0.0 if self._last_arrival is None else max(0.0, arrival - self._last_arrival)
+        expected = self._last + passed
+        time = self._from_ticks(ticks, expected)
+        if time < self._last or abs(time - expected) > _DISAGREE_S:
+            self._anchor, self._anchor_ticks = expected, ticks
+            time = expected
+        self._last, self._last_arrival = time, arrival
+        return time
+
+    def _from_ticks(self, ticks: int | None, expected: float) -> float:
+        if ticks is None:
+            return expected
+        if self._anchor_ticks is None:
+            self._anchor, self._anchor_ticks = expected, ticks
+        return self._anchor + (ticks - self._anchor_ticks) * self._tick
+
+
+_WINDOW_S = 5.0
+"""Rates and losses are told for so long."""
+
+_SILENT_S = 0.5
+"""Longer silence is a fault."""
+
+
+class Reception:
+    """What arrived and when; written by the source, read from another thread.
+
+    Parameters
+    ----------
+    name : str
+        Of the part.
+    content : str
+        What arrives, such as "RTP H.264"; may be set later.
+    """
+
+    def __init__(self, name: str, content: str = "") -> None:
+        self.name = name
+        self._lock = threading.Lock()
+        self._content = content
+        self._trouble = ""
+        self._size = (0, 0)
+        self._began = time.monotonic()
+        self._heard: float | None = None
+        self._frames: deque[float] = deque()
+        self._losses: deque[tuple[float, int]] = deque()
+        self._last_frame: float | None = None
+        self._n_lost = 0
+        self._n_held = 0
+        self._over = ""
+
+    def hear(self, content: str = "") -> None:
+        """Note that something came; ends a trouble.
+
+        Parameters
+        ----------
+        content : str
+            What it is; empty if that is known.
+        """
+        with self._lock:
+            self._heard = time.monotonic()
+            self._content = content or self._content
+            self._trouble = ""
+
+    def complain(self, words: str) -> None:
+        """Note why nothing of use comes, until something does.
+
+        Parameters
+        ----------
+        words : str
+            Empty if the reason is gone.
+        """
+        with self._lock:
+            self._trouble = words
+
+    def deliver(self, size_px: tuple[int, int], n_lost: int) -> None:
+        """Note a frame that goes out.
+
+        Parameters
+        ----------
+        size_px : (int, int)
+            Width and height.
+        n_lost : int
+            Frames lost before it.
+        """
+        now = time.monotonic()
+        with self._lock:
+            self._size = size_px
+            self._frames.append(now)
+            self._last_frame = now
+            self._n_held = 0
+            if n_lost:
+                self._losses.append((now, n_lost))
+                self._n_lost += n_lost
+            self._forget(now)
+
+    def hold(self, n: int) -> None:
+        """Note how many pictures are not delivered, since the last one that was, after a loss.
+
+        Parameters
+        ----------
+        n : int
+        """
+        with self._lock:
+            self._n_held = n
+
+    def end(self, words: str) -> None:
+        """Note that nothing more will come.
+
+        Parameters
+        ----------
+        words : str
+        """
+        with self._lock:
+            self._over = words
+
+    def health(self) -> PartHealth:
+        """Return the state in words."""
+        now = time.monotonic()
+        with self._lock:
+            self._forget(now)
+            state, words = self._state(now)
+            return PartHealth(self.name, state, words, self._n_lost + self._n_held)
+
+    def _forget(self, now: float) -> None:
+        while self._frames and self._frames[0] < now - _WINDOW_S:
+            self._frames.popleft()
+        while self._losses and self._losses[0][0] < now - _WINDOW_S:
+            self._losses.popleft()
+
+    def _state(self, now: float) -> tuple[State, str]:
+        if self._over:
+            return State.OFF, self._over
+        if self._trouble:
+            return State.FAULT, self._trouble
+        if self._heard is None:
+            return State.FAULT, f"waiting for the stream for {now - self._began:.0f} s"
+        if now - self._heard > self._patience():
+            return State.FAULT, f"silent for {now - self._heard:.1f} s; waiting for its return"
+        since = self._began if self._last_frame is None else self._last_frame
+        if now - since > self._patience():
+            why = "damaged or lost packets, no sound picture" if self._n_held else "no key frame"
+            return State.FAULT, f"{self._content}: {why} for {now - since:.1f} s"
+        return self._running()
+
+    def _running(self) -> tuple[State, str]:
+        span = self._frames[-1] - self._frames[0] if self._frames else 0.0
+        rate = (len(self._frames) - 1) / max(span, 1.0)
+        words = f"{self._content} {self._size[0]}x{self._size[1]} px, {rate:.1f} frames/s"
+        n_lost = sum(n for _, n in self._losses)
+        if not n_lost:
+            return State.OK, words.strip()
+        share = 100 * n_lost / (n_lost + len(self._frames))
+        return State.WARN, f"{words}, {share:.1f} % lost".strip()
+
+    def _patience(self) -> float:
+        """Return the silence that is no fault: longer for a stream of few frames."""
+        if len(self._frames) < 2:
+            return max(_SILENT_S, 2.0 if self._last_frame is None else 0.0)
+        return max(_SILENT_S, 3 * (self._frames[-1] - self._frames[0]) / (len(self._frames) - 1))
+
+
+_KNOWS_SOUND = frozenset({"h264", "hevc"})
+"""Decoders of FFmpeg that, once emptied, deliver nothing before a picture that needs no other, or
+before the end of a gradual refresh."""
+
+
+class LiveDecoder:
+    """Decodes the pictures of a stream; after damage it waits for pictures free of it.
+
+    Parameters
+    ----------
+    codec : VideoCodecContext
+        Not yet opened; taken over.
+    hears_losses : bool
+        Whether the caller learns of every loss from the transport. If not, the numbers of H.264's
+        pictures are watched.
+
+    Attributes
+    ----------
+    is_waiting : bool
+        Since damage no sound picture has come.
+
+    Notes
+    -----
+    A picture predicted from a lost or damaged one looks sound and is not: stripes stand where they
+    stood before. So after each loss, and after each picture that FFmpeg had to patch up, nothing
+    is delivered until a key frame, or a completed gradual refresh, which are decoded exactly.
+
+    One thread, because threads that work on several pictures delay each by their number less one;
+    threads that share a picture leave patched pictures unmarked. And because packets made from
+    Python's bytes deadlock when a decoder with threads is closed (PyAV 18).
+    """
+
+    def __init__(self, codec: VideoCodecContext, *, hears_losses: bool) -> None:
+        self.is_waiting = False
+        self._codec = codec
+        codec.thread_count = 1
+        codec.flags |= int(Flags.low_delay)
+        self._numbers = FrameNumbers() if codec.name == "h264" and not hears_losses else None
+        if self._numbers is not None and codec.extradata:
+            self._learn(codec.extradata)
+        self._waits_for_key = codec.name not in _KNOWS_SOUND
+
+    def _learn(self, extradata: bytes) -> None:
+        """Read the parameter sets; units with lengths instead of start codes are left unread."""
+        if extradata.startswith(b"\x01") or self._numbers is None:
+            self._numbers = None
+        else:
+            self._numbers.is_gap_before(extradata)
+
+    def distrust(self) -> None:
+        """Wait for a picture that needs no other: something was lost."""
+        self.is_waiting = True
+        self._codec.flush_buffers()
+        self._waits_for_key = self._codec.name not in _KNOWS_SOUND
+        if self._numbers is not None:
+            self._numbers.restart()
+
+    def decode(self, packet: "Packet[VideoStream]") -> list[VideoFrame]:
+        """Return the sound pictures that a packet completes.
+
+        Parameters
+        ----------
+        packet : Packet
+            A whole picture.
+
+        Returns
+        -------
+        pictures : list of VideoFrame
+            In order of presentation; empty while waiting.
+        """
+        if packet.is_corrupt:
+            self.distrust()
+            return []
+        if self._numbers is not None and self._numbers.is_gap_before(bytes(packet)):
+            self.distrust()
+        try:
+            pictures = self._codec.decode(packet)
+        except (av.error.FFmpegError, ValueError):
+            self.distrust()
+            return []
+        return self._sound(pictures)
+
+    def _sound(self, pictures: list[VideoFrame]) -> list[VideoFrame]:
+        sound = []
+        for picture in pictures:
+            if picture.is_corrupt:
+                self.distrust()
+                continue
+            self._waits_for_key = self._waits_for_key and not picture.key_frame
+            if not self._waits_for_key:
+                self.is_waiting = False
+                sound.append(picture)
+        return sound
+
+
+class LiveFrames:
+    """Decodes a stream, over reconnections: numbers rise, time never falls.
+
+    Parameters
+    ----------
+    reception : Reception
+        Told of every frame.
+    """
+
+    def __init__(self, reception: Reception) -> None:
+        self._reception = reception
+        self._ledger = Ledger(counts_packets=True)
+        self._clock = StreamClock(1.0)
+        self._decoder: LiveDecoder | None = None
+        self._spacing = _Spacing()
+        self._first: int | None = None
+        self._last_index = -1
+        self._last_time = 0.0
+        self._lossy = False
+        self._n_held = 0
+
+    def connect(self, codec: VideoCodecContext, tick: float, *, hears_losses: bool) -> None:
+        """Begin with a new decoder; what the old one held is lost.
+
+        Parameters
+        ----------
+        codec : VideoCodecContext
+            Not yet opened.
+        tick : float
+            Unit of the packets' time, in seconds.
+        hears_losses : bool
+            As for `LiveDecoder`.
+        """
+        self._decoder = LiveDecoder(codec, hears_losses=hears_losses)
+        self._ledger.restart()
+        self._lossy = False
+        self._clock.set_tick(tick)
+
+    def restart(self) -> None:
+        """Go on with a sender that has begun anew, on the same decoder."""
+        self.lose()
+        self._ledger.restart()
+        self._lossy = False
+
+    def lose(self) -> None:
+        """Note that packets were lost: wait for sound pictures."""
+        self._lossy = True
+        if self._decoder is not None:
+            self._decoder.distrust()
+
+    def announce(self, packet: "Packet[VideoStream]") -> None:
+        """Count a picture that is too damaged to be decoded.
+
+        Parameters
+        ----------
+        packet : Packet
+        """
+        self._ledger.expect(packet)
+        self._hold()
+
+    def feed(self, packet: "Packet[VideoStream]") -> Iterator[Frame]:
+        """Yield the frames that a packet completes.
+
+        Parameters
+        ----------
+        packet : Packet
+            A whole picture; `pts` in ticks, None where the stream has no clock.
+
+        Yields
+        ------
+        frame : Frame
+        """
+        if self._decoder is None or packet.size == 0:
+            return
+        self._ledger.expect(packet)
+        arrival = time.monotonic()
+        pictures = self._decoder.decode(packet)
+        if self._decoder.is_waiting:
+            self._lossy = True
+            self._hold()
+        for picture in pictures:
+            yield self._frame(picture, arrival)
+
+    def _hold(self) -> None:
+        self._n_held += 1
+        self._reception.hold(self._n_held)
+
+    def _frame(self, picture: VideoFrame, arrival: float) -> Frame:
+        at = self._clock.time_of(picture.pts, arrival)
+        index = self._number(picture, at)
+        n_lost = index - self._last_index - 1
+        self._last_index, self._last_time = index, at
+        self._lossy, self._n_held = False, 0
+        luma, chroma = planes_of(picture)
+        self._reception.deliver((picture.width, picture.height), n_lost)
+        return Frame(index, at, luma, chroma)
+
+    def _number(self, picture: VideoFrame, at: float) -> int:
+        """Return the picture's number; after a loss the time tells how many are missing."""
+        number = self._ledger.number(picture.pts)
+        if self._first is None:
+            self._first = number  # What came before was joined too late, not lost.
+        index = number - self._first
+        if self._last_index < 0:
+            return index
+        step, passed = index - self._last_index, at - self._last_time
+        if not self._lossy:
+            if step == 1:
+                self._spacing.learn(passed)
+            return index
+        missing = max(0, self._spacing.count(passed) - step)
+        self._ledger.skip(missing)
+        return index + missing
+
+
+class _Spacing:
+    """Learns the time between pictures."""
+
+    def __init__(self) -> None:
+        self._seen: deque[float] = deque(maxlen=15)
+
+    def learn(self, passed: float) -> None:
+        if passed > 0:
+            self._seen.append(passed)
+
+    def count(self, passed: float) -> int:
+        """Return how many pictures fit into a time; 0 if the spacing is unknown."""
+        if not self._seen:
+            return 0
+        return round(passed / statistics.median(self._seen))

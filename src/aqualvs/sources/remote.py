@@ -1,0 +1,303 @@
+"""Live video that FFmpeg receives: RTSP, SRT, HTTP, TCP, cameras of this machine.
+
+A connection that FFmpeg holds, read by a thread of its own.
+
+A camera of this machine, by Video4Linux.
+"""
+
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import av
+from av.container import InputContainer
+from av.packet import Packet
+from av.video.stream import VideoStream
+
+from aqualvs.errors import SourceError
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources.base import PartHealth
+from aqualvs.sources.live_frames import LiveFrames, Reception
+
+VideoPacket: TypeAlias = "Packet[VideoStream]"
+Opener: TypeAlias = Callable[[], InputContainer]
+
+_MAX_WAITING = 250
+"""Packets kept for a decoder that does not come; then the connection is given up."""
+
+
+class Connection:
+    """Opens a container and reads its first video in the background.
+
+    FFmpeg waits without end where a network is silent, and can't be woken. So nobody waits for
+    this thread: it ends by itself when FFmpeg's time runs out, and closes what it opened.
+
+    Parameters
+    ----------
+    opener : callable
+        Returns an open container, or raises what PyAV raises; its timeouts must be set.
+
+    Attributes
+    ----------
+    reason : str
+        Why the connection ended, in a few words; empty for a plain end.
+    fault : Exception or None
+        What PyAV raised when opening.
+    """
+
+    def __init__(self, opener: Opener) -> None:
+        self.reason = ""
+        self.fault: Exception | None = None
+        self._opener = opener
+        self._abandoned = threading.Event()
+        self._packets: queue.SimpleQueue[VideoPacket | None] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name="connection", daemon=True).start()
+
+    def get(self) -> "VideoPacket | None":
+        """Return the next packet, or None when the connection has ended or is abandoned."""
+        return self._packets.get()
+
+    def abandon(self) -> None:
+        """Let the thread end; a `get` that waits returns."""
+        self._abandoned.set()
+        self._packets.put(None)
+
+    def _run(self) -> None:
+        try:
+            with self._opener() as container:
+                self._read(container)
+        except Exception as fault:
+            # Whatever it is: the reader must be told, for nobody waits for this thread.
+            self.fault = fault
+            self.reason = _words(fault)
+        self._packets.put(None)
+
+    def _read(self, container: InputContainer) -> None:
+        if not container.streams.video:
+            self.reason = "holds no video"
+            return
+        try:
+            for packet in container.demux(container.streams.video[0]):
+                if self._abandoned.is_set():
+                    return
+                if self._packets.qsize() > _MAX_WAITING:
+                    self.reason = "this machine does not keep up"
+                    return
+                self._packets.put(packet)
+            self.reason = "the sender ended it"
+        except av.error.FFmpegError as fault:
+            self.reason = _words(fault)
+
+
+def _words(fault: Exception) -> str:
+    """Return what went wrong in a few words."""
+    if isinstance(fault, av.error.ExitError):
+        return "no answer in time"
+    if isinstance(fault, OSError | av.error.FFmpegError) and fault.strerror:
+        return fault.strerror
+    return f"{type(fault).__name__}: {fault}".splitlines()[0]
+
+
+Transport: TypeAlias = Literal["tcp", "udp"]
+
+_OPEN_S, _SILENT_S = 5.0, 2.0
+"""Time to connect and find the first key frame; silence after which a connection is dead."""
+
+_RETRY_S = (0.1, 0.2, 0.5)
+"""Pauses before new tries, the last for ever: the vehicle may come back at any time."""
+
+_PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
+"""The rate need not be known; the first pictures shall not wait until it is measured. FFmpeg's
+`nobuffer` is not set: it drops what was read meanwhile, often the only key frame for seconds."""
+
+
+class RemoteFeed:
+    """Frames from a container that FFmpeg opens, and opens again; satisfies `Feed`.
+
+    Parameters
+    ----------
+    name : str
+        How health and messages call it.
+    opener : callable
+        Opens the container; must not wait without end.
+    content : str
+        What arrives, for health.
+    """
+
+    def __init__(self, name: str, opener: Opener, *, content: str = "") -> None:
+        self.name = name
+        self._opener = opener
+        self._closed = threading.Event()
+        self._connection: Connection | None = None
+        self._reception = Reception(name, content)
+        self._frames = LiveFrames(self._reception)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until closed; connects anew when the stream breaks off."""
+        n_failed = 0
+        while not self._closed.is_set():
+            connection = self._connection = Connection(self._opener)
+            if self._closed.is_set():
+                connection.abandon()
+            n_packets = 0
+            try:
+                while (packet := connection.get()) is not None and not self._closed.is_set():
+                    if n_packets == 0:
+                        codec, tick = packet.stream.codec_context, float(packet.time_base)
+                        self._frames.connect(codec, tick, hears_losses=False)
+                    n_packets += 1
+                    self._reception.hear()
+                    yield from self._frames.feed(packet)
+            finally:
+                connection.abandon()
+            n_failed = 0 if n_packets else n_failed + 1
+            self._rest(connection, n_failed)
+
+    def health(self) -> PartHealth:
+        """Return how the stream is."""
+        return self._reception.health()
+
+    def close(self) -> None:
+        """End the iteration; what FFmpeg still waits for ends by itself within seconds."""
+        self._closed.set()
+        self._reception.end("closed")
+        if self._connection is not None:
+            self._connection.abandon()
+
+    def _rest(self, connection: Connection, n_failed: int) -> None:
+        """Say why there is no connection, and wait a little."""
+        if self._closed.is_set():
+            return
+        self._reception.complain(f"no connection ({connection.reason}); trying again")
+        self._closed.wait(_RETRY_S[min(n_failed, len(_RETRY_S) - 1)])
+
+
+def remote_feed(address: str, *, transport: Transport = "tcp") -> RemoteFeed:
+    """Return a feed from an address that FFmpeg knows.
+
+    Parameters
+    ----------
+    address : str
+        `rtsp://...`, `srt://...`, `http://...`, `tcp://...` and the like.
+    transport : {"tcp", "udp"}
+        How RTSP sends: TCP repeats lost packets; UDP never waits for them.
+    """
+    scheme = address.partition("://")[0].lower()
+    options = dict(_PROBE)
+    if scheme in ("rtsp", "rtsps"):
+        options |= {"rtsp_transport": transport, "max_delay": "50000"}
+
+    def opener() -> InputContainer:
+        return av.open(address, "r", options=options, timeout=(_OPEN_S, _SILENT_S))
+
+    return RemoteFeed(address, opener, content=scheme.upper())
+
+
+_DEVICES = Path("/dev")
+_OPEN_S, _SILENT_S = 5.0, 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraOptions:
+    """What is asked of a camera; what is left out, the camera chooses.
+
+    Attributes
+    ----------
+    size_px : (int, int) or None
+        Width and height.
+    fps : float or None
+        Frames per second.
+    pixel_format : str or None
+        As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
+        first two only.
+    """
+
+    size_px: tuple[int, int] | None = None
+    fps: float | None = None
+    pixel_format: str | None = None
+
+    def for_ffmpeg(self) -> dict[str, str]:
+        """Return the options of FFmpeg's `v4l2` input."""
+        found = {}
+        if self.size_px is not None:
+            found["video_size"] = f"{self.size_px[0]}x{self.size_px[1]}"
+        if self.fps is not None:
+            found["framerate"] = f"{self.fps:g}"
+        if self.pixel_format is not None:
+            found["input_format"] = self.pixel_format
+        return found
+
+
+class CameraFeed(RemoteFeed):
+    """Frames from a camera; opened again when it is unplugged and comes back.
+
+    Parameters
+    ----------
+    where : str
+        `/dev/video0`, `camera:0`, or `camera:` and a path.
+    options : CameraOptions
+    """
+
+    def __init__(self, where: str, options: CameraOptions) -> None:
+        self._device = camera_device(where)
+        asked = options.for_ffmpeg()
+
+        def opener() -> InputContainer:
+            return av.open(
+                self._device, "r", format="v4l2", options=asked, timeout=(_OPEN_S, _SILENT_S)
+            )
+
+        super().__init__(self._device, opener, content="camera")
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until closed.
+
+        Raises
+        ------
+        SourceError
+            If there is no such camera, or no Video4Linux, at the start.
+        """
+        if not sys.platform.startswith("linux"):
+            raise SourceError(
+                f"{self._device}: cameras are read on Linux only; send the picture by RTSP"
+            )
+        if not Path(self._device).exists():
+            raise SourceError(f"{self._device}: no such camera; {_what_there_is()}")
+        return super().__iter__()
+
+
+def camera_device(where: str) -> str:
+    """Return the device that `camera:0`, `camera:/dev/video2` or `/dev/video0` names.
+
+    Parameters
+    ----------
+    where : str
+
+    Raises
+    ------
+    SourceError
+        If nothing follows `camera:`.
+    """
+    name = where.removeprefix("camera:")
+    if not name:
+        raise SourceError(f"{where}: names no camera; type camera:0 for /dev/video0")
+    return str(_DEVICES / f"video{int(name)}") if name.isdecimal() else name
+
+
+def is_camera(where: str) -> bool:
+    """Return whether `where` names a camera.
+
+    Parameters
+    ----------
+    where : str
+    """
+    return where.startswith(("camera:", f"{_DEVICES}/video", f"{_DEVICES}/v4l/"))
+
+
+def _what_there_is() -> str:
+    found = sorted(str(path) for path in _DEVICES.glob("video*"))
+    return f"there is {', '.join(found)}" if found else "no camera is plugged in"

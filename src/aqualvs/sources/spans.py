@@ -1,0 +1,423 @@
+"""Parts of a dive that can be decoded by themselves, and how they are found.
+
+A part of a video must begin at a picture from which decoding can start as if nothing had been
+before. In H.264 and HEVC that is an instantaneous decoding refresh (IDR): by the standards (ITU-T
+H.264, 7.4.1.2.4; H.265, 7.4.2.2) no later picture refers to one before it, and none of those that
+follow it in the file is shown before it. Key frames that promise less are no place to cut. A dive
+about which any doubt is left stays in one piece.
+
+The frames of a part of a dive, read by themselves.
+"""
+
+import itertools
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import cast
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.packet import Packet
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+
+from aqualvs.closing import Closing
+from aqualvs.errors import SourceError
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources.base import planes_of
+from aqualvs.sources.h264 import UnitReader, unit_reader
+from aqualvs.sources.images import ImageSource, images_in
+
+# Codecs that predict no picture from another.
+_INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
+# The container's promise is kept where the last picture comes no earlier than this before its end;
+# the serial reader is more patient.
+_EARLY_FRAMES, _EARLY_SHARE = 2.0, 0.01
+_PATIENCE_S = 10.0
+
+
+class SpanKind(StrEnum):
+    """How the frames of a part are read."""
+
+    WHOLE = "whole"
+    """All of them, as a run reads them."""
+    VIDEO = "video"
+    IMAGES = "images"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """Consecutive frames of a dive.
+
+    Attributes
+    ----------
+    kind : SpanKind
+    first, stop : int
+        Frames `first` to `stop` - 1, by their index; 0 and 0 for a whole dive of unknown length.
+    start_pts, origin_pts : int
+        Time of the first packet and of the dive's first picture, in ticks of the stream.
+    n_bytes : int
+        Size of the packets, or of the files.
+    checksum : int
+        CRC-32 of the packets with their times.
+    """
+
+    kind: SpanKind
+    first: int = 0
+    stop: int = 0
+    start_pts: int = 0
+    origin_pts: int = 0
+    n_bytes: int = 0
+    checksum: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSpans:
+    """How a video may be cut.
+
+    Attributes
+    ----------
+    spans : tuple of Span
+        In order, without gaps; empty if the video must stay whole.
+    why_whole : str
+        Why it must; empty if it need not.
+    checksum : int
+        Of all packets.
+    n_bytes : int
+        Of all packets.
+    """
+
+    spans: tuple[Span, ...]
+    why_whole: str
+    checksum: int
+    n_bytes: int
+
+
+def video_spans(path: Path, n_least: int) -> VideoSpans:
+    """Read a video's packets, without decoding them, and find where it may be cut.
+
+    Parameters
+    ----------
+    path : Path
+    n_least : int
+        Frames that a part has at least, but for the last.
+
+    Raises
+    ------
+    av.error.FFmpegError, OSError
+        As FFmpeg says it, if the file cannot be opened.
+    """
+    with av.open(str(path), timeout=_PATIENCE_S) as container:
+        stream = container.streams.video[0]
+        packets = _Packets(stream)
+        try:
+            for packet in container.demux(stream):
+                packets.add(packet)
+        except av.error.FFmpegError as fault:
+            packets.doubt(f"the file breaks off ({fault.strerror})")
+        why = packets.why_whole() or _broken_promise(stream, packets)
+        spans = () if why else packets.spans(n_least)
+        return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
+
+
+def image_spans(sizes: Sequence[int], n_least: int) -> tuple[Span, ...]:
+    """Cut a folder of images into parts.
+
+    Parameters
+    ----------
+    sizes : sequence of int
+        Of the files, in bytes, in their order.
+    n_least : int
+        Images that a part has, but for the last.
+    """
+    edges = [*range(0, len(sizes), n_least), len(sizes)]
+    return tuple(
+        Span(kind=SpanKind.IMAGES, first=first, stop=stop, n_bytes=sum(sizes[first:stop]))
+        for first, stop in itertools.pairwise(edges)
+    )
+
+
+def packet_checksum(packet: "Packet[VideoStream]") -> int:
+    """Return the CRC-32 of a packet with its time."""
+    return zlib.crc32(packet, zlib.crc32(str(packet.pts).encode()))
+
+
+def joint_checksum(checksums: Sequence[int]) -> int:
+    """Return one checksum of those of several packets, in their order."""
+    return zlib.crc32(np.asarray(checksums, "<u4").tobytes())
+
+
+class _Packets:
+    """What is known of the packets so far; takes note of the first doubt about cutting them."""
+
+    def __init__(self, stream: VideoStream) -> None:
+        self._stream = stream
+        self._name = stream.codec_context.name
+        self._pts: list[int] = []
+        self._sizes: list[int] = []
+        self._sums: list[int] = []
+        self._cuts: list[int] = []
+        self._doubt = ""
+        self._units = self._reader()
+        self._sets_in_band = False
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the packets."""
+        return sum(self._sizes)
+
+    @property
+    def checksum(self) -> int:
+        """Of all packets."""
+        return joint_checksum(self._sums)
+
+    @property
+    def n_packets(self) -> int:
+        """Packets that are no empty ones."""
+        return len(self._sums)
+
+    def doubt(self, words: str) -> None:
+        """Note that the video must stay whole."""
+        self._doubt = self._doubt or words
+
+    def add(self, packet: "Packet[VideoStream]") -> None:
+        """Note the next packet of the file; the empty one at the end does not count."""
+        if packet.size == 0:
+            return
+        if packet.pts is None:
+            self.doubt("pictures without a time")
+        if packet.is_corrupt or packet.is_discard:
+            self.doubt("damaged or hidden pictures")
+        if self._may_begin_here(packet):
+            self._cuts.append(len(self._pts))
+        self._pts.append(packet.pts or 0)
+        self._sizes.append(packet.size)
+        self._sums.append(packet_checksum(packet))
+
+    def why_whole(self) -> str:
+        """Return why the video must stay whole, empty if it need not."""
+        if self._doubt:
+            return self._doubt
+        if self._units is None and self._name not in _INTRA_ONLY:
+            return f"videos in {self._name} stay whole"
+        if len(set(self._pts)) != len(self._pts):
+            return "pictures that share a time"
+        return "" if self._cuts[:1] == [0] else "no key frame at the beginning"
+
+    def spans(self, n_least: int) -> tuple[Span, ...]:
+        """Return the parts, each of which begins at a picture that needs none before it."""
+        starts = _far_enough(self._sound_cuts(), n_least)
+        edges = [*starts, len(self._pts)]
+        origin = min(self._pts)
+        return tuple(
+            Span(
+                kind=SpanKind.VIDEO,
+                first=first,
+                stop=stop,
+                start_pts=self._pts[first],
+                origin_pts=origin,
+                n_bytes=sum(self._sizes[first:stop]),
+                checksum=joint_checksum(self._sums[first:stop]),
+            )
+            for first, stop in itertools.pairwise(edges)
+        )
+
+    def latest_s(self) -> float:
+        """Return the time of the last picture after the first, in seconds."""
+        base = self._stream.time_base
+        return float((max(self._pts) - min(self._pts)) * base) if base and self._pts else 0.0
+
+    def _sound_cuts(self) -> list[int]:
+        """Return the cuts at which the order of the file is that of the pictures."""
+        pts = np.asarray(self._pts, np.int64)
+        latest = np.maximum.accumulate(pts)
+        earliest = np.minimum.accumulate(pts[::-1])[::-1]
+        return [
+            cut
+            for cut in self._cuts
+            if earliest[cut] == pts[cut] and (cut == 0 or latest[cut - 1] < pts[cut])
+        ]
+
+    def _reader(self) -> UnitReader | None:
+        context = self._stream.codec_context
+        try:
+            return unit_reader(context.name, context.extradata or b"")
+        except ValueError as fault:
+            self.doubt(str(fault))
+            return None
+
+    def _may_begin_here(self, packet: "Packet[VideoStream]") -> bool:
+        if self._units is None:
+            return packet.is_keyframe
+        found = self._units(memoryview(packet))
+        # Parameter sets in the file's midst count from there on; a part must bring its own.
+        self._sets_in_band = self._sets_in_band or found.has_parameter_sets
+        return found.is_refresh and (found.has_all_parameter_sets or not self._sets_in_band)
+
+
+def _far_enough(cuts: Sequence[int], n_least: int) -> list[int]:
+    """Return the first cut and those that leave enough frames since the one before."""
+    chosen = [cuts[0]]
+    for cut in cuts:
+        if cut - chosen[-1] >= n_least:
+            chosen.append(cut)
+    return chosen
+
+
+def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
+    """Return in words that the file may hold less than it says; empty if all is there."""
+    if stream.time_base is None:
+        return "no clock"
+    if stream.frames:
+        return "" if packets.n_packets >= stream.frames else "fewer pictures than promised"
+    promised_s, rate = promised_duration(stream), stream.average_rate
+    if promised_s is None or not rate:
+        return ""
+    patience_s = max(_EARLY_FRAMES / float(rate), _EARLY_SHARE * promised_s)
+    return "" if packets.latest_s() + patience_s >= promised_s else "ends before its promise"
+
+
+def promised_duration(stream: VideoStream) -> float | None:
+    """Return the duration in seconds that the container states for the video, if it does."""
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    clock = stream.metadata.get("DURATION", "").split(":")
+    if len(clock) != 3:
+        return None
+    hours, minutes, seconds = (float(part) for part in clock)
+    return 3600 * hours + 60 * minutes + seconds
+
+
+_SEEK_BEFORE_S = (0, 2, 20, 1_000_000)
+
+
+class UnlikeSurveyError(Exception):
+    """A part of a dive does not hold what it should; the dive must be measured in one piece."""
+
+
+class VideoParts(Closing):
+    """Reads parts of a video, opened once for all of them; a context manager.
+
+    Parameters
+    ----------
+    path : Path
+    size_px : (int, int)
+        Width and height of every picture.
+    """
+
+    def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
+        self._path, self._size_px = path, size_px
+        self._container: InputContainer | None = None
+
+    def frames(self, span: Span) -> Iterator[Frame]:
+        """Decode a part; frames have the index and the time that the whole video gives them.
+
+        Parameters
+        ----------
+        span : Span
+            From `video_spans` of the same file.
+
+        Raises
+        ------
+        UnlikeSurveyError
+            If any picture is damaged or missing: only the whole video tells what becomes of those
+            that follow.
+        """
+        index, latest = span.first, span.origin_pts - 1
+        try:
+            stream = self._stream(span)
+            for picture in _pictures(stream, span):
+                if picture.is_corrupt or picture.pts is None or picture.pts <= latest:
+                    raise UnlikeSurveyError(f"picture {index} is damaged")
+                if (picture.width, picture.height) != self._size_px:
+                    raise UnlikeSurveyError(f"picture {index} has another size")
+                latest = picture.pts
+                ticks = picture.pts - span.origin_pts
+                luma, chroma = planes_of(picture)
+                yield Frame(index, float(ticks * (stream.time_base or 0)), luma, chroma)
+                index += 1
+        except (av.error.FFmpegError, OSError) as fault:
+            raise UnlikeSurveyError(
+                f"picture {index} or a later one is damaged ({fault})"
+            ) from fault
+        if index != span.stop:
+            raise UnlikeSurveyError(f"{index - span.first} pictures of {span.stop - span.first}")
+
+    def close(self) -> None:
+        """Close the file; frames already delivered stay valid."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+    def _stream(self, span: Span) -> VideoStream:
+        if not span.first:
+            # Some containers cannot be wound back.
+            self.close()
+        if self._container is None:
+            self._container = av.open(str(self._path), timeout=_PATIENCE_S)
+            _prepare(self._container.streams.video[0])
+        return self._container.streams.video[0]
+
+
+def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
+    """Read a part of a folder of images, as `ImageSource` reads all of it.
+
+    Raises
+    ------
+    UnlikeSurveyError
+        If an image cannot be read, or there are others than there were.
+    """
+    try:
+        source = ImageSource(images_in(folder)[span.first : span.stop], fps=fps)
+        index = span.first
+        for frame in source:
+            if frame.index + span.first != index:
+                raise UnlikeSurveyError(f"image {index} cannot be read")
+            yield Frame(index, index / fps, frame.luma, frame.chroma)
+            index += 1
+    except SourceError as fault:
+        raise UnlikeSurveyError(str(fault)) from fault
+    if index != span.stop:
+        raise UnlikeSurveyError(f"{index - span.first} images of {span.stop - span.first}")
+
+
+def _prepare(stream: VideoStream) -> None:
+    """Decode on one thread, and stop at any damage instead of patching it up."""
+    context = stream.codec_context
+    context.thread_count = 1
+    context.options = {"err_detect": "explode"}
+
+
+def _pictures(stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
+    """Yield the pictures of exactly the packets of a part."""
+    checksums = []
+    for packet in itertools.islice(_packets_from(stream, span), span.stop - span.first):
+        checksums.append(packet_checksum(packet))
+        yield from packet.decode()
+    if joint_checksum(checksums) != span.checksum:
+        raise UnlikeSurveyError("the file has changed since it was looked through")
+    yield from stream.codec_context.decode(None)
+
+
+def _packets_from(stream: VideoStream, span: Span) -> "Iterator[Packet[VideoStream]]":
+    """Yield the packets of a stream from where a part begins.
+
+    Seeking has the decoder forget what it holds, as if nothing had been decoded before.
+    """
+    container = cast("InputContainer", stream.container)
+    if not span.first:
+        return (packet for packet in container.demux(stream) if packet.size)
+    for before_s in _SEEK_BEFORE_S:
+        # Some containers seek by the order of the file, where a picture may come before its time.
+        ticks = before_s / (stream.time_base or 1)
+        container.seek(max(span.origin_pts, round(span.start_pts - ticks)), stream=stream)
+        packets = (packet for packet in container.demux(stream) if packet.size)
+        for packet in packets:
+            if packet.pts == span.start_pts:
+                return itertools.chain([packet], packets)
+            if packet.is_keyframe and (packet.pts is None or packet.pts > span.start_pts):
+                break
+    raise UnlikeSurveyError(f"picture {span.first} is not found")

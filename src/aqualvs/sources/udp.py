@@ -1,0 +1,409 @@
+"""Live video over UDP: RTP with H.264, MPEG-TS, or a bare H.264 byte stream.
+
+Session descriptions (RFC 8866) of RTP streams.
+
+From datagrams to frames, for each kind of content.
+"""
+
+import base64
+import binascii
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import cast
+
+import av
+from av.packet import Packet
+from av.video.codeccontext import VideoCodecContext
+from av.video.stream import VideoStream
+
+from aqualvs.errors import SourceError
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources.base import PartHealth, packet_with
+from aqualvs.sources.datagrams import (
+    BARE,
+    MAX_FOREIGN,
+    RTP,
+    TS,
+    WAIT_S,
+    Datagrams,
+    Inbox,
+    UdpAddress,
+    kind_of,
+    transport_content,
+    why_not,
+)
+from aqualvs.sources.h264 import START_CODE
+from aqualvs.sources.live_frames import LiveFrames, Reception
+from aqualvs.sources.rtp import (
+    TICKS_HZ,
+    AccessUnit,
+    H264Depacketizer,
+    RtpOrder,
+    RtpPacket,
+    parse_rtp,
+)
+from aqualvs.sources.transport_stream import TransportStream
+from aqualvs.special_files import refuse_special
+
+_MAX_BYTES = 64 << 10
+
+
+@dataclass(frozen=True, slots=True)
+class SdpVideo:
+    """The video that a session description announces.
+
+    Attributes
+    ----------
+    address : UdpAddress
+        Where it arrives; the host is kept for multicast only.
+    payload_type : int
+    codec : str
+        As in RTP, upper case: "H264".
+    parameter_sets : bytes
+        SPS and PPS of H.264 as a byte stream; empty if they come in the stream.
+    """
+
+    address: UdpAddress
+    payload_type: int
+    codec: str
+    parameter_sets: bytes
+
+
+def read_sdp(path: Path) -> SdpVideo:
+    """Read the first video from an SDP file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or announces no video over RTP and UDP.
+    """
+    refuse_special(path)
+    try:
+        text = path.read_bytes()[:_MAX_BYTES].decode("utf-8", "replace")
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror})") from fault
+    session, *media = re.split(r"^(?=m=)", text, flags=re.MULTILINE)
+    for part in media:
+        found = re.match(r"m=video (\d+)(?:/\d+)? RTP/AVPF? (\d+)", part)
+        if found:
+            port, payload_type = int(found[1]), int(found[2])
+            return SdpVideo(
+                UdpAddress(_group(part) or _group(session), port),
+                payload_type,
+                _codec(part, payload_type),
+                _parameter_sets(part, payload_type),
+            )
+    raise SourceError(
+        f"{path}: announces no video over RTP; it needs a line m=video PORT RTP/AVP 96"
+    )
+
+
+def _group(part: str) -> str:
+    """Return the multicast group of the connection line; empty for the vehicle's own address."""
+    found = re.search(r"^c=IN IP[46] ([^/\s]+)", part, re.MULTILINE)
+    host = found[1] if found else ""
+    first = host.partition(".")[0]
+    is_group = host.lower().startswith("ff") or (first.isdecimal() and 224 <= int(first) <= 239)
+    return host if is_group else ""
+
+
+def _codec(part: str, payload_type: int) -> str:
+    found = re.search(rf"^a=rtpmap:{payload_type} ([^/\s]+)/", part, re.MULTILINE)
+    return found[1].upper() if found else "unknown"
+
+
+def _parameter_sets(part: str, payload_type: int) -> bytes:
+    found = re.search(
+        rf"^a=fmtp:{payload_type} .*sprop-parameter-sets=([^;\s]+)", part, re.MULTILINE
+    )
+    if not found:
+        return b""
+    try:
+        sets = [base64.b64decode(text, validate=True) for text in found[1].split(",") if text]
+    except binascii.Error:
+        return b""
+    return b"".join(START_CODE + each for each in sets)
+
+
+class RtpReader:
+    """Reads RTP with H.264.
+
+    Parameters
+    ----------
+    frames : LiveFrames
+    parameter_sets : bytes
+        SPS and PPS as a byte stream, or nothing.
+    payload_type : int or None
+        None takes every dynamic one.
+    """
+
+    def __init__(self, frames: LiveFrames, parameter_sets: bytes, payload_type: int | None) -> None:
+        self._frames = frames
+        self._parameter_sets = parameter_sets
+        self._payload_type = payload_type
+
+    def frames(self, inbox: Inbox) -> Iterator[Frame]:
+        """Yield frames until the feed ends or another kind comes.
+
+        Parameters
+        ----------
+        inbox : Inbox
+        """
+        order, pictures = RtpOrder(), H264Depacketizer()
+        self._frames.connect(
+            decoder_of("h264", self._parameter_sets), 1 / TICKS_HZ, hears_losses=True
+        )
+        while not inbox.is_closed:
+            datagram = inbox.get(order.wait or WAIT_S)
+            if datagram is None:
+                due = order.overdue(time.monotonic())
+            elif inbox.is_late(datagram):
+                self._frames.lose()
+                continue
+            else:
+                packet = parse_rtp(datagram.content)
+                if inbox.is_foreign(datagram, fits=packet is not None):
+                    return
+                if packet is None or not self._is_video(packet):
+                    continue
+                due = order.push(packet, datagram.arrival)
+                self._tell(inbox.reception, pictures)
+            for ordered in due:
+                for picture in pictures.push(ordered):
+                    yield from decoded(self._frames, picture)
+
+    def _is_video(self, packet: RtpPacket) -> bool:
+        if self._payload_type is None:
+            return packet.payload_type >= 96
+        return packet.payload_type == self._payload_type
+
+    def _tell(self, reception: Reception, pictures: H264Depacketizer) -> None:
+        if pictures.n_foreign > MAX_FOREIGN:
+            reception.complain("RTP comes, but not of H.264; set the camera to H.264")
+        else:
+            reception.hear(RTP)
+
+
+class TransportReader:
+    """Reads MPEG-TS.
+
+    Parameters
+    ----------
+    frames : LiveFrames
+    """
+
+    def __init__(self, frames: LiveFrames) -> None:
+        self._frames = frames
+
+    def frames(self, inbox: Inbox) -> Iterator[Frame]:
+        """Yield frames until the feed ends or another kind comes.
+
+        Parameters
+        ----------
+        inbox : Inbox
+        """
+        stream, codec = TransportStream(), None
+        while not inbox.is_closed:
+            datagram = inbox.get()
+            if datagram is None:
+                continue
+            if inbox.is_late(datagram):
+                self._frames.lose()
+                continue
+            content = transport_content(datagram.content)
+            if inbox.is_foreign(datagram, fits=content is not None):
+                return
+            inbox.reception.hear(TS)
+            for picture in stream.push(content or b""):
+                if codec != stream.codec:
+                    codec = stream.codec or ""
+                    # A loss of 16 packets, or as many times that, shows in no counter.
+                    self._frames.connect(decoder_of(codec), 1 / TICKS_HZ, hears_losses=False)
+                yield from decoded(self._frames, picture)
+
+
+class BareReader:
+    """Reads H.264 without any container, cut into datagrams anywhere.
+
+    Parameters
+    ----------
+    frames : LiveFrames
+    """
+
+    def __init__(self, frames: LiveFrames) -> None:
+        self._frames = frames
+
+    def frames(self, inbox: Inbox) -> Iterator[Frame]:
+        """Yield frames until the feed ends or another kind comes.
+
+        Parameters
+        ----------
+        inbox : Inbox
+        """
+        codec = decoder_of("h264")
+        self._frames.connect(codec, 1e-6, hears_losses=False)
+        while not inbox.is_closed:
+            datagram = inbox.get()
+            if datagram is None:
+                continue
+            if inbox.is_late(datagram):
+                self._frames.lose()
+                continue
+            other = kind_of(datagram.content) in (RTP, TS)
+            if inbox.is_foreign(datagram, fits=not other):
+                return
+            inbox.reception.hear(BARE)
+            for unit in codec.parse(datagram.content):
+                unit.pts, unit.time_base = int(1e6 * datagram.arrival), Fraction(1, 1_000_000)
+                yield from self._frames.feed(unit)
+
+
+def decoded(frames: LiveFrames, picture: AccessUnit) -> Iterator[Frame]:
+    """Yield the frames that a picture completes; a torn one is counted only.
+
+    Parameters
+    ----------
+    frames : LiveFrames
+    picture : AccessUnit
+    """
+    if picture.is_restart:
+        frames.restart()
+    if picture.after_loss:
+        frames.lose()
+    if picture.is_whole:
+        yield from frames.feed(packet_of(picture.data, picture.ticks))
+    else:
+        frames.announce(packet_of(b"\x00", picture.ticks))
+
+
+def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
+    """Return a decoder, not yet opened.
+
+    Parameters
+    ----------
+    codec : str
+        FFmpeg's name.
+    parameter_sets : bytes
+        SPS and PPS as a byte stream, or nothing.
+    """
+    found = cast("VideoCodecContext", av.CodecContext.create(codec, "r"))
+    if parameter_sets:
+        found.extradata = parameter_sets
+    return found
+
+
+def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
+    """Return a packet of a stream with the clock of video in RTP.
+
+    Parameters
+    ----------
+    data : bytes
+        One picture as a byte stream.
+    ticks : int
+        90 kHz.
+    """
+    packet = packet_with(data)
+    packet.pts, packet.time_base = ticks, Fraction(1, TICKS_HZ)
+    return packet
+
+
+_RETRY_S = 0.5
+"""Between two tries to listen."""
+
+
+class UdpFeed:
+    """Listens on a UDP port and takes what comes; satisfies `Feed`.
+
+    Parameters
+    ----------
+    name : str
+        How health and messages call it.
+    address : UdpAddress
+    parameter_sets : bytes
+        SPS and PPS as a byte stream, where an SDP file tells them; else they come in the stream.
+    payload_type : int or None
+        Of RTP; None takes every dynamic one (96 to 127).
+
+    Notes
+    -----
+    RTP and MPEG-TS are unpacked here and not by FFmpeg, whose interface hides which packets are
+    lost, and which probes a stream before it shows a picture and holds one or two back. What a
+    bare stream loses is found by the pictures' numbers only, and each of its pictures waits for
+    the next, which ends it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        address: UdpAddress,
+        *,
+        parameter_sets: bytes = b"",
+        payload_type: int | None = None,
+    ) -> None:
+        self.name = name
+        self._address = address
+        self._parameter_sets = parameter_sets
+        self._payload_type = payload_type
+        self._closed = threading.Event()
+        self._datagrams: Datagrams | None = None
+        self._reception = Reception(name)
+        self._frames = LiveFrames(self._reception)
+
+    @property
+    def port(self) -> int:
+        """Port in use; that of the address until frames are asked for."""
+        return self._address.port if self._datagrams is None else self._datagrams.port
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until closed; waits for a sender."""
+        while not self._closed.is_set():
+            datagrams = self._listen(self._address)
+            if datagrams is None:
+                self._closed.wait(_RETRY_S)
+                continue
+            self._datagrams = datagrams
+            with closing(datagrams):
+                yield from self._receive(datagrams)
+
+    def health(self) -> PartHealth:
+        """Return how the stream is."""
+        return self._reception.health()
+
+    def close(self) -> None:
+        """End the iteration."""
+        self._closed.set()
+        self._reception.end("closed")
+        if self._datagrams is not None:
+            self._datagrams.wake()
+
+    def _listen(self, address: UdpAddress) -> Datagrams | None:
+        try:
+            found = Datagrams(address)
+        except OSError as fault:
+            self._reception.complain(why_not(address, fault))
+            return None
+        self._reception.complain("")
+        return found
+
+    def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
+        """Yield frames of whatever kind comes, which may change."""
+        readers: dict[str, Callable[[Inbox], Iterator[Frame]]] = {
+            RTP: RtpReader(self._frames, self._parameter_sets, self._payload_type).frames,
+            TS: TransportReader(self._frames).frames,
+            BARE: BareReader(self._frames).frames,
+        }
+        inbox = Inbox(datagrams, self._closed, self._reception)
+        while not self._closed.is_set():
+            kind = inbox.peek_kind()
+            if kind is not None:
+                yield from readers[kind](inbox)

@@ -1,0 +1,274 @@
+"""Frames from a video file or stream, decoded by FFmpeg through PyAV.
+
+Numbers of pictures, with gaps for lost ones.
+"""
+
+import heapq
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+from av.container import InputContainer
+from av.packet import Packet
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+
+from aqualvs.closing import Closing
+from aqualvs.errors import SourceError
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources.base import planes_of
+from aqualvs.sources.spans import promised_duration
+
+
+class Ledger:
+    """Numbers pictures by the packets that announced them, so that lost ones leave a gap.
+
+    Parameters
+    ----------
+    counts_packets : bool
+        Whether each packet shows a picture.
+
+    Attributes
+    ----------
+    first_pts : int or None
+        Time of the first picture, in ticks of its stream.
+    n_packets : int
+        Packets noted.
+    """
+
+    def __init__(self, *, counts_packets: bool) -> None:
+        self.first_pts: int | None = None
+        self.n_packets = 0
+        self._counts_packets = counts_packets
+        self._pending: list[int] = []
+        self._next = 0
+
+    @property
+    def n_known(self) -> int:
+        """Pictures numbered so far and announced ones that have not come."""
+        return self._next + len(self._pending)
+
+    def expect(self, packet: "Packet[VideoStream]") -> None:
+        """Note a packet; the empty one that flushes the decoder does not count.
+
+        Parameters
+        ----------
+        packet : Packet
+        """
+        if packet.size == 0:
+            return
+        self.n_packets += 1
+        if packet.pts is None or packet.is_discard or not self._counts_packets:
+            return
+        heapq.heappush(self._pending, packet.pts)
+
+    def number(self, pts: int | None) -> int:
+        """Return the number of a picture, counting those lost before it.
+
+        Parameters
+        ----------
+        pts : int or None
+            Its time, in ticks of its stream.
+
+        Returns
+        -------
+        index : int
+            Greater than that of the picture before.
+        """
+        if self.first_pts is None and pts is not None:
+            self.first_pts = min(pts, *self._pending[:1])
+        while pts is not None and self._pending and self._pending[0] < pts:
+            heapq.heappop(self._pending)
+            self._next += 1
+        while pts is not None and self._pending and self._pending[0] == pts:
+            heapq.heappop(self._pending)
+        self._next += 1
+        return self._next - 1
+
+    def skip(self, n: int) -> None:
+        """Count pictures as lost whose packets never came.
+
+        Parameters
+        ----------
+        n : int
+            Not negative.
+        """
+        self._next += n
+
+    def restart(self) -> None:
+        """Count announced pictures that have not come as lost; the stream's ticks begin anew."""
+        self._next = self.n_known
+        self._pending.clear()
+
+
+_STALL_S = 10.0
+"""A stream that sends nothing for so long has ended."""
+
+_HIDDEN_PACKETS = frozenset({"vp8"})
+"""Codecs whose packets need not show a picture, so that packets cannot be counted as frames."""
+
+_LOSSY_CONTAINERS = frozenset({"mpegts", "rtsp"})
+"""Containers in which a packet marked as damaged still holds most of its picture, which helps to
+predict the next ones. Elsewhere it is the torn end of a file; its error would take the sound
+pictures with it that the decoder still holds."""
+
+
+class VideoSource(Closing):
+    """A video file, or a stream that FFmpeg can open.
+
+    Parameters
+    ----------
+    where : str or Path
+        Path or address.
+
+    Attributes
+    ----------
+    name, size_px, fps, n_frames
+        As in `FrameSource`.
+
+    Raises
+    ------
+    SourceError
+        If the file is missing, empty or cut off before its index, or is not a video.
+
+    Notes
+    -----
+    Pictures that the decoder had to patch up are dropped, not delivered: a stripe copied from the
+    picture before would give a posture that looks sound. Pictures predicted from a lost one are
+    delivered; they mend themselves at the next key frame. Damage that happens to be valid code goes
+    unseen.
+    """
+
+    def __init__(self, where: str | Path) -> None:
+        self.name = str(where)
+        self._container = _open(self.name)
+        self._stream = self._video_stream()
+        # Threads that share a picture leave patched ones unmarked; threads with a picture each do
+        # not wait for each other's patches, so that what follows would be left to chance.
+        self._stream.codec_context.thread_count = 1
+        self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
+        rate = self._stream.average_rate or self._stream.guessed_rate
+        self.fps = float(rate) if rate else None
+        self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
+        self._promised_s = promised_duration(self._stream)
+        self.n_frames = self._stream.frames or self._estimated_frames()
+        self._ledger = Ledger(counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the sound frames; lost ones leave a gap in the index.
+
+        Raises
+        ------
+        SourceError
+            At the end, if frames that the container promised did not come; or when the picture
+            size changes, or a stream stalls.
+        """
+        n_delivered, last = 0, None
+        for picture in self._pictures():
+            index = self._ledger.number(picture.pts)
+            if picture.is_corrupt:
+                continue
+            last = self._frame(picture, index)
+            n_delivered += 1
+            yield last
+        self._check_complete(n_delivered, last)
+
+    def _pictures(self) -> Iterator[VideoFrame]:
+        """Decode what can be decoded, in order of presentation."""
+        for packet in self._packets():
+            self._ledger.expect(packet)
+            if packet.is_corrupt and not self._damage_is_partial:
+                continue
+            try:
+                pictures = packet.decode()
+            except av.error.InvalidDataError:
+                continue
+            for picture in pictures:
+                if isinstance(picture, VideoFrame):
+                    yield picture
+
+    def _packets(self) -> Iterator["Packet[VideoStream]"]:
+        """Read packets; a damaged container ends early, which the promise then reveals."""
+        try:
+            yield from self._container.demux(self._stream)
+        except av.error.InvalidDataError:
+            return
+        except av.error.FFmpegError as fault:
+            raise SourceError(f"{self.name}: the stream broke off ({fault.strerror})") from fault
+
+    def _frame(self, picture: VideoFrame, index: int) -> Frame:
+        if (picture.width, picture.height) != self.size_px:
+            raise SourceError(
+                f"{self.name}: the picture size changes from {self.size_px[0]}x{self.size_px[1]} "
+                f"to {picture.width}x{picture.height} px at frame {index}; cut the video there"
+            )
+        luma, chroma = planes_of(picture)
+        return Frame(index, self._time_of(picture, index), luma, chroma)
+
+    def _time_of(self, picture: VideoFrame, index: int) -> float:
+        """Return seconds since the start of the stream, by its own clock where it has one."""
+        if picture.pts is None or self._stream.time_base is None:
+            return index / (self.fps or 1.0)
+        return float((picture.pts - (self._ledger.first_pts or 0)) * self._stream.time_base)
+
+    def _check_complete(self, n_delivered: int, last: Frame | None) -> None:
+        """Raise if the file ended before its promise, or if its last frames are lost."""
+        index, time_s = (-1, 0.0) if last is None else (last.index, last.time_s)
+        exact = self._stream.frames
+        cut = self._ledger.n_packets < exact if exact else self._ends_early(time_s)
+        if not cut and index + 1 == self._ledger.n_known:
+            return
+        promised = f"{exact}" if exact else f"about {max(self.n_frames or 0, self._ledger.n_known)}"
+        raise SourceError(
+            f"{self.name}: only {n_delivered} of {promised} frames could be decoded, the last at "
+            f"{time_s:.2f} s; the file is cut short or damaged, copy it again from the recorder"
+        )
+
+    def _ends_early(self, time_s: float) -> bool:
+        """Return whether the last frame lies clearly before the promised end."""
+        if self._promised_s is None or self.fps is None:
+            return False
+        return time_s + max(3 / self.fps, 0.02 * self._promised_s) < self._promised_s
+
+    def _estimated_frames(self) -> int | None:
+        if self._promised_s is None or self.fps is None:
+            return None
+        return round(self._promised_s * self.fps)
+
+    def _video_stream(self) -> VideoStream:
+        if not self._container.streams.video:
+            self._container.close()
+            raise SourceError(f"{self.name}: holds no video; give a video file")
+        stream = self._container.streams.video[0]
+        if stream.codec_context is None or not stream.codec_context.width:
+            self._container.close()
+            raise SourceError(f"{self.name}: no picture in this video; record it again")
+        return stream
+
+    def close(self) -> None:
+        """Close the file; frames already delivered stay valid."""
+        self._container.close()
+
+
+def _open(where: str) -> InputContainer:
+    """Open a container, or say in one line why not."""
+    try:
+        return av.open(where, timeout=_STALL_S)
+    except FileNotFoundError as fault:
+        raise SourceError(f"{where}: no such file; check the path") from fault
+    except (av.error.InvalidDataError, av.error.EOFError) as fault:
+        raise SourceError(_not_a_video(where)) from fault
+    except av.error.ExitError as fault:
+        raise SourceError(f"{where}: nothing came in {_STALL_S:g} s; is the sender on?") from fault
+    except (av.error.FFmpegError, OSError) as fault:
+        raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
+
+
+def _not_a_video(where: str) -> str:
+    path = Path(where)
+    if path.is_file() and path.stat().st_size == 0:
+        return f"{where}: the file is empty (0 bytes); copy it again from the recorder"
+    return (
+        f"{where}: not a video, or cut short before its index was written; "
+        "check the file or copy it again from the recorder"
+    )

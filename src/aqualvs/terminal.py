@@ -1,0 +1,171 @@
+"""How far a run is, on standard error.
+
+Stopping in good order: Ctrl-C and SIGTERM end the run after the current frame.
+
+The progress bar of a terminal.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from types import FrameType
+from typing import Any, Self, TypeAlias
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from aqualvs.closing import Closing
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals(Closing):
+    """Note a request to stop instead of dying from it; a context manager.
+
+    The second request is no longer caught, so that whoever insists gets out. Outside of the main
+    thread, where Python allows no handlers, nothing is caught.
+
+    Attributes
+    ----------
+    caught : Signals or None
+        The signal that asked to stop.
+    """
+
+    def __init__(self) -> None:
+        self.caught: signal.Signals | None = None
+        self._previous: dict[signal.Signals, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code by the shell's convention: 128 + signal, 0 if there was none."""
+        return 0 if self.caught is None else 128 + self.caught
+
+    def __enter__(self) -> Self:
+        """Catch the signals from here on."""
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {s: signal.signal(s, self._note) for s in _SIGNALS}
+        return self
+
+    def close(self) -> None:
+        """Put the previous handlers back."""
+        self._restore()
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self.caught = signal.Signals(number)
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous = {}
+
+
+# Until the first frame is done; compiled code is kept for the next run.
+_FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
+
+
+class _Rate(ProgressColumn):
+    """Frames, or whatever is counted, per second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        """Return the rate as text."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.0f} {self._unit}/s")
+
+
+@contextlib.contextmanager
+def terminal_bar(label: str, n_frames: int | None, unit: str) -> Iterator[Callable[[int], None]]:
+    """Show a bar on standard error; nothing where Rich does not take that for a terminal.
+
+    Parameters and what it yields are those of `aqualvs.terminal.progress`.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit))
+    bar = Progress(
+        *columns,
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task(f"{label} {_FIRST_RUN}", total=n_frames)
+
+        def tick(n_done: int) -> None:
+            bar.update(task, advance=n_done, description=label)
+
+        yield tick
+
+
+Tick: TypeAlias = Callable[[int], None]
+
+_HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
+# What says of something else that it is a terminal (https://force-color.org).
+_CLAIMS = ("TTY_COMPATIBLE", "FORCE_COLOR")
+
+
+@contextlib.contextmanager
+def hidden_progress() -> Iterator[None]:
+    """Show no bars of what is done inside: two at a time overwrite each other."""
+    token = _HIDDEN.set(True)
+    try:
+        yield
+    finally:
+        _HIDDEN.reset(token)
+
+
+@contextlib.contextmanager
+def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
+    """Show a progress bar; nothing where standard error is not a terminal, or bars are hidden.
+
+    Parameters
+    ----------
+    label : str
+        What is going on.
+    n_frames : int or None
+        Frames to come, if known.
+    unit : str
+        What is counted, if not frames.
+
+    Yields
+    ------
+    tick : callable
+        To be called with the number of frames that have been done since the last call.
+    """
+    if _HIDDEN.get() or not _may_be_terminal():
+        yield _tell_nobody
+        return
+
+    with terminal_bar(label, n_frames, unit) as tick:
+        yield tick
+
+
+def _may_be_terminal() -> bool:
+    """Return whether standard error may be a terminal; False is certain."""
+    if any(os.environ.get(name) for name in _CLAIMS):
+        return True
+    try:
+        return sys.stderr.isatty()
+    except (AttributeError, ValueError):
+        return False
+
+
+def _tell_nobody(n_done: int) -> None:
+    """Do nothing."""

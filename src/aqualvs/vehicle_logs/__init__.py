@@ -1,0 +1,35 @@
+"""What the vehicle logged of its own motion, next to a dive: depth, heading, attitude."""
+
+from aqualvs.vehicle_logs.reading import read_vehicle_log
+from aqualvs.vehicle_logs.time_offset import (
+    OffsetRefusal,
+    PostureTrack,
+    TimeOffset,
+    dive_start_utc,
+    find_time_offset,
+    offset_from_clocks,
+)
+from aqualvs.vehicle_logs.vehicle_log import (
+    Interpolation,
+    Places,
+    Signal,
+    VehicleLog,
+    VehiclePlaces,
+    VehicleState,
+)
+
+__all__ = [
+    "Interpolation",
+    "OffsetRefusal",
+    "Places",
+    "PostureTrack",
+    "Signal",
+    "TimeOffset",
+    "VehicleLog",
+    "VehiclePlaces",
+    "VehicleState",
+    "dive_start_utc",
+    "find_time_offset",
+    "offset_from_clocks",
+    "read_vehicle_log",
+]

@@ -1,0 +1,512 @@
+"""ArduPilot's dataflash logs (`.BIN`, and their text form `.log`), as the vehicle writes them.
+
+Which record is read for what, and why:
+
+- attitude and heading: `ATT`, the attitude that the autopilot flies by.
+- depth: `CTUN.Alt`, the height that ArduSub flies by, from its filter, 0 at the surface. `POS`
+  follows home when someone moves it; the filter's own `XKF1.PD` counts from where it started.
+  `CTUN.BAlt` and `BARO.Alt` are the pressure sensor without filter; of several `BARO`, the one in
+  the water is not the first, which sits in the hull.
+- velocity: `XKF1` (`NKF1` of older firmware), of the first core.
+- UTC: `GPS` (leap seconds of 2017 taken off), else `RTC`.
+
+Records of ArduPilot's dataflash logs, binary and text, without decoding those nobody asks for.
+
+Such a log describes itself: `FMT` records give every other kind's number, length, NumPy-like format
+and columns. Binary records start with 0xA3 0x95 and their number; they carry no checksum
+(https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html).
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from aqualvs.errors import SourceError
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.vehicle_logs.tlog import SUB_MODES, Candidate, choose_depth
+from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of, wrap
+
+HEAD = b"\xa3\x95"
+_FMT = 0x80
+_FMT_LENGTH = 89
+_TYPES = {
+    "b": ("i1", 1.0),
+    "B": ("u1", 1.0),
+    "M": ("u1", 1.0),
+    "h": ("<i2", 1.0),
+    "H": ("<u2", 1.0),
+    "i": ("<i4", 1.0),
+    "I": ("<u4", 1.0),
+    "q": ("<i8", 1.0),
+    "Q": ("<u8", 1.0),
+    "g": ("<f2", 1.0),
+    "f": ("<f4", 1.0),
+    "d": ("<f8", 1.0),
+    "c": ("<i2", 0.01),
+    "C": ("<u2", 0.01),
+    "e": ("<i4", 0.01),
+    "E": ("<u4", 0.01),
+    "L": ("<i4", 1e-7),
+    "n": ("S4", 0.0),
+    "N": ("S16", 0.0),
+    "Z": ("S64", 0.0),
+    "a": ("S64", 0.0),
+}
+"""Format characters: type, and the factor on numbers (0 for what is no number)."""
+_BOGUS_TIME_S = 10.0
+_NEIGHBOURS = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """What an `FMT` record says of a kind of record.
+
+    Attributes
+    ----------
+    name : str
+        Kind, such as 'ATT'.
+    length : int
+        Bytes of a record, its head of three included.
+    codes : str
+        One format character a column.
+    columns : tuple of str
+        Names of the columns.
+    """
+
+    name: str
+    length: int
+    codes: str
+    columns: tuple[str, ...]
+
+    @property
+    def dtype(self) -> np.dtype[np.void] | None:
+        """A record without its head as a NumPy type; None where the description makes no sense."""
+        if len(self.codes) != len(self.columns) or any(c not in _TYPES for c in self.codes):
+            return None
+        named = all(self.columns) and len(set(self.columns)) == len(self.columns)
+        if not named or not self.columns:
+            return None
+        layout = np.dtype(
+            [(name, _TYPES[code][0]) for name, code in zip(self.columns, self.codes, strict=True)]
+        )
+        return layout if layout.itemsize == self.length - 3 else None
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """The wanted records of a dataflash log.
+
+    Attributes
+    ----------
+    tables : mapping of str to mapping of str to array
+        Kind to columns; numbers as float64 in the units that the log's text form has. A table
+        without records is missing. `time_s`, seconds since the autopilot started, is in each.
+    n_records : int
+        Records of any kind.
+    skipped : tuple of (int, int)
+        Stretches without records: place in the file (or line, of text), and length in bytes (or
+        lines).
+    n_bogus : int
+        Wanted records with an impossible time; they are left out.
+    """
+
+    tables: Mapping[str, Mapping[str, FloatArray]]
+    n_records: int
+    skipped: tuple[tuple[int, int], ...]
+    n_bogus: int
+
+
+def read_binary(data: bytes, wanted: Iterable[str]) -> Records:
+    """Read wanted kinds of records out of a binary dataflash log."""
+    names = frozenset(wanted)
+    places: dict[str, list[int]] = {name: [] for name in names}
+    formats: dict[str, Format] = {}
+    n_records, skipped = _scan(data, names, places, formats)
+    octets = np.frombuffer(data, np.uint8)
+    tables: dict[str, dict[str, FloatArray]] = {}
+    for name, starts in places.items():
+        if starts:
+            tables[name] = _decode(octets, np.array(starts, np.int64), formats[name])
+    return _sound(tables, n_records, skipped)
+
+
+def _scan(
+    data: bytes, names: frozenset[str], places: dict[str, list[int]], formats: dict[str, Format]
+) -> tuple[int, list[tuple[int, int]]]:
+    """Walk over the records, note where the wanted ones are and what they look like."""
+    lengths: dict[int, int] = {_FMT: _FMT_LENGTH}
+    lists: dict[int, list[int]] = {}
+    skipped: list[tuple[int, int]] = []
+    at, size, n_records, last = 0, len(data), 0, 0
+    while at + 3 <= size:
+        kind = data[at + 2]
+        length = lengths.get(kind, 0) if data[at] == 0xA3 and data[at + 1] == 0x95 else 0
+        if not length:
+            # A record that lost bytes swallows the next ones, so the search begins within it.
+            found = _next_record(data, last + 1 if n_records else 0, lengths)
+            begin = at if found is None or found >= at else last
+            swallower = lists.get(data[last + 2]) if begin == last < at else None
+            if swallower and swallower[-1] == last:
+                swallower.pop()
+            skipped.append((begin, (size if found is None else found) - begin))
+            if found is None:
+                return n_records, skipped
+            last = at = found
+            continue
+        if at + length > size:
+            break
+        n_records += 1
+        if kind == _FMT:
+            number, described = _format(data, at)
+            if described.dtype is not None:
+                lengths[number] = described.length
+                if described.name in names:
+                    formats[described.name] = described
+                    lists[number] = places[described.name]
+            elif described.length > 3 and number != _FMT:
+                lengths[number] = described.length
+        elif kind in lists:
+            lists[kind].append(at)
+        last, at = at, at + length
+    if at < size:
+        skipped.append((at, size - at))
+    return n_records, skipped
+
+
+def _format(data: bytes, at: int) -> tuple[int, Format]:
+    def text(start: int, length: int) -> str:
+        return data[at + start : at + start + length].split(b"\0")[0].decode("ascii", "replace")
+
+    columns = text(25, 64)
+    return data[at + 3], Format(
+        text(5, 4), data[at + 4], text(9, 16), tuple(columns.split(",")) if columns else ()
+    )
+
+
+def _next_record(data: bytes, start: int, lengths: Mapping[int, int]) -> int | None:
+    """Return where the first record starts that another, or the end of the file, follows."""
+    at = data.find(HEAD, start)
+    while at >= 0 and at + 3 <= len(data):
+        length = lengths.get(data[at + 2], 0)
+        end = at + length
+        if length and (end == len(data) or data[end : end + 2] == HEAD):
+            return at
+        at = data.find(HEAD, at + 1)
+    return None
+
+
+def _decode(octets: np.ndarray, at: np.ndarray, form: Format) -> dict[str, FloatArray]:
+    layout = form.dtype
+    if layout is None:
+        return {}
+    rows = np.ascontiguousarray(octets[at[:, None] + 3 + np.arange(layout.itemsize)])
+    table = rows.view(layout)[:, 0]
+    return {
+        name: table[name].astype(float) * _TYPES[code][1]
+        for name, code in zip(form.columns, form.codes, strict=True)
+        if _TYPES[code][1]
+    }
+
+
+def read_text(text: str, wanted: Iterable[str]) -> Records:
+    """Read wanted kinds of records out of the text form of a dataflash log."""
+    names = frozenset(wanted)
+    columns: dict[str, tuple[str, ...]] = {}
+    rows: dict[str, list[list[float]]] = {}
+    skipped: list[tuple[int, int]] = []
+    lines = text.splitlines()
+    for number, line in enumerate(lines, start=1):
+        cells = re.split(r"\s*,\s*", line.strip())
+        name = cells[0]
+        if name == "FMT" and len(cells) > 5:
+            columns[cells[3]] = tuple(cells[5:])
+        elif name in names:
+            if name not in columns or len(cells) != len(columns[name]) + 1:
+                skipped.append((number, 1))
+                continue
+            rows.setdefault(name, []).append([_number(cell) for cell in cells[1:]])
+    tables = {
+        name: dict(zip(columns[name], np.array(found).T, strict=True))
+        for name, found in rows.items()
+    }
+    return _sound(tables, len(lines), skipped)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
+def _sound(
+    tables: Mapping[str, dict[str, FloatArray]], n_records: int, skipped: list[tuple[int, int]]
+) -> Records:
+    """Give each table its times and leave out records whose time is impossible."""
+    kept: dict[str, dict[str, FloatArray]] = {}
+    n_bogus = 0
+    for name, table in tables.items():
+        times = _seconds(table)
+        if times is None:
+            continue
+        sound = _believable(times)
+        n_bogus += int(np.count_nonzero(~sound))
+        if sound.any():
+            kept[name] = {column: values[sound] for column, values in table.items()}
+            kept[name]["time_s"] = times[sound]
+    return Records(kept, n_records, tuple(skipped), n_bogus)
+
+
+def _seconds(table: Mapping[str, FloatArray]) -> FloatArray | None:
+    if "TimeUS" in table:
+        return table["TimeUS"] * 1e-6
+    # ArduSub before 3.4 wrote milliseconds.
+    return table["TimeMS"] * 1e-3 if "TimeMS" in table else None
+
+
+def _believable(times: FloatArray) -> BoolArray:
+    """Return which times are near those of their neighbours in the file."""
+    usual = ndimage.median_filter(times, min(_NEIGHBOURS, len(times)), mode="nearest")
+    near: BoolArray = np.isfinite(times) & (np.abs(times - usual) <= _BOGUS_TIME_S)
+    return near if len(times) > 2 else np.isfinite(times)
+
+
+_WANTED = ("ATT", "CTUN", "POS", "XKF1", "NKF1", "BARO", "GPS", "RTC", "MODE", "ARM", "EV")
+_GPS_EPOCH_S = 315964800.0
+_LEAP_S = 18.0
+_WEEK_S = 604800.0
+_GPS_FIX = 3
+_UTC_SIGMA_S = 1.0
+"""A vehicle's clock is set once, to about the second."""
+_ARMED_EVENT, _DISARMED_EVENT = 10, 11
+_DEEPEST_M = 12000.0
+_LARGEST_DEG = 720.0
+"""Records have no checksum: damaged ones may hold any number."""
+
+_Tables = Mapping[str, Mapping[str, FloatArray]]
+
+
+def looks_like_dataflash(head: bytes) -> bool:
+    """Return whether a file begins as a binary dataflash log; a damaged begin is forgiven."""
+    return head.startswith(HEAD) or head.count(HEAD + b"\x80") >= 3
+
+
+def looks_like_dataflash_text(head: bytes) -> bool:
+    """Return whether a file begins as a dataflash log in text."""
+    return head.startswith(b"FMT,") or b"\nFMT," in head
+
+
+def read_dataflash(path: Path) -> VehicleLog:
+    """Read a binary dataflash log.
+
+    Raises
+    ------
+    SourceError
+        If nothing that is wanted is in it.
+    """
+    records = read_binary(path.read_bytes(), _WANTED)
+    return _log(path, records, "dataflash", "bytes")
+
+
+def read_dataflash_text(path: Path) -> VehicleLog:
+    """Read a dataflash log in text.
+
+    Raises
+    ------
+    SourceError
+        If nothing that is wanted is in it.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return _log(path, read_text(text, _WANTED), "dataflash text", "lines")
+
+
+def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
+    tables = _first_core(records.tables)
+    starts = [
+        float(t["time_s"][0]) for name, t in tables.items() if name in ("ATT", "CTUN", "BARO")
+    ]
+    if not starts:
+        raise SourceError(
+            f"{path}: holds neither attitude nor depth in {records.n_records} records; give a log "
+            "of a dive"
+        )
+    begin = min(starts)
+    depth, stuck = _depth(tables, begin)
+    heading = _angle(tables, begin, "Yaw", Interpolation.BEARING)
+    roll = _angle(tables, begin, "Roll", Interpolation.ANGLE)
+    velocity, velocity_from = _velocity(tables, begin)
+    armed, armed_from = _armed(tables, begin)
+    utc, utc_from = _start_utc(tables, begin)
+    sources = {
+        "depth": depth.label if depth else "",
+        "heading": "ATT.Yaw" if heading else "",
+        "roll": "ATT.Roll" if roll else "",
+        "pitch": "ATT.Pitch" if roll else "",
+        "velocity_ned": velocity_from,
+        "armed": armed_from,
+        "start_utc_s": utc_from,
+    }
+    return VehicleLog(
+        name=str(path),
+        kind=kind,
+        depth=depth.depth if depth else None,
+        heading=heading,
+        roll=roll,
+        pitch=_angle(tables, begin, "Pitch", Interpolation.ANGLE),
+        velocity_ned=velocity,
+        armed=armed,
+        modes=_modes(tables, begin),
+        start_utc_s=utc,
+        start_utc_sigma_s=None if utc is None else _UTC_SIGMA_S,
+        sources={name: where for name, where in sources.items() if where},
+        notes=tuple(n for n in (*_damage(records, unit), stuck) if n),
+    )
+
+
+def _first_core(tables: _Tables) -> _Tables:
+    """Keep the first core of each filter, where a log has several."""
+    kept = dict(tables)
+    for name in ("XKF1", "NKF1"):
+        table = tables.get(name)
+        if table is not None and "C" in table:
+            first = table["C"] == 0
+            kept[name] = {column: values[first] for column, values in table.items()}
+    return kept
+
+
+def _damage(records: Records, unit: str) -> list[str]:
+    notes = []
+    if records.skipped:
+        lost = sum(length for _, length in records.skipped)
+        notes.append(
+            f"{lost} {unit} are no records and are left out, the first at {unit[:-1]} "
+            f"{records.skipped[0][0]}: the file is damaged or cut short"
+        )
+    if records.n_bogus:
+        notes.append(f"{records.n_bogus} records have an impossible time and are left out")
+    return notes
+
+
+def _signal(
+    tables: _Tables,
+    begin: float,
+    kind: str,
+    column: str,
+    scale: float = 1.0,
+) -> Signal | None:
+    table = tables.get(kind)
+    if table is None or column not in table:
+        return None
+    values = scale * table[column]
+    values = np.where(np.abs(values) <= _DEEPEST_M, values, np.nan)
+    return Signal.from_samples(table["time_s"] - begin, values)
+
+
+def _angle(
+    tables: _Tables, begin: float, column: str, interpolation: Interpolation
+) -> Signal | None:
+    table = tables.get("ATT")
+    if table is None or column not in table:
+        return None
+    angle = np.deg2rad(np.where(np.abs(table[column]) <= _LARGEST_DEG, table[column], np.nan))
+    angle = bearing_of(angle) if interpolation is Interpolation.BEARING else wrap(angle)
+    return Signal.from_samples(table["time_s"] - begin, angle, interpolation)
+
+
+def _depth(tables: _Tables, begin: float) -> tuple[Candidate | None, str | None]:
+    candidates = [
+        Candidate(f"{kind}.{column}", _signal(tables, begin, kind, column, scale))
+        for kind, column, scale in (
+            ("CTUN", "Alt", -1.0),
+            ("POS", "RelHomeAlt", -1.0),
+            ("XKF1", "PD", 1.0),
+            ("NKF1", "PD", 1.0),
+            ("CTUN", "BAlt", -1.0),
+        )
+    ]
+    pressure = candidates[-1].depth
+    return choose_depth([*candidates, _barometer(tables, begin)], pressure)
+
+
+def _barometer(tables: _Tables, begin: float) -> Candidate:
+    table = tables.get("BARO")
+    if table is None or "Alt" not in table:
+        return Candidate("BARO.Alt", None)
+    number = table.get("I", np.zeros(len(table["Alt"])))
+    outer = number == number.max()
+    label = f"BARO.Alt of sensor {number.max():.0f}"
+    return Candidate(
+        label, Signal.from_samples(table["time_s"][outer] - begin, -table["Alt"][outer])
+    )
+
+
+def _velocity(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
+    for name in ("XKF1", "NKF1"):
+        table = tables.get(name)
+        if table is None or not {"VN", "VE", "VD"} <= set(table):
+            continue
+        parts = np.stack([table["VN"], table["VE"], table["VD"]], axis=1)
+        velocity = Signal.from_samples(table["time_s"] - begin, parts)
+        if velocity is not None:
+            return velocity, f"{name}.VN, VE, VD"
+    return None, ""
+
+
+def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
+    """Return the arming; it is logged at changes only, so a signal without gaps is made of it."""
+    table = tables.get("ARM")
+    if table is not None and "ArmState" in table:
+        times, state, where = table["time_s"], table["ArmState"], "ARM.ArmState"
+    else:
+        table = tables.get("EV")
+        if table is None or "Id" not in table:
+            return None, ""
+        told = (table["Id"] == _ARMED_EVENT) | (table["Id"] == _DISARMED_EVENT)
+        times, where = table["time_s"][told], "EV.Id"
+        state = (table["Id"][told] == _ARMED_EVENT).astype(float)
+    signal = Signal.from_samples(times - begin, (state > 0.0).astype(float), Interpolation.HELD)
+    if signal is None:
+        return None, ""
+    end = max(float(t["time_s"][-1]) for t in tables.values()) - begin
+    if end > signal.time_s[-1]:
+        signal = Signal(
+            np.append(signal.time_s, end),
+            np.append(signal.values, signal.values[-1]),
+            signal.interpolation,
+            np.inf,
+        )
+    return Signal(signal.time_s, signal.values, signal.interpolation, np.inf), where
+
+
+def _modes(tables: _Tables, begin: float) -> tuple[tuple[float, str], ...]:
+    table = tables.get("MODE")
+    if table is None:
+        return ()
+    numbers = table.get("ModeNum", table.get("Mode"))
+    if numbers is None:
+        return ()
+    return tuple(
+        (float(time) - begin, SUB_MODES.get(int(number), f"mode {number:.0f}"))
+        for time, number in zip(table["time_s"], numbers, strict=True)
+        if np.isfinite(number)
+    )
+
+
+def _start_utc(tables: _Tables, begin: float) -> tuple[float | None, str]:
+    gps = tables.get("GPS")
+    if gps is not None and {"GWk", "GMS", "Status"} <= set(gps):
+        fixed = (gps["Status"] >= _GPS_FIX) & (gps["GWk"] > 0)
+        if fixed.any():
+            utc = _GPS_EPOCH_S + _WEEK_S * gps["GWk"] + gps["GMS"] * 1e-3 - _LEAP_S
+            return float(np.median((utc - gps["time_s"])[fixed])) + begin, "GPS.GWk, GMS"
+    rtc = tables.get("RTC")
+    if rtc is not None and "Epoch" in rtc:
+        known = rtc["Epoch"] > 0
+        if known.any():
+            ahead = rtc["Epoch"] * 1e-6 - rtc["time_s"]
+            return float(np.median(ahead[known])) + begin, "RTC.Epoch"
+    return None, ""

@@ -1,0 +1,295 @@
+"""Angles over time as band-passed rates on an even grid, the form in which motions are compared.
+
+How well two motions agree at every time offset, and at one offset in detail.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft, ndimage
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal
+
+STEP_S = 0.05
+"""Of the grid; what is faster than the smoothing below is noise, so finer would tell nothing."""
+SMOOTHING_S = 0.4
+"""Standard deviation of the window over which a rate is taken. Posture's noise of 0.4 degrees at
+25 Hz leaves a rate of 0.1 degrees a second; a vehicle's own motion is slower than this window."""
+_TREND_S = 5.0
+"""What changes more slowly is left out: the net's own bearing along a cage, drift of a compass."""
+_LEAST_COVER = 0.5
+"""Share of the window that must hold values."""
+_CLIP_SIGMAS = 4.0
+_CLIP_RATE = math.radians(5.0)
+"""Rates beyond both are cut down to the larger one, lest one false reading decides."""
+_HAMPEL_SAMPLES = 11
+_HAMPEL_SIGMAS = 5.0
+_HAMPEL_ANGLE = math.radians(2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Band-passed rates of one angle.
+
+    Attributes
+    ----------
+    start_s : float
+        Time of the first; they are `STEP_S` apart.
+    rate : array, shape (n,)
+        Radians a second, extreme ones cut down; 0 where not valid.
+    valid : bool array, shape (n,)
+        Where there are values enough to tell.
+    """
+
+    start_s: float
+    rate: FloatArray
+    valid: BoolArray
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Times of the rates, shape (n,)."""
+        return self.start_s + STEP_S * np.arange(len(self.rate), dtype=np.float64)
+
+
+def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
+    """Return the band-passed rates of an angle on a grid from one time to another."""
+    times: FloatArray = np.arange(start_s, end_s + STEP_S, STEP_S, dtype=np.float64)
+    unwrapped = Signal(angle.time_s, angle.unwrapped(), Interpolation.LINEAR, angle.max_gap_s)
+    values, valid = unwrapped.at(times)
+    rate, known = _slopes(np.where(valid, values, 0.0), valid)
+    rate = rate - _smooth(np.where(known, rate, 0.0), known)
+    limit = max(_CLIP_SIGMAS * robust_sigma(rate[known]), _CLIP_RATE)
+    return Rates(float(times[0]), np.where(known, np.clip(rate, -limit, limit), 0.0), known)
+
+
+def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
+    """Return which valid samples are not far from their neighbours.
+
+    Parameters
+    ----------
+    angle : array, shape (n,)
+        Radians, in the order of time.
+    valid : bool array, shape (n,)
+        Samples that count at all.
+    """
+    values, kept = np.asarray(angle, float), np.array(valid, bool)
+    kept &= np.isfinite(values)
+    if np.count_nonzero(kept) < _HAMPEL_SAMPLES:
+        return kept
+    chosen = values[kept]
+    off = np.abs(chosen - ndimage.median_filter(chosen, _HAMPEL_SAMPLES, mode="nearest"))
+    limit = max(_HAMPEL_SIGMAS * 1.4826 * float(np.median(off)), _HAMPEL_ANGLE)
+    kept[kept] = off <= limit
+    return kept
+
+
+def robust_sigma(values: FloatArray) -> float:
+    """Return the standard deviation that the median of the magnitudes stands for; 0 for none."""
+    return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
+
+
+def _slopes(values: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Return the slope of the line that fits best within a Gaussian window about each sample.
+
+    Unlike a difference, it copes with missing samples and averages the others.
+    """
+    reach = math.ceil(3.0 * SMOOTHING_S / STEP_S)
+    lag = STEP_S * np.arange(-reach, reach + 1)
+    window = np.exp(-0.5 * (lag / SMOOTHING_S) ** 2)
+    centred = np.where(valid, values - values[valid].mean(), 0.0) if valid.any() else values
+    count = valid.astype(float)
+    # Reversed kernels, since convolution turns them round.
+    s0, s2 = _convolve(count, window), _convolve(count, window * lag**2)
+    s1, sx = _convolve(count, -window * lag), _convolve(centred, window)
+    stx = _convolve(centred, -window * lag)
+    spread = s0 * s2 - s1**2
+    whole = window.sum()
+    known = (s0 >= _LEAST_COVER * whole) & (spread >= _LEAST_COVER**2 * whole * window @ lag**2)
+    slope = (s0 * stx - s1 * sx) / np.where(known, spread, 1.0)
+    return np.where(known, slope, 0.0), known
+
+
+def _smooth(values: FloatArray, valid: BoolArray) -> FloatArray:
+    """Return the mean of valid samples in a wide Gaussian window."""
+    reach = math.ceil(3.0 * _TREND_S / STEP_S)
+    window = np.exp(-0.5 * (STEP_S * np.arange(-reach, reach + 1) / _TREND_S) ** 2)
+    weight = _convolve(valid.astype(float), window)
+    # Rounding of the transform leaves tiny weights where there is no sample.
+    found = weight > 1e-6 * window.sum()
+    total: FloatArray = _convolve(values, window)
+    return np.where(found, total / np.where(found, weight, 1.0), 0.0)
+
+
+def _convolve(values: FloatArray, window: FloatArray) -> FloatArray:
+    # A second to import, which only this needs.
+    from scipy.signal import oaconvolve
+
+    whole: FloatArray = oaconvolve(values, window, mode="full")
+    reach = len(window) // 2
+    return whole[reach : reach + len(values)]
+
+
+def correlation_time(first: Rates, second: Rates) -> float:
+    """Return how much time one independent pair of values takes, in seconds (Bartlett, 1946).
+
+    It is the integral over lag of the product of both autocorrelations.
+    """
+    reach = round(4.0 * _TREND_S / STEP_S)
+    product = _autocorrelation(first, reach) * _autocorrelation(second, reach)
+    return max(STEP_S * float(2.0 * product.sum() - product[0]), STEP_S)
+
+
+def _autocorrelation(rates: Rates, reach: int) -> FloatArray:
+    values = rates.rate
+    size = fft.next_fast_len(len(values) + reach, real=True)
+    spectrum = np.abs(fft.rfft(values, size)) ** 2
+    counts = np.abs(fft.rfft(rates.valid.astype(float), size)) ** 2
+    products = fft.irfft(spectrum, size)[:reach]
+    pairs = np.maximum(fft.irfft(counts, size)[:reach], 1.0)
+    mean: FloatArray = products / pairs
+    return mean / mean[0] if mean[0] > 0.0 else np.ones(reach)
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One angle, seen from the net and logged by the vehicle.
+
+    Attributes
+    ----------
+    name : str
+        'yaw' or 'pitch'.
+    seen : Rates
+        Of the posture, in dive time.
+    logged : Rates
+        Of the vehicle, in log time. Posture's angles change opposite to the vehicle's.
+    """
+
+    name: str
+    seen: Rates
+    logged: Rates
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Agreement of all channels at every offset of the grid.
+
+    Attributes
+    ----------
+    offset_s : array, shape (k,)
+        Log time minus dive time, rising by `STEP_S`.
+    score : array, shape (k,)
+        Logarithm of the likelihood ratio between "the motions agree" and "they do not".
+    overlap_s : array, shape (k,)
+        Time for which both are known, of the channel that has most.
+    """
+
+    offset_s: FloatArray
+    score: FloatArray
+    overlap_s: FloatArray
+
+
+def scores_of(channels: tuple[Channel, ...]) -> Scores:
+    """Return the agreement at every offset at which dive and log overlap.
+
+    Channels must start at the same times and have the same lengths.
+    """
+    first = channels[0]
+    before = len(first.seen.rate) - 1
+    lags = np.arange(-before, len(first.logged.rate))
+    score, overlap = np.zeros(len(lags)), np.zeros(len(lags))
+    for channel in channels:
+        rho, count = _correlations(channel.seen, channel.logged)
+        independent = count * STEP_S / correlation_time(channel.seen, channel.logged)
+        opposite = np.clip(-rho, 0.0, 0.9999)
+        score -= 0.5 * independent * np.log1p(-(opposite**2))
+        overlap = np.maximum(overlap, count * STEP_S)
+    offset_s: FloatArray = (
+        first.logged.start_s - first.seen.start_s + STEP_S * lags.astype(np.float64)
+    )
+    return Scores(offset_s, score, overlap)
+
+
+def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
+    """Return the correlation coefficient, and the pairs it rests on, for every lag."""
+    a, b = seen.rate, logged.rate
+    size = fft.next_fast_len(len(a) + len(b) - 1, real=True)
+    fa, fa2, fma = (fft.rfft(x, size) for x in (a, a**2, seen.valid.astype(float)))
+    fb, fb2, fmb = (fft.rfft(x, size) for x in (b, b**2, logged.valid.astype(float)))
+
+    def pairs(x: np.ndarray, y: np.ndarray) -> FloatArray:
+        products: FloatArray = fft.irfft(np.conj(x) * y, size)
+        return np.concatenate([products[size - len(a) + 1 :], products[: len(b)]])
+
+    count = np.round(pairs(fma, fmb))
+    n = np.maximum(count, 1.0)
+    mean_a, mean_b = pairs(fa, fmb) / n, pairs(fma, fb) / n
+    var_a, var_b = pairs(fa2, fmb) / n - mean_a**2, pairs(fma, fb2) / n - mean_b**2
+    # Relative to the whole, so that rounding of the transform cannot pass for motion.
+    moving = (var_a > 1e-6 * np.mean(a**2)) & (var_b > 1e-6 * np.mean(b**2)) & (count > 0)
+    spread = np.sqrt(np.where(moving, var_a * var_b, 1.0))
+    rho = np.where(moving, (pairs(fa, fb) / n - mean_a * mean_b) / spread, 0.0)
+    return np.clip(rho, -1.0, 1.0), count
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """Seen and logged rates of a channel at one offset, sample by sample of the seen ones.
+
+    Attributes
+    ----------
+    residual : array, shape (n,)
+        Seen rate less what the logged one predicts; less the mean only, where it is not known.
+    predicted : bool array, shape (n,)
+        Where both rates are known.
+    gain : float
+        Share of the vehicle's motion that the net shows: 1 for a plane, still net.
+    slope : array, shape (n,)
+        Change of the logged rate with time, 0 where not known.
+    correlation : float
+        Between seen and opposite logged rates.
+    """
+
+    residual: FloatArray
+    predicted: BoolArray
+    gain: float
+    slope: FloatArray
+    correlation: float
+
+
+def match_at(channel: Channel, offset_s: float) -> Match:
+    """Return how a channel agrees at one offset, not bound to the grid."""
+    seen, logged = channel.seen, channel.logged
+    where = (seen.time_s + offset_s - logged.start_s) / STEP_S
+    below = np.floor(where).astype(np.int64)
+    inside = (below >= 0) & (below < len(logged.rate) - 1)
+    below = np.where(inside, below, 0)
+    both = inside & seen.valid & logged.valid[below]
+    both &= logged.valid[np.minimum(below + 1, len(logged.rate) - 1)]
+    rate, slope = _between(logged.rate, below, where - below)
+    y = seen.rate
+    residual = np.where(seen.valid, y, 0.0)
+    if np.count_nonzero(both) < 3:
+        return Match(residual, both, 0.0, np.zeros(len(y)), 0.0)
+    dx, dy = rate - rate[both].mean(), y - y[both].mean()
+    sxx, syy, sxy = dx[both] @ dx[both], dy[both] @ dy[both], dx[both] @ dy[both]
+    if sxx <= 0.0 or syy <= 0.0:
+        return Match(residual, both, 0.0, np.zeros(len(y)), 0.0)
+    gain = max(-float(sxy / sxx), 0.0)
+    residual = np.where(both, dy + gain * dx, residual)
+    correlation = -float(sxy / np.sqrt(sxx * syy))
+    return Match(residual, both, gain, np.where(both, slope, 0.0), correlation)
+
+
+def _between(
+    values: FloatArray, below: IntArray, share: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return values between grid points, and their slopes (central differences)."""
+    last = len(values) - 1
+    before, first, second, after = (
+        values[np.clip(below + step, 0, last)] for step in (-1, 0, 1, 2)
+    )
+    rise, next_rise = (second - before) / (2.0 * STEP_S), (after - first) / (2.0 * STEP_S)
+    return first + share * (second - first), rise + share * (next_rise - rise)

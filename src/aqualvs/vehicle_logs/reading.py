@@ -1,0 +1,296 @@
+"""A vehicle's log as a table of comma-separated values.
+
+Columns, in any order: `time_s` (seconds on any clock) or `time` (UTC, ISO 8601); `depth_m`,
+positive down; `heading_deg`, clockwise from north; and, if known, `roll_deg` and `pitch_deg`. One
+of depth and heading must be there. An empty cell is a value that was not logged. Other columns are
+ignored, unless they look like one of these in another unit.
+
+Reading a vehicle's log, whatever its format.
+"""
+
+import csv
+import datetime
+import difflib
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.errors import SourceError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.special_files import refuse_special
+from aqualvs.vehicle_logs.dataflash import (
+    looks_like_dataflash,
+    looks_like_dataflash_text,
+    read_dataflash,
+    read_dataflash_text,
+)
+from aqualvs.vehicle_logs.mavlink_frames import looks_like_frames
+from aqualvs.vehicle_logs.tlog import read_tlog
+from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of, wrap
+
+TIME_COLUMNS = ("time_s", "time")
+VALUE_COLUMNS = ("depth_m", "heading_deg", "roll_deg", "pitch_deg")
+_COLUMNS = TIME_COLUMNS + VALUE_COLUMNS
+_STEMS = {name.rsplit("_", 1)[0]: name for name in VALUE_COLUMNS} | {"yaw": "heading_deg"}
+_UNITS = frozenset({"", "m", "cm", "mm", "ft", "deg", "rad", "degrees", "radians", "cdeg"})
+_LARGEST = {"depth_m": 12000.0, "heading_deg": 720.0, "roll_deg": 360.0, "pitch_deg": 180.0}
+# Waves and the sensor's zero put a vehicle this far above the surface, no further.
+_ABOVE_SURFACE_M = -2.0
+# A computer whose clock the network sets is right to well below this.
+_UTC_SIGMA_S = 2.0
+
+
+def read_csv_log(path: Path) -> VehicleLog:
+    """Read a table of depth and heading.
+
+    Raises
+    ------
+    SourceError
+        One line that names the file, the line, the value and the remedy.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise SourceError(f"{path}: is not text; save the table as CSV in UTF-8") from None
+    rows = _rows(text, path)
+    if len(rows) < 2:
+        raise SourceError(
+            f"{path}: holds no rows; write 'time_s,depth_m,heading_deg' and a line for each time"
+        )
+    names, ignored = _columns([cell.strip() for cell in rows[0][1]], path)
+    notes = (f"columns not used: {', '.join(ignored)}",) if ignored else ()
+    if len(rows) > 2 and len(rows[-1][1]) < len(names):
+        # A recording that was interrupted ends within a line.
+        notes = (*notes, f"line {rows[-1][0]}, the last, is cut short and left out")
+        del rows[-1]
+    table, start_utc_s = _table(names, rows[1:], path)
+    return _log(path, table, start_utc_s, notes)
+
+
+def _rows(text: str, path: Path) -> list[tuple[int, list[str]]]:
+    """Return the lines that hold anything, with their numbers."""
+    reader = csv.reader(text.splitlines())
+    try:
+        return [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as fault:
+        raise SourceError(f"{path}: line {reader.line_num}: {fault}; mend the line") from None
+
+
+def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
+    if len(names) == 1 and ";" in names[0]:
+        raise SourceError(f"{path}: is separated by semicolons; save it with commas")
+    for name in names:
+        if name in _COLUMNS and names.count(name) > 1:
+            raise SourceError(f"{path}: column {name} appears twice; keep one")
+    if not set(TIME_COLUMNS) & set(names):
+        _refuse_near_misses(names, TIME_COLUMNS, path)
+        raise SourceError(
+            f"{path}: has no column of times; add time_s in seconds, or time in UTC (ISO 8601)"
+        )
+    if set(TIME_COLUMNS) <= set(names):
+        raise SourceError(f"{path}: has time_s and time; keep one, so that there is one clock")
+    missing = [name for name in VALUE_COLUMNS if name not in names]
+    _refuse_near_misses(names, missing, path)
+    if "depth_m" in missing and "heading_deg" in missing:
+        raise SourceError(f"{path}: has neither depth_m nor heading_deg; add at least one of them")
+    return names, [name for name in names if name and name not in _COLUMNS]
+
+
+def _refuse_near_misses(names: list[str], wanted: tuple[str, ...] | list[str], path: Path) -> None:
+    """Refuse a column that means a missing one but writes it otherwise, or in another unit."""
+    for name in names:
+        if name in _COLUMNS:
+            continue
+        plain = name.lower().strip()
+        stem, _, unit = plain.partition("_")
+        meant = _STEMS.get(stem) if unit in _UNITS else None
+        close = difflib.get_close_matches(plain, wanted, n=1, cutoff=0.85)
+        target = meant or (close[0] if close else None)
+        if target in wanted:
+            raise SourceError(
+                f"{path}: column {name!r} is not known; write it as {target}, in that unit"
+            )
+
+
+def _table(
+    names: list[str], rows: list[tuple[int, list[str]]], path: Path
+) -> tuple[dict[str, FloatArray], float | None]:
+    """Return the columns as numbers (NaN for empty cells), and the UTC of the first row."""
+    wanted = [(i, name) for i, name in enumerate(names) if name in _COLUMNS]
+    filled: dict[str, list[float]] = {name: [] for _, name in wanted}
+    for line, row in rows:
+        if len(row) != len(names):
+            raise SourceError(
+                f"{path}: line {line} has {len(row)} values for {len(names)} columns; mend the line"
+            )
+        for i, name in wanted:
+            filled[name].append(_number(name, row[i].strip(), path, line))
+    table = {name: np.array(values) for name, values in filled.items()}
+    lines = [line for line, _ in rows]
+    start = None
+    if "time" in table:
+        start = float(table["time"][0])
+        table["time_s"] = table.pop("time") - start
+    _check_times(table["time_s"], lines, path)
+    if "depth_m" in table:
+        _check_depths(table["depth_m"], lines, path)
+    return table, start
+
+
+def _number(name: str, cell: str, path: Path, line: int) -> float:
+    if name == "time":
+        return _utc(cell, path, line)
+    if not cell:
+        if name == "time_s":
+            raise SourceError(f"{path}: line {line} has no time_s; write one in every row")
+        return math.nan
+    try:
+        value = float(cell)
+    except ValueError:
+        raise SourceError(
+            f"{path}: line {line}: {name} is {cell!r}; write a plain number"
+        ) from None
+    if math.isnan(value) and name != "time_s":
+        return value
+    if not math.isfinite(value) or abs(value) > _LARGEST.get(name, math.inf):
+        unit = name.rsplit("_", 1)[1]
+        raise SourceError(
+            f"{path}: line {line}: {name} is {cell!r}; write the value in {unit}, or leave it empty"
+        )
+    return value
+
+
+def _utc(cell: str, path: Path, line: int) -> float:
+    try:
+        stamp = datetime.datetime.fromisoformat(cell)
+    except ValueError:
+        raise SourceError(
+            f"{path}: line {line}: time is {cell!r}; write UTC as 2026-05-31T12:00:00.250Z, "
+            "or give seconds in a column time_s"
+        ) from None
+    if stamp.tzinfo is None:
+        stamp = stamp.replace(tzinfo=datetime.UTC)
+    return stamp.timestamp()
+
+
+def _check_times(time_s: FloatArray, lines: list[int], path: Path) -> None:
+    back = np.flatnonzero(np.diff(time_s) < 0.0)
+    if len(back):
+        i = int(back[0])
+        raise SourceError(
+            f"{path}: line {lines[i + 1]}: the time goes back by {time_s[i] - time_s[i + 1]:g} s; "
+            "sort the rows by time, or cut the file there"
+        )
+
+
+def _check_depths(depth_m: FloatArray, lines: list[int], path: Path) -> None:
+    known = depth_m[np.isfinite(depth_m)]
+    if len(known) and np.median(known) < _ABOVE_SURFACE_M:
+        i = int(np.nanargmin(depth_m))
+        raise SourceError(
+            f"{path}: line {lines[i]}: depth_m is {depth_m[i]:g}, above the surface; write depths "
+            "positive down"
+        )
+
+
+def _log(
+    path: Path, table: dict[str, FloatArray], start_utc_s: float | None, notes: tuple[str, ...]
+) -> VehicleLog:
+    time_s = table["time_s"]
+    repeated = int(np.count_nonzero(np.diff(time_s) == 0.0))
+    if repeated:
+        notes = (*notes, f"{repeated} rows repeat the time of the row before and are left out")
+
+    def angle(name: str, interpolation: Interpolation) -> Signal | None:
+        if name not in table:
+            return None
+        turned = np.deg2rad(table[name])
+        turned = bearing_of(turned) if interpolation is Interpolation.BEARING else wrap(turned)
+        return Signal.from_samples(time_s, turned, interpolation)
+
+    return VehicleLog(
+        name=str(path),
+        kind="csv",
+        depth=Signal.from_samples(time_s, table["depth_m"]) if "depth_m" in table else None,
+        heading=angle("heading_deg", Interpolation.BEARING),
+        roll=angle("roll_deg", Interpolation.ANGLE),
+        pitch=angle("pitch_deg", Interpolation.ANGLE),
+        start_utc_s=start_utc_s,
+        start_utc_sigma_s=None if start_utc_s is None else _UTC_SIGMA_S,
+        sources={n.rsplit("_", 1)[0]: f"column {n}" for n in VALUE_COLUMNS if n in table},
+        notes=notes,
+    )
+
+
+_HEAD_BYTES = 65536
+_OTHERS = {
+    b"ULog": "is a PX4 log (ULog); convert it to CSV with columns time_s, depth_m, heading_deg",
+    b"\x89MCAP": "is an MCAP recording; export its MAVLink messages as .tlog",
+    b"PK\x03\x04": "is a ZIP archive; unpack it first",
+    b"\x1f\x8b": "is compressed with gzip; unpack it first",
+}
+
+
+def read_vehicle_log(path: str | Path) -> VehicleLog:
+    """Read a vehicle's log; the format is told from the content, not from the name.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV table, MAVLink telemetry log (`.tlog`) or ArduPilot dataflash log (`.BIN`, or its text
+        form `.log`).
+
+    Returns
+    -------
+    log : VehicleLog
+        Of a file that is cut short or damaged in places, what is readable; `log.notes` says what is
+        not.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or holds neither depth nor heading; one line that names the
+        file, the value and the remedy.
+    """
+    source = Path(path)
+    refuse_special(source)
+    head = _head(source)
+    if not head:
+        raise SourceError(f"{source}: is empty; give the log of the dive")
+    log = _reader(head, source)(source)
+    if log.depth is None and log.heading is None:
+        raise SourceError(f"{source}: holds neither depth nor heading; give another log")
+    return log
+
+
+def _reader(head: bytes, path: Path) -> Callable[[Path], VehicleLog]:
+    """Return what reads such a file."""
+    if looks_like_dataflash(head):
+        return read_dataflash
+    if looks_like_dataflash_text(head):
+        return read_dataflash_text
+    for begin, remedy in _OTHERS.items():
+        if head.startswith(begin):
+            raise SourceError(f"{path}: {remedy}")
+    if looks_like_frames(head):
+        return read_tlog
+    if b"\0" in head:
+        raise SourceError(
+            f"{path}: is no MAVLink telemetry log (.tlog), no dataflash log (.BIN) and no table "
+            "(CSV); give one of these"
+        )
+    return read_csv_log
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; give the path of the vehicle's log") from None
+    except IsADirectoryError:
+        raise SourceError(f"{path}: is a folder; give the path of a log in it") from None
+    except OSError as fault:
+        raise SourceError(f"{path}: cannot be read ({fault.strerror})") from None

@@ -1,0 +1,426 @@
+"""The offset between a dive's clock and the vehicle's, found from the motion that both saw.
+
+The net stands still: when the vehicle turns right, the net's far normal turns left in the dome's
+frame, and when its nose rises, the normal falls. So posture yaw changes opposite to heading, and
+posture pitch opposite to the vehicle's pitch. Rates are compared, between about 0.03 and 0.5 Hz:
+the bearing of the net itself, which changes as the vehicle moves along a cage, and the compass's
+drift are slower.
+
+The offset that clocks give: the log's UTC against the time that a video's container states.
+"""
+
+import datetime
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.vehicle_logs.motion import (
+    STEP_S,
+    Channel,
+    Match,
+    Scores,
+    match_at,
+    rates_of,
+    robust_sigma,
+    scores_of,
+    without_outliers,
+)
+from aqualvs.vehicle_logs.vehicle_log import Signal, VehicleLog
+
+_LEAST_OVERLAP_S = 30.0
+_LONGEST_S = 24 * 3600.0
+_LOBE_S = 1.0
+"""Within this of the best offset, another is no rival but the same peak."""
+_N_RIVALS = 30
+_BLOCK_S = 3.0
+"""Longer than a motion lasts, so that blocks are independent witnesses."""
+_LEAST_MARGIN = 2.5
+"""By how many standard deviations the best offset must explain the blocks better than any other."""
+_START_SIGMAS = 4.0
+_ITERATIONS = 8
+_HUBER = 1.5
+_CONVERGED_S = 1e-5
+_PROBE_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class PostureTrack:
+    """Posture over a dive.
+
+    Attributes
+    ----------
+    time_s : array, shape (n,)
+        Dive time, increasing.
+    yaw, pitch : array, shape (n,)
+        Posture to the net in radians (paper, Eq. 24-26); anything where not valid.
+    valid : bool array, shape (n,)
+        Where the posture is valid.
+    """
+
+    time_s: FloatArray
+    yaw: FloatArray
+    pitch: FloatArray
+    valid: BoolArray
+
+    def __post_init__(self) -> None:
+        shapes = {np.shape(a) for a in (self.time_s, self.yaw, self.pitch, self.valid)}
+        if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+            raise ValueError(f"time_s, yaw, pitch and valid have shapes {shapes}; give one length")
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOffset:
+    """Offset between two clocks: log time = dive time + offset_s.
+
+    Attributes
+    ----------
+    offset_s : float
+        Seconds.
+    sigma_s : float
+        Its standard deviation.
+    correlation : float or None
+        Between the vehicle's and the net's motion at this offset, 1 for full agreement; None where
+        the offset does not come from motion.
+    how : str
+        In words, where it comes from.
+    """
+
+    offset_s: float
+    sigma_s: float
+    correlation: float | None
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetRefusal:
+    """No offset, and why; falsy.
+
+    Attributes
+    ----------
+    reason : str
+        One line, with the remedy.
+    """
+
+    reason: str
+
+    def __bool__(self) -> Literal[False]:
+        """Return False, so that `if offset:` reads well."""
+        return False
+
+
+def find_time_offset(
+    log: VehicleLog, posture_track: PostureTrack, *, start: TimeOffset | None = None
+) -> TimeOffset | OffsetRefusal:
+    """Find the offset at which log and dive show the same motion.
+
+    Parameters
+    ----------
+    log : VehicleLog
+        With heading, pitch or both.
+    posture_track : PostureTrack
+        Of the dive.
+    start : TimeOffset, optional
+        What clocks say. Where motion alone leaves a doubt, only offsets within four of its sigmas
+        are considered.
+
+    Returns
+    -------
+    offset : TimeOffset or OffsetRefusal
+        Refused, where no offset clearly explains the motion best: too little motion or overlap,
+        or motion that repeats itself.
+
+    Notes
+    -----
+    Each channel (yaw against heading, pitch against pitch) gives a correlation coefficient rho for
+    every offset; the score is the sum of -n/2 log(1 - rho²) over channels with the right sign, n
+    the number of independent pairs (Bartlett 1946). The best offset must explain blocks of three
+    seconds better than every rival and than no motion at all, by 2.5 standard deviations of the
+    blocks' votes (Vuong 1989). It is then refined by weighted least squares; its sigma
+    comes from the scatter of the blocks' scores (sandwich estimate), so that it holds for residuals
+    of any colour.
+    """
+    channels = _channels(log, posture_track)
+    if isinstance(channels, OffsetRefusal):
+        return channels
+    scores = scores_of(channels)
+    found = _clear_peak(channels, scores, "")
+    if not found and start is not None:
+        near = np.abs(scores.offset_s - start.offset_s) <= _START_SIGMAS * start.sigma_s + _LOBE_S
+        where = f" within {_START_SIGMAS * start.sigma_s:.0f} s of what the clocks say"
+        found = _clear_peak(channels, _only(scores, near), where)
+    if isinstance(found, OffsetRefusal):
+        return found
+    refined = _refine(channels, found)
+    return refined if start is None else _compared(refined, start)
+
+
+def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | OffsetRefusal:
+    """Pair the angles that both sides have, on one grid each."""
+    pairs = [("yaw", track.yaw, log.heading), ("pitch", track.pitch, log.pitch)]
+    logged = [(name, seen, angle) for name, seen, angle in pairs if angle is not None]
+    if not logged:
+        return OffsetRefusal(
+            f"{log.name} holds neither heading nor pitch; give the offset yourself"
+        )
+    seen = [
+        Signal.from_samples(track.time_s[kept], values[kept])
+        for _, values, _ in logged
+        for kept in (without_outliers(values, track.valid),)
+    ]
+    tracks = [angle for angle in seen if angle is not None]
+    if len(tracks) < len(seen):
+        return OffsetRefusal("the dive has no valid posture; give the offset yourself")
+    dive = min(a.time_s[0] for a in tracks), max(a.time_s[-1] for a in tracks)
+    span = min(a.time_s[0] for _, _, a in logged), max(a.time_s[-1] for _, _, a in logged)
+    for what, (begin, end) in (("the dive", dive), (log.name, span)):
+        if end - begin > _LONGEST_S:
+            return OffsetRefusal(
+                f"{what} covers {(end - begin) / 3600.0:.0f} hours; cut it, or check that its "
+                "times are seconds"
+            )
+    return tuple(
+        Channel(name, rates_of(track_of, *dive), rates_of(angle, *span))
+        for (name, _, angle), track_of in zip(logged, tracks, strict=True)
+    )
+
+
+def _clear_peak(channels: tuple[Channel, ...], scores: Scores, where: str) -> float | OffsetRefusal:
+    """Return the offset on the grid that is clearly the best."""
+    enough = scores.overlap_s >= _LEAST_OVERLAP_S
+    if not enough.any():
+        longest = float(scores.overlap_s.max(initial=0.0))
+        return OffsetRefusal(
+            f"dive and log share at most {longest:.0f} s with valid posture{where}, and "
+            f"{_LEAST_OVERLAP_S:.0f} s are needed; give the offset yourself"
+        )
+    peaks = _peaks(scores, enough)
+    if not peaks:
+        return OffsetRefusal(
+            f"posture and log show no common motion at any offset{where}; give the offset yourself"
+        )
+    best, rivals = peaks[0], peaks[1:]
+    margin, rival = _margin(channels, best, rivals)
+    if margin >= _LEAST_MARGIN:
+        return best
+    if rival is None:
+        return OffsetRefusal(
+            f"the motion common to posture and log is too small to tell the offset{where} (best "
+            f"{best:.2f} s, {margin:.1f} sigma from chance); give the offset yourself"
+        )
+    return OffsetRefusal(
+        f"offsets of {best:.2f} s and {rival:.2f} s explain the motion almost equally well{where} "
+        f"({margin:.1f} sigma apart); give the offset yourself"
+    )
+
+
+def _only(scores: Scores, near: BoolArray) -> Scores:
+    return Scores(scores.offset_s, scores.score, np.where(near, scores.overlap_s, 0.0))
+
+
+def _peaks(scores: Scores, allowed: BoolArray) -> list[float]:
+    """Return the offsets of the best peaks, the highest first."""
+    height = np.where(allowed, scores.score, 0.0)
+    # Padded, since a peak may be the first or the last.
+    # A second to import, which only this needs.
+    from scipy.signal import find_peaks
+
+    tops, _ = find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))
+    ranked = tops[np.argsort(height[tops - 1])[::-1]] - 1
+    return [float(scores.offset_s[i]) for i in ranked[: _N_RIVALS + 1]]
+
+
+def _margin(
+    channels: tuple[Channel, ...], best: float, rivals: list[float]
+) -> tuple[float, float | None]:
+    """Return by how many sigmas the best explains the blocks better, and than which rival.
+
+    The rival is None where it is the absence of common motion.
+    """
+    at_best = [match_at(channel, best) for channel in channels]
+    scales = [_scale(match) for match in at_best]
+    still = [c.seen.rate for c in channels]
+    chosen = [match.residual for match in at_best]
+    worst, which = _vote(still, chosen, scales), None
+    for rival in rivals:
+        others = [match_at(channel, rival).residual for channel in channels]
+        votes = _vote(others, chosen, scales)
+        if votes < worst:
+            worst, which = votes, rival
+    return worst, which
+
+
+def _scale(match: Match) -> float:
+    spread = robust_sigma(match.residual[match.predicted])
+    return spread if spread > 0.0 else 1.0
+
+
+def _vote(others: list[FloatArray], chosen: list[FloatArray], scales: list[float]) -> float:
+    """Return by how many sigmas the chosen residuals are smaller, block by block."""
+    gain = np.zeros(len(chosen[0]))
+    for other, residual, scale in zip(others, chosen, scales, strict=True):
+        gain += (other / scale) ** 2 - (residual / scale) ** 2
+    sums = _blocks(gain)
+    spread = math.sqrt(float(sums @ sums))
+    return float(sums.sum()) / spread if spread > 0.0 else 0.0
+
+
+def _blocks(values: FloatArray) -> FloatArray:
+    """Return the sums over blocks."""
+    return np.add.reduceat(values, np.arange(0, len(values), round(_BLOCK_S / STEP_S)))
+
+
+def _refine(channels: tuple[Channel, ...], start_s: float) -> TimeOffset:
+    """Return the offset that fits best by weighted least squares, with its sandwich sigma."""
+    offset = start_s
+    for _ in range(_ITERATIONS):
+        pull, stiffness = _normal_equation(channels, offset, _weights(channels, offset))
+        step = float(np.clip(pull.sum() / stiffness.sum(), -_LOBE_S / 4, _LOBE_S / 4))
+        offset += step
+        if abs(step) < _CONVERGED_S:
+            break
+    matches = [match_at(channel, offset) for channel in channels]
+    best = max(match.correlation for match in matches)
+    shared_s = STEP_S * max(np.count_nonzero(match.predicted) for match in matches)
+    return TimeOffset(offset, _sigma(channels, offset), best, _words(matches, channels, shared_s))
+
+
+def _weights(channels: tuple[Channel, ...], offset_s: float) -> list[FloatArray]:
+    """Return Huber's weights of every channel's samples, over the residuals' variance."""
+    weights = []
+    for channel in channels:
+        match = match_at(channel, offset_s)
+        scale = _scale(match)
+        size = np.abs(match.residual) / scale
+        weights.append(1.0 / np.maximum(size / _HUBER, 1.0) / scale**2)
+    return weights
+
+
+def _normal_equation(
+    channels: tuple[Channel, ...], offset_s: float, weights: list[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return every sample's pull on the offset, and its stiffness.
+
+    A later offset changes the residual by the gain times the slope of the logged rate.
+    """
+    n = len(channels[0].seen.rate)
+    pull, stiffness = np.zeros(n), np.full(n, 1e-300)
+    for channel, weight in zip(channels, weights, strict=True):
+        match = match_at(channel, offset_s)
+        change = match.gain * match.slope
+        pull -= np.where(match.predicted, weight * change * match.residual, 0.0)
+        stiffness += np.where(match.predicted, weight * change**2, 0.0)
+    return pull, stiffness
+
+
+def _sigma(channels: tuple[Channel, ...], offset_s: float) -> float:
+    """Return the standard deviation of the offset from the scatter of the blocks' pulls.
+
+    The pull's derivative is taken by differences: noise in the log makes its slopes, and with them
+    the stiffness, too large. Each block's pull is raised by its own share in finding the offset
+    (MacKinnon & White 1985, HC3), which matters when few turns carry it.
+    """
+    weights = _weights(channels, offset_s)
+    pull, stiffness = _normal_equation(channels, offset_s, weights)
+    shares = _blocks(stiffness) / stiffness.sum()
+    sums = _blocks(pull) / np.maximum(1.0 - shares, 0.1)
+    later, _ = _normal_equation(channels, offset_s + _PROBE_S, weights)
+    earlier, _ = _normal_equation(channels, offset_s - _PROBE_S, weights)
+    fall = float(earlier.sum() - later.sum()) / (2.0 * _PROBE_S)
+    slope = fall if fall > 0.0 else float(stiffness.sum())
+    return math.sqrt(float(sums @ sums)) / slope
+
+
+def _words(matches: list[Match], channels: tuple[Channel, ...], shared_s: float) -> str:
+    parts = [
+        f"{channel.name} (correlation {match.correlation:.2f}, share {match.gain:.2f})"
+        for channel, match in zip(channels, matches, strict=True)
+    ]
+    return f"motion over {shared_s:.0f} s: {' and '.join(parts)}"
+
+
+def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
+    """Add what the clocks say."""
+    off = start.offset_s - found.offset_s
+    doubt = math.hypot(found.sigma_s, start.sigma_s)
+    verdict = "agree" if abs(off) <= _START_SIGMAS * doubt else "are not to be trusted"
+    how = f"{found.how}; the clocks {verdict} ({off:+.1f} s off)"
+    return TimeOffset(found.offset_s, found.sigma_s, found.correlation, how)
+
+
+VIDEO_UTC_SIGMA_S = 5.0
+"""Containers state whole seconds, some write them when recording ends or the file is copied, and
+few cameras' clocks are set to better than this."""
+
+
+def dive_start_utc(video: str | Path) -> float | None:
+    """Return the UTC at which a video says that it was created, in seconds since 1970.
+
+    Only the container's `creation_time` counts; times of the file change when it is copied.
+
+    Parameters
+    ----------
+    video : str or Path
+        A video file.
+
+    Returns
+    -------
+    start_utc_s : float or None
+        None where the container does not state it, or states the zero of its calendar.
+    """
+    import av
+
+    try:
+        with av.open(str(video), metadata_errors="ignore") as container:
+            stamps = [container.metadata.get("creation_time")]
+            stamps += [stream.metadata.get("creation_time") for stream in container.streams.video]
+    except (av.error.FFmpegError, OSError):
+        return None
+    for stamp in stamps:
+        seconds = _seconds(stamp) if stamp else None
+        # Cameras without a clock write the zero of their calendar: 1904, 1970 or 1980.
+        if seconds is not None and seconds > _FIRST_BELIEVED:
+            return seconds
+    return None
+
+
+_FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
+
+
+def _seconds(stamp: str) -> float | None:
+    try:
+        moment = datetime.datetime.fromisoformat(stamp)
+    except ValueError:
+        return None
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.UTC)
+    return moment.timestamp()
+
+
+def offset_from_clocks(
+    log: VehicleLog, dive_start_utc_s: float | None, sigma_s: float = VIDEO_UTC_SIGMA_S
+) -> TimeOffset | OffsetRefusal:
+    """Return the offset that the clocks of dive and log give.
+
+    Parameters
+    ----------
+    log : VehicleLog
+        With `start_utc_s`.
+    dive_start_utc_s : float or None
+        UTC of dive time 0.
+    sigma_s : float
+        How far to trust it.
+    """
+    if log.start_utc_s is None or log.start_utc_sigma_s is None:
+        return OffsetRefusal(f"{log.name} does not know the time of day")
+    if dive_start_utc_s is None:
+        return OffsetRefusal("the dive does not know the time of day")
+    return TimeOffset(
+        dive_start_utc_s - log.start_utc_s,
+        math.hypot(sigma_s, log.start_utc_sigma_s),
+        None,
+        "clocks of dive and log",
+    )

@@ -1,0 +1,365 @@
+"""MAVLink telemetry logs (`.tlog`), as ground stations write them.
+
+Which message is read for what, and why:
+
+- attitude and heading: `ATTITUDE`, which carries the autopilot's time and comes fastest. Where it
+  is missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then `VFR_HUD` (whole
+  ones).
+- depth: `GLOBAL_POSITION_INT.relative_alt`, height above home, which ArduSub puts at the surface.
+  `VFR_HUD.alt` is above mean sea level and 0 without a home; `AHRS2.altitude` comes from the spare
+  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, tells changes only: what the
+  pressure was at the surface, the log does not say.
+- velocity: `LOCAL_POSITION_NED`, then `GLOBAL_POSITION_INT` in cm/s.
+
+Which of several depths in a log to believe.
+
+One clock for a telemetry log: the autopilot's, through reboots, with its place in UTC.
+"""
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from aqualvs.errors import SourceError
+from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.vehicle_logs.mavlink_frames import Frames, Table, read_frames
+from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of
+
+_STUCK_SHARE = 0.1
+_DIVED_M = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A depth that a log holds.
+
+    Attributes
+    ----------
+    label : str
+        Where it stands in the log.
+    depth : Signal or None
+        Metres, positive down; None where the log does not have it.
+    """
+
+    label: str
+    depth: Signal | None
+
+
+def choose_depth(
+    candidates: Sequence[Candidate], pressure_depth: Signal | None
+) -> tuple[Candidate | None, str | None]:
+    """Return the first candidate that is there and moves, and a note where one does not.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        The best first.
+    pressure_depth : Signal or None
+        Depth that the outer pressure alone tells, up to a constant. An estimate that stands still
+        while the pressure changes is the estimate of a filter without origin, not a depth.
+    """
+    dived = 0.0 if pressure_depth is None else _span(pressure_depth)
+    note = None
+    for candidate in candidates:
+        if candidate.depth is None:
+            continue
+        if dived > _DIVED_M and _span(candidate.depth) < _STUCK_SHARE * dived:
+            note = note or (
+                f"{candidate.label} stands still while the pressure changes by {dived:.1f} m of "
+                "water; not used"
+            )
+            continue
+        return candidate, note
+    return None, note
+
+
+def _span(depth: Signal) -> float:
+    low, high = np.percentile(depth.values, (1.0, 99.0))
+    return float(high - low)
+
+
+_BOOT = "time_boot_ms"
+_REBOOT_S = 2.0
+_BLOCK_S = 30.0
+"""A tether delays some message by next to nothing in so long a time."""
+_CLOCK_STEP_S = 1.0
+_UTC_SIGMA_S = 2.0
+"""A computer whose clock the network sets is right to well below this."""
+_FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryClock:
+    """Log time of every message.
+
+    Attributes
+    ----------
+    at : array, shape (n,)
+        Places in the file of the messages that the clock rests on.
+    log_s : array, shape (n,)
+        Their log time.
+    boot_at : array, shape (k,)
+        Place in the file from which each run of the autopilot counts.
+    boot_s : array, shape (k,)
+        Log time at which each run began.
+    start_utc_s, start_utc_sigma_s : float or None
+        UTC of log time 0, and how far to trust it.
+    notes : tuple of str
+        Reboots, and steps of the computer's clock.
+    """
+
+    at: IntArray
+    log_s: FloatArray
+    boot_at: IntArray
+    boot_s: FloatArray
+    start_utc_s: float | None
+    start_utc_sigma_s: float | None
+    notes: tuple[str, ...]
+
+    def of(self, table: Table) -> FloatArray:
+        """Return the log time of a table's messages.
+
+        A message without time of its own takes it from its neighbours in the file.
+        """
+        if _BOOT not in (table.payload.dtype.names or ()) or not len(self.boot_at):
+            between: FloatArray = np.interp(table.at, self.at, self.log_s)
+            return between
+        run = np.maximum(np.searchsorted(self.boot_at, table.at, side="right") - 1, 0)
+        return table.payload[_BOOT] / 1e3 + self.boot_s[run]
+
+
+def telemetry_clock(tables: Mapping[str, Table]) -> TelemetryClock:
+    """Return the clock of an autopilot's messages; there must be at least one."""
+    timed = [t for t in tables.values() if _BOOT in (t.payload.dtype.names or ())]
+    if not timed:
+        table = max(tables.values(), key=lambda t: len(t.at))
+        received = table.received_us / 1e6
+        none = np.zeros(0)
+        return _with_utc(table, received - received[0], none.astype(np.int64), none, ())
+    table = max(timed, key=lambda t: len(t.at))
+    boot, received = table.payload[_BOOT] / 1e3, table.received_us / 1e6
+    firsts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(boot) < -_REBOOT_S)])
+    starts = [-float(boot[0])]
+    for before, first, end in zip(firsts, firsts[1:], [*firsts[2:], len(boot)], strict=False):
+        # The fastest messages to either side tell how much time passed in between.
+        old = slice(max(before, first - 100), first)
+        new = slice(first, min(end, first + 100))
+        gone = np.min(received[new] - boot[new]) - np.min(received[old] - boot[old])
+        starts.append(starts[-1] + float(gone))
+    notes = (f"the autopilot restarted {len(firsts) - 1} times",) if len(firsts) > 1 else ()
+    boot_at, boot_s = table.at[firsts].copy(), np.array(starts)
+    boot_at[0] = 0
+    run = np.searchsorted(boot_at, table.at, side="right") - 1
+    return _with_utc(table, boot + boot_s[run], boot_at, boot_s, notes)
+
+
+def _with_utc(
+    table: Table, log_s: FloatArray, boot_at: IntArray, boot_s: FloatArray, notes: tuple[str, ...]
+) -> TelemetryClock:
+    """Place log time 0 in UTC by the messages that were received with the least delay."""
+    behind = table.received_us / 1e6 - log_s
+    firsts = np.flatnonzero(np.diff(np.floor(log_s / _BLOCK_S), prepend=-np.inf))
+    least = np.minimum.reduceat(behind, firsts)
+    start, sigma = float(np.median(least)), _UTC_SIGMA_S
+    if start < _FIRST_BELIEVED:
+        return TelemetryClock(table.at, log_s, boot_at, boot_s, None, None, notes)
+    steps = np.diff(least)
+    large = np.flatnonzero(np.abs(steps) > _CLOCK_STEP_S)
+    if len(large):
+        sigma = max(sigma, float(np.ptp(least)))
+        when = log_s[firsts[large[0] + 1]]
+        notes = (
+            *notes,
+            f"the recording computer's clock was set by {steps[large[0]]:+.1f} s at about "
+            f"{when:.0f} s of the log",
+        )
+    return TelemetryClock(table.at, log_s, boot_at, boot_s, start, sigma, notes)
+
+
+_NO_AUTOPILOT = 8
+_GROUND_STATION = 6
+_ARDUPILOT, _SUBMARINE = 3, 12
+_ARMED = 128
+SUB_MODES = {
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    3: "AUTO",
+    4: "GUIDED",
+    7: "CIRCLE",
+    9: "SURFACE",
+    16: "POSHOLD",
+    19: "MANUAL",
+    20: "MOTOR_DETECT",
+    21: "SURFTRAK",
+}
+"""ArduSub's flight modes (ArduSub/mode.h)."""
+_METRES_PER_HPA = 100.0 / (1025.0 * 9.80665)
+_UNKNOWN_HEADING = 65535
+
+_Tables = Mapping[str, Table]
+_Found = tuple[Signal | None, str]
+
+
+def read_tlog(path: Path) -> VehicleLog:
+    """Read a telemetry log.
+
+    Raises
+    ------
+    SourceError
+        If no autopilot speaks in it.
+    """
+    frames = read_frames(path.read_bytes())
+    source, others = _autopilot(frames, path)
+    spoken = {name: table[table.source == source] for name, table in frames.tables.items()}
+    tables = {name: table for name, table in spoken.items() if len(table.at)}
+    clock = telemetry_clock(tables)
+    depth, stuck = _depth(tables, clock)
+    heading, heading_from = _heading(tables, clock)
+    velocity, velocity_from = _velocity(tables, clock)
+    roll = _signal(tables, clock, "ATTITUDE", "roll", interpolation=Interpolation.ANGLE)
+    pitch = _signal(tables, clock, "ATTITUDE", "pitch", interpolation=Interpolation.ANGLE)
+    armed, modes = _armed_and_modes(tables, clock)
+    sources = {
+        "depth": depth.label if depth else "",
+        "heading": heading_from,
+        "roll": "ATTITUDE.roll" if roll else "",
+        "pitch": "ATTITUDE.pitch" if pitch else "",
+        "velocity_ned": velocity_from,
+        "armed": "HEARTBEAT.base_mode" if armed else "",
+    }
+    return VehicleLog(
+        name=str(path),
+        kind="tlog",
+        depth=depth.depth if depth else None,
+        heading=heading,
+        roll=roll,
+        pitch=pitch,
+        velocity_ned=velocity,
+        armed=armed,
+        modes=modes,
+        start_utc_s=clock.start_utc_s,
+        start_utc_sigma_s=clock.start_utc_sigma_s,
+        sources={name: where for name, where in sources.items() if where},
+        notes=tuple(n for n in (others, *_damage(frames), *clock.notes, stuck) if n),
+    )
+
+
+def _autopilot(frames: Frames, path: Path) -> tuple[int, str | None]:
+    """Return whose messages to read, and a note where several vehicles speak."""
+    beats = frames.tables.get("HEARTBEAT")
+    speakers: set[int] = set()
+    if beats is not None:
+        kind, autopilot = beats.payload["type"], beats.payload["autopilot"]
+        speakers = set(beats.source[(kind != _GROUND_STATION) & (autopilot != _NO_AUTOPILOT)])
+    telling = [t.source for name, t in frames.tables.items() if name not in ("HEARTBEAT",)]
+    said = np.concatenate(telling) if telling else np.zeros(0, np.int64)
+    if not speakers:
+        # A log cut out of a longer one may lack heartbeats; autopilots are component 1.
+        speakers = {int(source) for source in np.unique(said) if source % 256 == 1}
+    counts = {int(source): int(np.count_nonzero(said == source)) for source in speakers}
+    if not counts or not max(counts.values()):
+        raise SourceError(
+            f"{path}: no autopilot tells depth or attitude in {frames.n_frames} messages; "
+            "give the log of the vehicle's own connection"
+        )
+    best = max(counts, key=lambda source: counts[source])
+    systems = sorted({source >> 8 for source, n in counts.items() if n})
+    if len(systems) == 1:
+        return best, None
+    named = ", ".join(str(system) for system in systems)
+    return best, f"vehicles {named} speak; {best >> 8} is read, which speaks most"
+
+
+def _damage(frames: Frames) -> list[str]:
+    notes = []
+    if frames.skipped:
+        lost = sum(length for _, length in frames.skipped)
+        notes.append(
+            f"{lost} bytes are no messages and are left out, the first at byte "
+            f"{frames.skipped[0][0]}: the file is damaged or cut short"
+        )
+    if frames.n_failed:
+        notes.append(f"{frames.n_failed} messages have a wrong checksum and are left out")
+    return notes
+
+
+def _signal(
+    tables: _Tables,
+    clock: TelemetryClock,
+    message: str,
+    field: str,
+    scale: float = 1.0,
+    interpolation: Interpolation = Interpolation.LINEAR,
+) -> Signal | None:
+    table = tables.get(message)
+    if table is None:
+        return None
+    values: FloatArray = scale * table.payload[field].astype(float)
+    if interpolation is Interpolation.BEARING:
+        values = bearing_of(values)
+    return Signal.from_samples(clock.of(table), values, interpolation)
+
+
+def _depth(tables: _Tables, clock: TelemetryClock) -> tuple[Candidate | None, str | None]:
+    candidates = [
+        Candidate(f"{message}.{field}", _signal(tables, clock, message, field, scale))
+        for message, field, scale in (
+            ("GLOBAL_POSITION_INT", "relative_alt", -1e-3),
+            ("VFR_HUD", "alt", -1.0),
+            ("AHRS2", "altitude", -1.0),
+        )
+    ]
+    pressure = _signal(tables, clock, "SCALED_PRESSURE2", "press_abs", _METRES_PER_HPA)
+    return choose_depth(candidates, pressure)
+
+
+def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:
+    heading = _signal(tables, clock, "ATTITUDE", "yaw", interpolation=Interpolation.BEARING)
+    if heading is not None:
+        return heading, "ATTITUDE.yaw"
+    table = tables.get("GLOBAL_POSITION_INT")
+    if table is not None:
+        known = dict(tables)
+        known["GLOBAL_POSITION_INT"] = table[table.payload["hdg"] != _UNKNOWN_HEADING]
+        scale = float(np.deg2rad(0.01))
+        heading = _signal(known, clock, "GLOBAL_POSITION_INT", "hdg", scale, Interpolation.BEARING)
+        if heading is not None:
+            return heading, "GLOBAL_POSITION_INT.hdg"
+    scale = float(np.deg2rad(1.0))
+    heading = _signal(tables, clock, "VFR_HUD", "heading", scale, Interpolation.BEARING)
+    return heading, "VFR_HUD.heading (whole degrees)" if heading else ""
+
+
+def _velocity(tables: _Tables, clock: TelemetryClock) -> _Found:
+    for message, scale in (("LOCAL_POSITION_NED", 1.0), ("GLOBAL_POSITION_INT", 0.01)):
+        table = tables.get(message)
+        if table is None:
+            continue
+        parts = [scale * table.payload[name].astype(float) for name in ("vx", "vy", "vz")]
+        velocity = Signal.from_samples(clock.of(table), np.stack(parts, axis=1))
+        if velocity is not None:
+            return velocity, f"{message}.vx, vy, vz"
+    return None, ""
+
+
+def _armed_and_modes(
+    tables: _Tables, clock: TelemetryClock
+) -> tuple[Signal | None, tuple[tuple[float, str], ...]]:
+    table = tables.get("HEARTBEAT")
+    if table is None:
+        return None, ()
+    times, beat = clock.of(table), table.payload
+    armed = (beat["base_mode"] & _ARMED > 0).astype(float)
+    number = beat["custom_mode"].astype(np.int64)
+    changed = np.flatnonzero(np.diff(number, prepend=-1))
+    is_sub = (beat["autopilot"] == _ARDUPILOT) & (beat["type"] == _SUBMARINE)
+    modes = tuple((float(times[i]), _mode_name(int(number[i]), bool(is_sub[i]))) for i in changed)
+    return Signal.from_samples(times, armed, Interpolation.HELD), modes
+
+
+def _mode_name(number: int, is_sub: bool) -> str:
+    return SUB_MODES.get(number, f"mode {number}") if is_sub else f"mode {number}"

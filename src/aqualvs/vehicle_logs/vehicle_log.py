@@ -1,0 +1,454 @@
+"""What a vehicle wrote down of its own motion during a dive.
+
+One quantity over time, as a vehicle logged it.
+
+Where on the net the dive was looking: depth, heading and the net's bearing for dive times.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Self, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+
+IndexArray: TypeAlias = NDArray[np.intp]
+
+_TURN = 2.0 * math.pi
+_GAP_STEPS = 4.0
+"""A step this many times the usual one is a gap: single messages get lost all the time."""
+_SHORTEST_GAP_S = 0.5
+"""Within half a second a vehicle under water hardly changes what it does, so no step is a gap."""
+
+
+class Interpolation(StrEnum):
+    """What a signal does between its samples."""
+
+    LINEAR = "linear"
+    """Changes evenly."""
+    ANGLE = "angle"
+    """Changes evenly along the shorter way round; answers lie in (-pi, pi]."""
+    BEARING = "bearing"
+    """As ANGLE, but answers lie in [0, 2 pi)."""
+    HELD = "held"
+    """Keeps the value of the last sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """A quantity with its own time stamps.
+
+    Attributes
+    ----------
+    time_s : array, shape (n,)
+        Log time, strictly increasing; n is at least 1.
+    values : array, shape (n,) or (n, k)
+        Finite; SI units and radians.
+    interpolation : Interpolation
+        How values between samples are found.
+    max_gap_s : float
+        No value is told between samples that are further apart than this.
+    """
+
+    time_s: FloatArray
+    values: FloatArray
+    interpolation: Interpolation
+    max_gap_s: float
+
+    @classmethod
+    def from_samples(
+        cls,
+        time_s: ArrayLike,
+        values: ArrayLike,
+        interpolation: Interpolation = Interpolation.LINEAR,
+    ) -> Self | None:
+        """Make a signal from samples in the order of the file; None where none is usable.
+
+        Samples that are not finite are left out, and so are those whose time is not later than
+        that of all samples before them: such a value has no place on the time axis.
+        """
+        times, found = np.asarray(time_s, float), np.asarray(values, float)
+        if not len(times):
+            return None
+        finite = np.isfinite(times) & np.isfinite(found.reshape(len(times), -1)).all(axis=1)
+        times, found = times[finite], found[finite]
+        if not len(times):
+            return None
+        later = np.ones(len(times), bool)
+        later[1:] = times[1:] > np.maximum.accumulate(times)[:-1]
+        times, found = times[later], found[later]
+        return cls(times, found, interpolation, usual_gap(times))
+
+    @property
+    def n_gaps(self) -> int:
+        """Number of gaps between the first and the last sample."""
+        return int(np.count_nonzero(np.diff(self.time_s) > self.max_gap_s))
+
+    @property
+    def rate_hz(self) -> float:
+        """Usual rate of the samples; 0 for a single one."""
+        steps = np.diff(self.time_s)
+        return 1.0 / float(np.median(steps)) if len(steps) else 0.0
+
+    def at(self, time_s: ArrayLike) -> tuple[FloatArray, BoolArray]:
+        """Return the values at other times.
+
+        Parameters
+        ----------
+        time_s : array, shape (m,)
+            Log time, in any order.
+
+        Returns
+        -------
+        values : array, shape (m,) or (m, k)
+            NaN where not valid.
+        valid : bool array, shape (m,)
+            False before the first sample, after the last one and inside a gap.
+        """
+        times = np.atleast_1d(np.asarray(time_s, float))
+        last = len(self.time_s) - 1
+        before = np.clip(np.searchsorted(self.time_s, times, side="right") - 1, 0, last)
+        after = np.minimum(before + 1, last)
+        start, end = self.time_s[before], self.time_s[after]
+        inside = (times > start) & (times < end) & (end - start <= self.max_gap_s)
+        valid = inside | (times == start) | (times == end)
+        share = np.where(inside, (times - start) / np.where(end > start, end - start, 1.0), 0.0)
+        # `before` is the sample itself where the times agree, because of side="right".
+        values = self._between(before, after, share)
+        values[~valid] = np.nan
+        return values, valid
+
+    def _between(self, before: IndexArray, after: IndexArray, share: FloatArray) -> FloatArray:
+        first: FloatArray = self.values[before]
+        if self.interpolation is Interpolation.HELD:
+            return first.copy()
+        step = self.values[after] - first
+        if self.interpolation is not Interpolation.LINEAR:
+            step = wrap(step)
+        between: FloatArray = first + (share if first.ndim == 1 else share[:, None]) * step
+        if self.interpolation is Interpolation.ANGLE:
+            return wrap(between)
+        return bearing_of(between) if self.interpolation is Interpolation.BEARING else between
+
+    def unwrapped(self) -> FloatArray:
+        """Return an angle's samples without jumps of a full turn.
+
+        Across a gap the shorter way round is assumed.
+        """
+        whole: FloatArray = np.unwrap(self.values, axis=0)
+        return whole
+
+
+def usual_gap(time_s: FloatArray) -> float:
+    """Return the longest step between increasing times that is not a gap, in seconds."""
+    steps = np.diff(time_s)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    return max(_GAP_STEPS * usual, _SHORTEST_GAP_S)
+
+
+def wrap(angle: FloatArray) -> FloatArray:
+    """Return angles as their equals in (-pi, pi]."""
+    wrapped: FloatArray = math.pi - np.mod(math.pi - angle, _TURN)
+    return wrapped
+
+
+def bearing_of(angle: FloatArray) -> FloatArray:
+    """Return angles as their equals in [0, 2 pi)."""
+    turned = np.mod(angle, _TURN)
+    # A tiny negative angle rounds up to a full turn.
+    return np.where(turned >= _TURN, 0.0, turned)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleState:
+    """The vehicle at some times; NaN and False where the log does not tell.
+
+    Attributes
+    ----------
+    time_s : array, shape (n,)
+        Log time.
+    depth, heading, roll, pitch : array, shape (n,)
+        Metres, positive down; radians, heading in [0, 2 pi).
+    depth_valid, heading_valid, roll_valid, pitch_valid : bool array, shape (n,)
+        Where the log tells them.
+    """
+
+    time_s: FloatArray
+    depth: FloatArray
+    heading: FloatArray
+    roll: FloatArray
+    pitch: FloatArray
+    depth_valid: BoolArray
+    heading_valid: BoolArray
+    roll_valid: BoolArray
+    pitch_valid: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleLog:
+    """A vehicle's log: signals on one clock, each with its own time stamps.
+
+    Attributes
+    ----------
+    name : str
+        How messages call it: the file's path.
+    kind : str
+        'csv', 'tlog' (MAVLink telemetry), 'dataflash' or 'dataflash text'.
+    depth : Signal or None
+        Metres below the surface, positive down.
+    heading : Signal or None
+        Radians clockwise from north as the vehicle knows it, in [0, 2 pi).
+    roll, pitch : Signal or None
+        Radians, MAVLink's axes (forward, right, down): roll is positive with the right side down,
+        pitch with the nose up.
+    velocity_ned : Signal or None
+        North, east and down, in m/s.
+    armed : Signal or None
+        1 while the thrusters could turn, else 0.
+    modes : tuple of (float, str)
+        Log time of each change of the flight mode, and the new mode.
+    start_utc_s : float or None
+        UTC (seconds since 1970) of log time 0, where the log knows it.
+    start_utc_sigma_s : float or None
+        How far to trust it.
+    sources : mapping of str to str
+        Signal to what in the file it was read from, and why where there was a choice.
+    notes : tuple of str
+        What is wrong with the file, one line each: cut short, corrupt stretches, clock steps.
+    """
+
+    name: str
+    kind: str
+    depth: Signal | None = None
+    heading: Signal | None = None
+    roll: Signal | None = None
+    pitch: Signal | None = None
+    velocity_ned: Signal | None = None
+    armed: Signal | None = None
+    modes: tuple[tuple[float, str], ...] = ()
+    start_utc_s: float | None = None
+    start_utc_sigma_s: float | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def signals(self) -> dict[str, Signal]:
+        """The continuous signals that the log has, by name."""
+        named = {
+            "depth": self.depth,
+            "heading": self.heading,
+            "roll": self.roll,
+            "pitch": self.pitch,
+            "velocity_ned": self.velocity_ned,
+        }
+        return {name: signal for name, signal in named.items() if signal is not None}
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last log time of any signal; both NaN for a log without signals."""
+        found = list(self.signals.values())
+        if not found:
+            return float("nan"), float("nan")
+        return (
+            float(min(signal.time_s[0] for signal in found)),
+            float(max(signal.time_s[-1] for signal in found)),
+        )
+
+    def at(self, time_s: ArrayLike) -> VehicleState:
+        """Return the vehicle's state at other times; nothing is told across gaps.
+
+        Parameters
+        ----------
+        time_s : array, shape (n,)
+            Log time, in any order.
+        """
+        times = np.atleast_1d(np.asarray(time_s, float))
+        depth, depth_valid = _at(self.depth, times)
+        heading, heading_valid = _at(self.heading, times)
+        roll, roll_valid = _at(self.roll, times)
+        pitch, pitch_valid = _at(self.pitch, times)
+        return VehicleState(
+            time_s=times,
+            depth=depth,
+            heading=heading,
+            roll=roll,
+            pitch=pitch,
+            depth_valid=depth_valid,
+            heading_valid=heading_valid,
+            roll_valid=roll_valid,
+            pitch_valid=pitch_valid,
+        )
+
+    def mode_at(self, time_s: float) -> str | None:
+        """Return the flight mode at a log time; None before the first that is known."""
+        known = [mode for since, mode in self.modes if since <= time_s]
+        return known[-1] if known else None
+
+
+def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray]:
+    if signal is None:
+        return np.full(len(times), np.nan), np.zeros(len(times), bool)
+    return signal.at(times)
+
+
+# Straight up or down no bearing is left to tell.
+_LEAST_HORIZONTAL = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Places:
+    """Vehicle and net in `world` at some dive times; NaN where not valid.
+
+    Attributes
+    ----------
+    time_s : array, shape (n,)
+        Dive time.
+    depth : array, shape (n,)
+        Of the vehicle's depth sensor, in metres, positive down.
+    heading : array, shape (n,)
+        Of the vehicle's nose (the dome's y axis), radians clockwise from north, in [0, 2 pi).
+    bearing : array, shape (n,)
+        Of the net's far normal: the compass direction in which one looks when square to the net,
+        radians in [0, 2 pi). From inside a round cage it says where on the wall the vehicle is.
+    lean : array, shape (n,)
+        Elevation of the far normal: 0 for a net that hangs plumb, positive where the net's top
+        leans towards the vehicle, radians. Needs the vehicle's roll and pitch.
+    depth_valid, heading_valid, bearing_valid, lean_valid : bool array, shape (n,)
+        Where they are told.
+    ned_from_dome : array, shape (n, 3, 3)
+        Rotations from `dome` to `world` (north, east, down). The depth of a point in `dome` is
+        `depth + (ned_from_dome @ p_in_dome)[2]`, but for the lever arm between the depth sensor
+        and the dome. NaN where the heading is not known.
+    level : bool array, shape (n,)
+        Where roll or pitch is not known and the vehicle was taken as level in `ned_from_dome`
+        and `bearing`.
+    """
+
+    time_s: FloatArray
+    depth: FloatArray
+    heading: FloatArray
+    bearing: FloatArray
+    lean: FloatArray
+    depth_valid: BoolArray
+    heading_valid: BoolArray
+    bearing_valid: BoolArray
+    lean_valid: BoolArray
+    ned_from_dome: FloatArray
+    level: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class VehiclePlaces:
+    """A log next to a dive: answers for dive times.
+
+    Attributes
+    ----------
+    log : VehicleLog
+        The vehicle's log.
+    offset_s : float
+        Log time = dive time + offset_s.
+    """
+
+    log: VehicleLog
+    offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.offset_s):
+            raise OptionError(
+                f"{self.log.name}: time offset is {self.offset_s}; give a number of seconds"
+            )
+
+    def at(
+        self,
+        time_s: ArrayLike,
+        yaw: ArrayLike | None = None,
+        pitch: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
+    ) -> Places:
+        """Return where the vehicle and the net were.
+
+        Parameters
+        ----------
+        time_s : array, shape (n,)
+            Dive time.
+        yaw, pitch : array, shape (n,), optional
+            Posture to the net (paper, Eq. 24-26) at those times. Without yaw no bearing is told;
+            without pitch the net counts as square to the dome's y axis in elevation.
+        valid : bool array, shape (n,), optional
+            Where the posture is valid; everywhere that it is finite, if left out.
+
+        Notes
+        -----
+        The far normal is (tan yaw, 1, tan pitch) in `dome`, up to its length. Level, its bearing
+        is heading + yaw: yaw is positive when the far normal points to the right, headings grow
+        clockwise. Roll and pitch of the vehicle are taken into account where the log tells them.
+        """
+        times = np.atleast_1d(np.asarray(time_s, float))
+        state = self.log.at(times + self.offset_s)
+        level = ~(state.roll_valid & state.pitch_valid)
+        ned_from_dome = ned_from_dome_of(
+            state.heading, np.where(level, 0.0, state.pitch), np.where(level, 0.0, state.roll)
+        )
+        normal, posture_valid = _far_normals(len(times), yaw, pitch, valid)
+        normal_in_ned = np.einsum("nij,nj->ni", ned_from_dome, normal)
+        north, east, down = normal_in_ned.T
+        horizontal = np.hypot(north, east)
+        seen = posture_valid & state.heading_valid
+        bearing_valid = seen & (horizontal > _LEAST_HORIZONTAL)
+        lean_valid = seen & ~level & (pitch is not None)
+        return Places(
+            time_s=times,
+            depth=state.depth,
+            heading=state.heading,
+            bearing=np.where(bearing_valid, bearing_of(np.arctan2(east, north)), np.nan),
+            lean=np.where(lean_valid, np.arctan2(-down, horizontal), np.nan),
+            depth_valid=state.depth_valid,
+            heading_valid=state.heading_valid,
+            bearing_valid=bearing_valid,
+            lean_valid=lean_valid,
+            ned_from_dome=ned_from_dome,
+            level=level,
+        )
+
+
+def ned_from_dome_of(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
+    """Return rotations from `dome` (right, forward, up) to north, east, down.
+
+    Parameters
+    ----------
+    heading, pitch, roll : array, shape (n,)
+        Of the vehicle, radians, as MAVLink's ATTITUDE: heading clockwise from north, pitch positive
+        with the nose up, roll positive with the right side down; applied in the order roll, pitch,
+        heading.
+
+    Returns
+    -------
+    ned_from_dome : array, shape (n, 3, 3)
+    """
+    turn, nod, tilt = np.broadcast_arrays(*(np.asarray(a, float) for a in (heading, pitch, roll)))
+    ch, sh, cp, sp = np.cos(turn), np.sin(turn), np.cos(nod), np.sin(nod)
+    cr, sr = np.cos(tilt), np.sin(tilt)
+    forward = np.stack([ch * cp, sh * cp, -sp], axis=-1)
+    right = np.stack([ch * sp * sr - sh * cr, sh * sp * sr + ch * cr, cp * sr], axis=-1)
+    down = np.stack([ch * sp * cr + sh * sr, sh * sp * cr - ch * sr, cp * cr], axis=-1)
+    return np.stack([right, forward, -down], axis=-1)
+
+
+def _far_normals(
+    n: int, yaw: ArrayLike | None, pitch: ArrayLike | None, valid: ArrayLike | None
+) -> tuple[FloatArray, BoolArray]:
+    """Return unit far normals in `dome`, shape (n, 3), and where they are known."""
+    if yaw is None:
+        return np.full((n, 3), np.nan), np.zeros(n, bool)
+    across = np.broadcast_to(np.asarray(yaw, float), n)
+    up = np.broadcast_to(np.asarray(0.0 if pitch is None else pitch, float), n)
+    known = np.isfinite(across) & np.isfinite(up)
+    if valid is not None:
+        known = known & np.broadcast_to(np.asarray(valid, bool), n)
+    normal = np.stack([np.tan(across), np.ones(n), np.tan(up)], axis=-1)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True), known

@@ -1,0 +1,4 @@
+"""Processes that measure a dive together: partition, pool, messages, frame results.
+
+Imports the scanner, sources and results.
+"""

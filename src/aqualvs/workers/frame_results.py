@@ -1,0 +1,301 @@
+"""From frames to what a run writes of them, a few frames at a time.
+
+What ignoring the dome costs: the same stripe points, triangulated as if by a bare lens.
+
+Blocks of consecutive frames, and a thread that reads them ahead.
+"""
+
+import contextlib
+import queue
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aqualvs.errors import AqualvsError
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import borrowing_kernel
+from aqualvs.optics.rig import Rig
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust, plane_of_all
+from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of, rested_on
+from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.triangulate import Triangulator
+
+# Neighbouring points say the same; a few hundred are plenty for a comparison.
+_EVERY = 4
+_MIN_POINTS = 6
+
+
+class BareLensComparison:
+    """Measures a scan's posture again with the rig's camera out of its dome.
+
+    Detection, classification and the choice of the target are taken over from the scan, so that
+    the difference is that of the ray model alone (paper, section 5.4).
+
+    Parameters
+    ----------
+    rig : Rig
+        A rig with a dome.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        camera = rig.bare_camera()
+        self._triangulator = Triangulator(rig, camera)
+        self._along_x = np.array(
+            [search.axis.value == "x" for search in plan_searches(rig, rig.camera())], np.int64
+        )
+        self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
+
+    def measure(self, scan: Scan) -> Posture | Refusal:
+        """Return the bare-lens posture to the target of a scan, or the refusal in its place.
+
+        However unlikely it looks, it is returned: what the bare lens makes of the target is what
+        the comparison is about.
+        """
+        if not scan.posture:
+            return scan.posture
+        points = scan.points
+        most = -(-len(points) // _EVERY)
+        numbers, pixels = np.empty((3, most), np.int64), np.empty((most, 2))
+        n = _pick(points.used, points.laser, points.pixels, self._along_x, numbers, pixels)
+        found, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
+        rows, laser, along_x = numbers[:, :n]
+        # Every point is a group of its own: they are not neighbours.
+        all_valid = self._triangulator.triangulate_into(
+            pixels[:n], along_x, laser, rows, found, sensitivity, valid
+        )
+        if not all_valid:
+            found, sensitivity, laser = found[valid], sensitivity[valid], laser[valid]
+        if len(found) < _MIN_POINTS:
+            return Refusal(Reason.TOO_FEW_POINTS, "a bare lens would see too few of the points")
+        fit = self._fit(found, sensitivity, laser)
+        if fit is None:
+            return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
+        n_points, nearest = rested_on(found, fit.weights)
+        return posture_of(fit, nearest, n_points, self._axis_in_dome)
+
+    @staticmethod
+    def _fit(points: FloatArray, sensitivity: FloatArray, laser: IntArray) -> PlaneFit | None:
+        n, start = len(points), np.empty(3)
+        if not plane_of_all(points, start):
+            return None
+        return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, SOLID_ERROR)
+
+
+@borrowing_kernel
+def _pick(
+    used: BoolArray,
+    laser: NDArray[np.int8],
+    pixels: FloatArray,
+    along_x_of: IntArray,
+    numbers: IntArray,
+    out_pixels: FloatArray,
+) -> int:
+    """Write row, laser and direction of search of some of the points used; how many there are."""
+    n, n_used = 0, 0
+    for i in range(used.shape[0]):
+        if not used[i]:
+            continue
+        if n_used % _EVERY == 0:
+            numbers[0, n], numbers[1, n], numbers[2, n] = i, laser[i], along_x_of[laser[i]]
+            out_pixels[n, 0], out_pixels[n, 1] = pixels[i, 0], pixels[i, 1]
+            n += 1
+        n_used += 1
+    return n
+
+
+T = TypeVar("T")
+
+_MOST_FRAMES = 8
+_MOST_BYTES = 32 << 20
+_PATIENCE_S = 0.1
+
+
+def block_length(size_px: tuple[int, int]) -> int:
+    """Return how many frames make a block: a few, and less than 32 MB.
+
+    Measuring eight frames step by step takes a third less than one after the other, between which
+    the decoder displaces all code from the caches; more than eight gain nothing.
+    """
+    n_bytes = 3 * size_px[0] * size_px[1] // 2
+    return max(1, min(_MOST_FRAMES, _MOST_BYTES // n_bytes))
+
+
+def in_blocks(
+    items: Iterator[T], length: int, breaks: type[Exception] = AqualvsError
+) -> Iterator[list[T]]:
+    """Yield lists of up to `length` items; none is lost where their source breaks off.
+
+    Parameters
+    ----------
+    items : iterator
+    length : int
+    breaks : type of exception
+        How it breaks off; raised after the items before it.
+    """
+    block: list[T] = []
+    try:
+        for item in items:
+            block.append(item)
+            if len(block) == length:
+                yield block
+                block = []
+    except breaks:
+        if block:
+            yield block
+        raise
+    if block:
+        yield block
+
+
+def read_ahead(items: Iterator[T]) -> Iterator[T]:
+    """Yield items that a thread fetches, up to two of them before they are wanted.
+
+    An exception of `items` is raised where it belongs in the order. When the iteration is given up,
+    the thread ends after the item that it is fetching.
+    """
+    fetched: queue.Queue[T | _End] = queue.Queue(1)
+    given_up = threading.Event()
+
+    def put(item: T | _End) -> None:
+        while not given_up.is_set():
+            with contextlib.suppress(queue.Full):
+                return fetched.put(item, timeout=_PATIENCE_S)
+        return None
+
+    def fetch() -> None:
+        try:
+            for item in items:
+                put(item)
+                if given_up.is_set():
+                    return
+            put(_End())
+        except BaseException as fault:  # raised again where it is noticed
+            put(_End(fault))
+
+    thread = threading.Thread(target=fetch, name="frames", daemon=True)
+    thread.start()
+    try:
+        while not isinstance(item := fetched.get(), _End):
+            yield item
+        if item.fault is not None:
+            raise item.fault
+    finally:
+        given_up.set()
+        thread.join()
+
+
+class _End:
+    """Stands for the end of the items, and what brought it about."""
+
+    def __init__(self, fault: BaseException | None = None) -> None:
+        self.fault = fault
+
+
+class ScansFrames(Protocol):
+    """What a run needs of a scanner."""
+
+    def process(self, frame: Frame) -> Scan:
+        """Return the scan of one frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was found in a frame.
+
+    Attributes
+    ----------
+    scan : Scan
+    bare : Posture, Refusal or None
+        What ignoring the dome would make of it; None for a rig without a dome.
+    frame : Frame or None
+        None for a frame that was lost, or that another process has measured.
+    is_lost : bool
+        Whether the scan stands for a frame that could not be decoded.
+    """
+
+    scan: Scan
+    bare: Posture | Refusal | None
+    frame: Frame | None = None
+    is_lost: bool = False
+
+
+class Meter:
+    """Measures frames, with the dome and without.
+
+    Parameters
+    ----------
+    rig : Rig
+    scanner : ScansFrames
+        For the same rig.
+
+    Attributes
+    ----------
+    block_length : int
+        How many frames it is best given at a time.
+    """
+
+    def __init__(self, rig: Rig, scanner: ScansFrames) -> None:
+        self._scanner = scanner
+        self.block_length = block_length(rig.size_px) if isinstance(scanner, Scanner) else 1
+        self._bare_lens = BareLensComparison(rig) if rig.dome is not None else None
+
+    def measure(self, frames: Sequence[Frame]) -> list[Measured]:
+        """Measure frames, in their order."""
+        return [
+            Measured(scan, self._bare(scan), frame)
+            for scan, frame in zip(self._scans(frames), frames, strict=True)
+        ]
+
+    def lost(self, scan: Scan) -> Measured:
+        """Complete the scan that stands for a lost frame."""
+        return Measured(scan, self._bare(scan), is_lost=True)
+
+    def _bare(self, scan: Scan) -> Posture | Refusal | None:
+        return None if self._bare_lens is None else self._bare_lens.measure(scan)
+
+    def _scans(self, frames: Sequence[Frame]) -> list[Scan]:
+        scanner = self._scanner
+        if not isinstance(scanner, Scanner):
+            return [scanner.process(frame) for frame in frames]
+        # Step by step for all of them: code that has just run is still in the caches, where
+        # decoding and the other step would displace it.
+        returns = [scanner.detect(frame) for frame in frames]
+        return [
+            scanner.measure(frame.index, frame.time_s, found)
+            for frame, found in zip(frames, returns, strict=True)
+        ]
+
+
+def measured_blocks(
+    blocks: Iterator[list[tuple[list[Scan], Frame]]], meter: Meter
+) -> Iterator[list[Measured]]:
+    """Yield what is found in frames, and what stands for lost ones, in the order of the dive.
+
+    Parameters
+    ----------
+    blocks : iterator of list
+        Of frames with the scans that stand for the lost ones right before, see `with_losses`.
+    meter : Meter
+
+    Yields
+    ------
+    found : list of Measured
+        Of one block; what stands for lost frames before it comes by itself.
+    """
+    for block in blocks:
+        (before, _), *others = block
+        if before:
+            # Before anything is recorded of the block's own frames.
+            yield [meter.lost(scan) for scan in before]
+        first, *more = meter.measure([frame for _, frame in block])
+        found = [first]
+        for (lost, _), measured in zip(others, more, strict=True):
+            found += [meter.lost(scan) for scan in lost]
+            found.append(measured)
+        yield found

@@ -1,0 +1,92 @@
+"""How processes that measure begin; light to import."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkContext, ForkServerContext, SpawnContext
+
+
+FOR_BATCHES = ("distributed.nanny", "aqualvs.batch.scheduler")
+"""What the processes of a batch import first."""
+
+
+def prepare(modules: tuple[str, ...]) -> None:
+    """Begin the process that others are copied from, where the system has such a thing.
+
+    It imports what they need while this process imports what it needs itself.
+    """
+    if has_server():
+        from multiprocessing import forkserver
+
+        multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
+        with deaf_to_interrupts():
+            forkserver.ensure_running()
+
+
+def context() -> "ForkContext | ForkServerContext | SpawnContext":
+    """Return how processes begin: where it can be, as copies of this one with all it has imported.
+
+    It cannot where this process has threads, of libraries too: a copy would have their locks, and
+    not the threads that open them.
+    """
+    if not has_server():
+        return multiprocessing.get_context("spawn")
+    if n_threads() == 1:
+        return multiprocessing.get_context("fork")
+    return multiprocessing.get_context("forkserver")
+
+
+def n_threads() -> int | None:
+    """Return how many threads this process has, those of libraries included; None if unknown."""
+    try:
+        return len(os.listdir("/proc/self/task"))
+    except OSError:
+        return None
+
+
+def n_cores() -> int:
+    """Return how many processes can work at a time on this machine."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def has_server() -> bool:
+    """Return whether the system copies a process that has imported much.
+
+    Libraries of macOS do not bear it once they are loaded, and Windows cannot.
+    """
+    return sys.platform == "linux"
+
+
+@contextlib.contextmanager
+def deaf_to_interrupts() -> Iterator[None]:
+    """Let no thread or process that is begun here, or by one of these, hear Ctrl-C.
+
+    A terminal sends it to all processes; this one decides what becomes of the others.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    # Begun later, it would have the thread that begins it hear again.
+    resource_tracker.ensure_running()
+    with interrupts_blocked():
+        yield
+
+
+@contextlib.contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Have Ctrl-C wait; a copy of this process that is begun here never hears it."""
+    heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, heard)

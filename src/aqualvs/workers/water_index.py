@@ -1,0 +1,124 @@
+"""Following the water's index during a run, by a target on the vehicle (paper, 2.2).
+
+What calibrates is imported where it is used: every run reads this module, few follow the water.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.solved import rig_uncertainty
+from aqualvs.results.run_request import Water
+from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.scan import Frame, Scan
+
+if TYPE_CHECKING:
+    from aqualvs.calibration.water_index.state import IndexPrior, IndexReading
+
+
+# Reading the target's markers takes longer than measuring a frame; the index hardly changes.
+_FIRST_FRAMES, _EVERY_S = 5, 0.4
+# A change of the index that matters less than this to the range (0.003 %) is not worth new plans.
+_WORTH = 2e-4
+_LEAST_SIGMA_TO_FOLLOW = 4e-3
+# How well users can measure where the plate is; its index is followed, not its place.
+_PLACE_MM, _TURN_DEG = 0.2, 0.1
+
+
+class WaterFollowingScanner:
+    """A scanner that measures each frame in the water that the index target tells.
+
+    Parameters
+    ----------
+    rig : Rig
+        In the water to begin with.
+    options : ScannerOptions
+    target : Path
+        Markers on the vehicle (target.yaml).
+    water : Water
+        Temperature and salinity, if given, are a prior.
+
+    Attributes
+    ----------
+    scanner : Scanner
+        For the water as it is known.
+
+    Raises
+    ------
+    CalibrationError
+        If the target's file cannot be used.
+    """
+
+    def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
+        from aqualvs.calibration.targets.target_files import load_target
+        from aqualvs.calibration.water_index.estimator import IndexEstimator
+        from aqualvs.calibration.water_index.state import IndexOptions
+
+        self._rig, self._options, self._target = rig, options, target
+        self.scanner = Scanner(rig, options)
+        self._markers = load_target(target)
+        self._estimator = IndexEstimator(
+            rig,
+            uncertainty=rig_uncertainty(rig),
+            prior=_prior(water, rig),
+            options=IndexOptions.of_target(_PLACE_MM, _TURN_DEG),
+        )
+        self._next_s = -np.inf
+        self._n_read = 0
+        self._last: IndexReading | None = None
+
+    def process(self, frame: Frame) -> Scan:
+        """Measure a frame in the water as it is known now."""
+        if self.is_due(frame):
+            self.look(frame)
+        return self.scanner.process(frame)
+
+    @property
+    def sigma_n_water(self) -> float:
+        """Standard deviation of the index; NaN until the target has been seen."""
+        return float("nan") if self._last is None else self._last.sigma
+
+    def lines(self) -> list[str]:
+        """Return what the run's summary says of the water."""
+        last = self._last
+        if last is None:
+            return [
+                f"{self._target}: the target was never seen; measured with index "
+                f"{self._rig.n_water:.4f}"
+            ]
+        found = [f"water index {last.n:.5f} ± {last.sigma:.5f} from {self._n_read} frames"]
+        if not last.observable:
+            found.append("the pictures alone cannot tell the index; see aqualvs check")
+        return found + [step.text() for step in self._estimator.steps]
+
+    def is_due(self, frame: Frame) -> bool:
+        """Return whether the target should be read in this frame."""
+        return self._n_read < _FIRST_FRAMES or frame.time_s >= self._next_s
+
+    def look(self, frame: Frame) -> None:
+        """Read the target in a frame; makes another scanner if the water has changed."""
+        from aqualvs.calibration.detection.detection import detect_markers
+        from aqualvs.calibration.targets.targets import View
+
+        self._next_s = frame.time_s + _EVERY_S
+        grey = np.ascontiguousarray(frame.luma)
+        view = detect_markers(grey, self._markers, f"frame {frame.index}")
+        if not isinstance(view, View):
+            return
+        reading = self._estimator.add(frame.time_s, view)
+        if not reading:
+            return
+        self._last, self._n_read = reading, self._n_read + 1
+        trusted = reading.sigma < _LEAST_SIGMA_TO_FOLLOW
+        if trusted and abs(reading.n - self.scanner.rig.n_water) > _WORTH:
+            self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
+
+
+def _prior(water: Water, rig: Rig) -> "IndexPrior | None":
+    from aqualvs.calibration.water_index.state import IndexPrior
+
+    if water.temperature_c is None or water.salinity is None:
+        return None
+    return IndexPrior.seawater(water.temperature_c, water.salinity, n_air=rig.n_air)
