@@ -1,9 +1,76 @@
-"""Underwater laser vision: posture to a net or wall from a camera behind a dome and line lasers."""
+"""Underwater laser vision: posture to a net or wall from a camera behind a dome and line lasers.
 
+The names below are the interface for programs; each is imported when it is first used, so that
+`import aqualvs` itself costs nothing.
+"""
+
+import importlib
 import os
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from aqualvs.errors import AqualvsError
+    from aqualvs.optics.rig import Rig
+    from aqualvs.optics.rigfile import load_rig, save_rig
+    from aqualvs.pipeline import RunResult, run
+    from aqualvs.results.net_survey import read_run
+    from aqualvs.results.run_request import RunRequest
+    from aqualvs.scanner import Scanner, ScannerOptions
+    from aqualvs.scanning.posture import Posture, Refusal
+    from aqualvs.scanning.scan import Frame, Scan
+    from aqualvs.sources import open_source
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AqualvsError",
+    "Frame",
+    "Posture",
+    "Refusal",
+    "Rig",
+    "RunRequest",
+    "RunResult",
+    "Scan",
+    "Scanner",
+    "ScannerOptions",
+    "load_rig",
+    "open_source",
+    "read_run",
+    "run",
+    "save_rig",
+]
+
+_MODULES = {
+    "AqualvsError": "aqualvs.errors",
+    "Frame": "aqualvs.scanning.scan",
+    "Posture": "aqualvs.scanning.posture",
+    "Refusal": "aqualvs.scanning.posture",
+    "Rig": "aqualvs.optics.rig",
+    "RunRequest": "aqualvs.results.run_request",
+    "RunResult": "aqualvs.pipeline",
+    "Scan": "aqualvs.scanning.scan",
+    "Scanner": "aqualvs.scanner",
+    "ScannerOptions": "aqualvs.scanner",
+    "load_rig": "aqualvs.optics.rigfile",
+    "open_source": "aqualvs.sources",
+    "read_run": "aqualvs.results.net_survey",
+    "run": "aqualvs.pipeline",
+    "save_rig": "aqualvs.optics.rigfile",
+}
 
 # Pixels of a picture that OpenCV decodes, read when it is imported: a file of a few kilobytes can
 # claim 60,000 x 60,000. The largest cameras have 150 million.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(160_000_000))
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(importlib.import_module(_MODULES[name]), name)
+    # Kept, so that Python does not ask again.
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

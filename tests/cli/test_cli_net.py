@@ -15,7 +15,7 @@ from aqualvs.net_survey import command as body
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.results.folder import NET_FILES, RunOutputs
-from aqualvs.results.net_survey import NetPass, stored_scans
+from aqualvs.results.net_survey import NetPass, read_run
 from aqualvs.results.points import PointsJournal
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net
@@ -163,12 +163,12 @@ def test_an_offset_that_cannot_be_found_is_told(run_folder, tmp_path, capsys):
 
 def test_stopping_tells_of_what_came_before(run_folder, monkeypatch, capsys):
     def interrupted(folder):
-        for i, scan in enumerate(stored_scans(folder)):
+        for i, scan in enumerate(read_run(folder)):
             if i == 20:
                 os.kill(os.getpid(), signal.SIGINT)
             yield scan
 
-    monkeypatch.setattr(body, "stored_scans", interrupted)
+    monkeypatch.setattr(body, "read_run", interrupted)
     assert main(["net", str(run_folder)]) == 130
     assert "stopped by SIGINT" in capsys.readouterr().out
     assert int(rows(run_folder / "net.csv")[-1]["last_frame"]) == 20

@@ -10,7 +10,7 @@ from pyarrow import parquet
 from aqualvs.errors import SourceError
 from aqualvs.results import net_survey as module
 from aqualvs.results.folder import RunOutputs
-from aqualvs.results.net_survey import check_stored, stored_scans
+from aqualvs.results.net_survey import check_stored, read_run
 from aqualvs.results.points import PointsJournal, export_points
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
@@ -64,7 +64,7 @@ def same(found, made):
 def test_scans_come_back_however_the_file_is_cut(tmp_path, monkeypatch, batch):
     monkeypatch.setattr(module, "_BATCH", batch)
     made = dive()
-    found = list(stored_scans(written(tmp_path / "run", made)))
+    found = list(read_run(written(tmp_path / "run", made)))
     assert len(found) == len(made)
     for one, other in zip(found, made, strict=True):
         same(one, other)
@@ -80,7 +80,7 @@ def test_a_run_that_was_killed_is_read_from_its_journal(tmp_path):
     # What was cut short counts for nothing: half a row, half a batch.
     with (folder / "posture.csv").open("a") as file:
         file.write("8,0.32,1,,0.5")
-    found = list(stored_scans(folder))
+    found = list(read_run(folder))
     for one, other in zip(found, made, strict=True):
         same(one, other)
 
@@ -91,7 +91,7 @@ def test_points_of_a_frame_without_a_row_go_to_no_other_frame(tmp_path):
     path = folder / "posture.csv"
     kept = [line for line in path.read_text().splitlines() if not line.startswith("2,")]
     path.write_text("\n".join(kept) + "\n")
-    found = list(stored_scans(folder))
+    found = list(read_run(folder))
     assert [one.index for one in found] == [0, 1, 3, 4, 5, 6, 7]
     for one in found:
         same(one, made[one.index])
@@ -113,7 +113,7 @@ def test_an_older_run_without_a_single_point_is_told_too(tmp_path):
     folder = written(tmp_path / "run", [scan(0, 0)])
     without(folder, "width_px")
     with pytest.raises(SourceError, match="no column width_px"):
-        list(stored_scans(folder))
+        list(read_run(folder))
 
 
 def test_an_older_journal_still_becomes_parquet(tmp_path):
@@ -141,7 +141,7 @@ def test_a_broken_folder_gives_one_line(tmp_path, spoil, words):
     folder = written(tmp_path / "run", dive())
     spoil(folder)
     with pytest.raises(SourceError) as caught:
-        list(stored_scans(folder))
+        list(read_run(folder))
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -151,14 +151,14 @@ def test_a_word_where_a_number_belongs_is_told(tmp_path):
     path = folder / "posture.csv"
     path.write_text(path.read_text().replace("0.510000", "much", 1))
     with pytest.raises(SourceError, match=r"posture\.csv: frame 1 holds what is no number"):
-        list(stored_scans(folder))
+        list(read_run(folder))
 
 
 def test_memory_does_not_grow_with_the_dive(tmp_path):
     def peak(n):
         folder = written(tmp_path / str(n), (scan(i, 400) for i in range(n)))
         tracemalloc.start()
-        count = sum(len(one.points) for one in stored_scans(folder))
+        count = sum(len(one.points) for one in read_run(folder))
         _, most = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert count == 400 * n

@@ -22,7 +22,7 @@ from aqualvs.nets.target_file import NetRequest
 from aqualvs.report.run_page import write_report
 from aqualvs.results.files import writing
 from aqualvs.results.folder import NET_FILES
-from aqualvs.results.net_survey import stored_scans
+from aqualvs.results.net_survey import read_run
 from aqualvs.sources.spans import UnlikeSurveyError
 
 NET = "net"
@@ -79,7 +79,7 @@ def _state(work: DiveWork, key: str, request: NetRequest) -> dict[str, Any]:
         return found
     dive = StoredDive(out)
     net = dive.net_pass(request)
-    for scan in stored_scans(out):
+    for scan in read_run(out):
         net.add(scan)
     with writing(out), scratch(work.home, NET) as draft:
         result = net.write(draft, dive.video)

@@ -19,7 +19,7 @@ from aqualvs.results.folder import (
     claim_run,
     recover,
 )
-from aqualvs.results.net_survey import NetPass, check_stored, stored_scans
+from aqualvs.results.net_survey import NetPass, check_stored, read_run
 from aqualvs.results.run_request import RunRequest, read_run_yaml, scanner_options
 from aqualvs.terminal import StopSignals, progress
 
@@ -102,7 +102,7 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
     net = stored.net_pass(request)
     with claim_run(folder, NET_FILES, overwrite=place.overwrite):
         with StopSignals() as stop, progress(str(run_folder), stored.n_frames) as tick:
-            for scan in stored_scans(run_folder):
+            for scan in read_run(run_folder):
                 net.add(scan)
                 tick(1)
                 if stop.caught:

@@ -188,12 +188,12 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 _NONE = np.empty(0)
 
 
-def stored_scans(run_folder: Path) -> Iterator[Scan]:
+def read_run(run_folder: str | Path) -> Iterator[Scan]:
     """Yield the scans of a run in the order of their frames.
 
     Parameters
     ----------
-    run_folder : Path
+    run_folder : str or Path
         With `posture.csv` and `points.parquet`, or `points.arrows` of a run that was killed.
 
     Yields
@@ -214,8 +214,8 @@ def stored_scans(run_folder: Path) -> Iterator[Scan]:
     -----
     Memory holds one batch of points, however long the dive.
     """
-    points = _Points(run_folder)
-    path = run_folder / POSTURE_CSV
+    folder = Path(run_folder)
+    points, path = _Points(folder), folder / POSTURE_CSV
     for row in _posture_rows(path):
         try:
             index, posture = int(row["frame"]), _posture(row)
@@ -228,12 +228,12 @@ def stored_scans(run_folder: Path) -> Iterator[Scan]:
 
 
 def check_stored(run_folder: Path) -> None:
-    """Raise if `stored_scans` could not read a run.
+    """Raise if `read_run` could not read a run.
 
     Raises
     ------
     SourceError
-        As `stored_scans`.
+        As `read_run`.
     """
     check_run_files(run_folder)
     next(_posture_rows(run_folder / POSTURE_CSV), None)
