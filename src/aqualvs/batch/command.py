@@ -1,4 +1,4 @@
-"""`aqualvs batch`: a season's dives, on this machine or on many."""
+"""`aqualvs batch`: many dives measured on one machine or on many."""
 
 import json
 import os

@@ -1,11 +1,10 @@
-"""A piece of a dive, measured by itself: rows, points, and notes for the join.
+"""Measurement of one piece of a dive: its rows, its points, and notes for the merge.
 
-What a join must know of the frames of a piece beyond the rows and points that are on disk.
-
-A run watches its lasers and its net over the whole dive. Its verdicts rest on the scans of some
-frames in full precision; which ones, the watchers decide as the dive goes on. A piece asks a
-watcher of its own, which knows nothing of the pieces before and therefore looks at more frames than
-the dive's will, and keeps those.
+The notes hold what the merge needs beyond the rows and points on disk. A run monitors its lasers
+and its net over the whole dive, and bases its verdicts on the scans of some frames in full
+precision, which the monitors choose as the dive goes on. A piece runs monitors of its own. They
+know nothing of the pieces before, and therefore look at more frames than those of the dive will;
+these are kept.
 """
 
 import threading

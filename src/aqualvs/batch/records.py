@@ -1,6 +1,6 @@
-"""How the dives of a batch stand.
+"""Status of a batch: a record for each dive, and its progress on standard error.
 
-How far a batch is: a bar with the time left on standard error, and a line for every dive.
+Progress is a bar with the time left, and a line for every dive that has ended.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,6 +1,8 @@
-"""From many dives to their results: what is to be done next, and what to make of what was done.
+"""Scheduler of a batch: hands the next task to the processes, and takes care of its outcome.
 
-The state of a dive's net, told from its finished run and kept until something changes.
+A dive is surveyed, measured piece by piece, and merged; failed tasks are tried again or given up.
+Where the condition of the net is wanted, it is evaluated from the finished run and kept until
+something that it depends on changes.
 """
 
 import os

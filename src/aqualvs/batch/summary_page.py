@@ -1,6 +1,6 @@
-"""The page about all dives of a batch; it opens anywhere, without a network.
+"""`summary.html`: one page about all dives of a batch, which opens anywhere without a network.
 
-The range over a dive as a picture of the size of a word.
+The range over each dive is shown as a sparkline.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,7 @@
-"""What is to be done for one dive, as it travels to the processes that do it.
+"""Work on one dive of a batch, as it is sent to the processes, and the first look at the dive.
 
-The first look at a dive: whether it can be measured, what it holds, and where it is cut.
+The first look (`survey`) finds whether the dive can be measured, what its source holds, and where
+it is cut into pieces.
 """
 
 import hashlib

@@ -1,6 +1,8 @@
-"""`aqualvs check new.yaml --against old.yaml`: what has moved between two rigs, and what of it.
+"""`aqualvs check new.yaml --against old.yaml`: changes between two rigs, and their consequence.
 
-What lies between two rigs, such as before and after maintenance: numbers and their sigmas.
+Two rigs are compared number by number, for example before and after maintenance. Each difference
+has a sigma from the covariances of both rigs, so that a move can be told from chance. The
+consequence is what the old rig would read of a wall where the new one is right.
 """
 
 import math

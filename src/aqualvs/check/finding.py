@@ -1,6 +1,8 @@
-"""Findings: what `aqualvs check` has to say, one sentence each.
+"""Findings of `aqualvs check`, one sentence each, and the errors to expect of a rig.
 
-What a rig can measure, in words and tables: errors of posture, and of the water's index.
+The accuracy part predicts what a rig can measure, in sentences and tables: standard deviations of
+the posture to a wall ahead, from noise and from the uncertainty of the rig, and of the water's
+index.
 """
 
 import math

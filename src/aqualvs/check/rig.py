@@ -1,8 +1,8 @@
-"""`aqualvs check rig.yaml`: is this rig sane, and what can it measure? In words.
+"""`aqualvs check rig.yaml`: plausibility of a rig and its expected accuracy, in words.
 
-From what a rig was solved, how long ago and how well; and what should not be believed of it.
-
-How much of the outer medium a camera sees.
+The findings follow the light through the rig. They include the age, order and quality of its
+calibrations, numbers that were assumed or that the calibration did not determine, and the part of
+the picture that sees nothing of the outer medium.
 """
 
 import itertools

@@ -1,6 +1,6 @@
-"""`aqualvs reproduce`: run the experiments one after the other and put them on one page.
+"""`aqualvs reproduce`: the experiments, run one after the other and shown on one page.
 
-How far `aqualvs reproduce` is, on standard error: experiment, frames, and time left.
+Standard error shows the experiment, its frames and the time left.
 """
 
 import contextlib

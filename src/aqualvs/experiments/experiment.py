@@ -1,8 +1,7 @@
-"""What an experiment is, and what comes out of one.
+"""Experiments and their outcomes, and the catalogue of experiments by name.
 
-A figure in the style of all experiments, from what draws it.
-
-The experiments by name, in the paper's order; each is imported when it is run.
+An experiment is a function that returns findings, figures and series. All figures are drawn in one
+style. The catalogue has the paper's order; each experiment is imported when it is run.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,8 +1,8 @@
-"""The water tank of the experiments: dives with truth, rendered once, and measured at will.
+"""Simulated water tank of the experiments: rendered dives with truth, and measurements of them.
 
-The same dive measured in several ways, side by side.
-
-The rig as a user gets it: calibrated from pictures, as the commands do it.
+A dive is rendered once and measured as often as wanted; `Variant` compares several ways to measure
+the same dive. `calibrated_rig` is the rig as a user gets it: calibrated from pictures, as the
+commands do it.
 """
 
 import hashlib

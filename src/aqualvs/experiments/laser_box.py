@@ -1,4 +1,4 @@
-"""The lasers' planes from a box of markers, and what range error remains; the paper's figure 7."""
+"""Laser planes from a box of markers, and the range error that remains; the paper's figure 7."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

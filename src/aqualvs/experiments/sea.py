@@ -1,6 +1,7 @@
-"""Down along a net at sea, distance and heading kept, where the paper has figure 22.
+"""Runs along a net under control, where the paper has figures 22 and 23.
 
-Distance and yaw under control before a net, where the paper has figure 23.
+Figure 22 is a descent along a net at sea with distance and heading kept; figure 23 is distance and
+yaw under control before a net.
 """
 
 import math

@@ -1,6 +1,7 @@
-"""The index of the water from a target on the vehicle, fresh to sea; the paper's figure 5.
+"""Refractive index of the water from a target on the vehicle, fresh to sea; the paper's figure 5.
 
-The figures of the index experiment: the number on the screen, and where it can be had.
+The figures show the index on the screen frame by frame, and its standard deviation by the place of
+the lens in the dome.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""`aqualvs net`: the state of a net, from a dive or from a run of it."""
+"""`aqualvs net`: the condition of a net, from a dive or from a run of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The comparison of dives along the same net, from their files to what changed."""
+"""Comparison of dives along the same net: from the files of the runs to the changes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,9 +1,7 @@
-"""Growth cell by cell, and of the whole wall: the same places on several dates.
+"""Fouling growth: solidity of the same places on several dates, by cell and over the whole wall.
 
-What a cell was on a date is a weighted mean of stretches; every number here is a linear sum of
-their solidities, so that its variance follows exactly from theirs.
-
-Fouling growth from the history of a wall: per cell, over the whole wall, date by date.
+The solidity of a cell on a date is a weighted mean over stretches. Every number here is a linear
+combination of the stretches' solidities, so that its variance follows exactly from theirs.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Holes of several dates: which are the same, which are new, which are gone or were not passed."""
+"""Hole sites over several dates: holes that stay, are new, are gone, or were not passed again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

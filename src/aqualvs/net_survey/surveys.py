@@ -1,6 +1,6 @@
-"""Runs of dives along a net, read again from the files that `aqualvs net` wrote.
+"""Surveys of a net: runs read from the files that `aqualvs net` wrote, and their dates.
 
-When a dive took place: what the user says, else what its names say, else its video's clock.
+The date of a dive is what the user gives, else what the names say, else the clock of its video.
 """
 
 import csv

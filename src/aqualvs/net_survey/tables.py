@@ -1,7 +1,4 @@
-"""`net_change.csv` and `holes_change.csv`.
-
-What changed on a net, in sentences.
-"""
+"""Tables and sentences of a comparison: `net_change.csv`, `holes_change.csv`, and the summary."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,6 +1,8 @@
-"""Residuals over the picture: vectors, coverage, and their histogram.
+"""Charts of the residuals and pictures of a calibration.
 
-Pictures of a calibration with points drawn over them, small enough to embed.
+Residuals over the picture are shown as vectors, as coverage (points per cell), and as a histogram
+beside the Gaussian of their rms. Pictures with detected points drawn over them are embedded as
+JPEG, scaled down to a size that suits a page.
 """
 
 import base64

@@ -1,6 +1,7 @@
-"""The numbers behind the charts, as plain data that `report.js` draws.
+"""Data of the charts in a run's report, as plain values that `report.js` draws.
 
-Long series made short enough to draw, with their gaps and extremes kept.
+Long series are thinned to what a screen can show; their gaps and extremes are kept. Consecutive
+frames without a posture become one `Stretch`, with the commonest reasons in words.
 """
 
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Which frames the report shows, and their pictures decoded again from the source."""
+"""Selection of the frames that a report shows, decoded again from the source."""
 
 import base64
 import contextlib

@@ -1,9 +1,10 @@
-"""Reflections in a laser's plane as print-ready pictures, after figures 9, 13 and 14 of the paper.
+"""`aqualvs figures`: reflections in a laser's plane and the mesh filter, from a run's folder.
 
-Constantinou, Georgiades and Loizou, Robotics 2021, 10, 126. Matplotlib is asked for when a picture
-is drawn, and only its Agg canvas: no display is needed.
+The print-ready pictures follow figures 9, 13 and 14 of the paper (Constantinou, Georgiades and
+Loizou, Robotics 2021, 10, 126): what a laser lit in one frame (13), what each mesh filter keeps of
+it (14), and the laser-plane image (Eq. 41-42) with the structuring elements (9) to scale.
 
-`aqualvs figures`: the paper's pictures of its mesh filter, made from a run of one's own.
+Matplotlib is imported when a picture is drawn, with its Agg canvas only: no display is needed.
 """
 
 from collections.abc import Callable, Mapping

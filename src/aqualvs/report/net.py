@@ -1,4 +1,4 @@
-"""The state of the net in a run's report: what its files say, as a section and a card."""
+"""Condition of the net in a run's report: section, card and warnings, read from its net files."""
 
 import base64
 import csv

@@ -1,6 +1,8 @@
-"""One pass over a run's points, batch by batch: counts, histograms, a sample of everything.
+"""Statistics of a run's points, read once and batch by batch.
 
-The one loop of the report that touches every point of a dive.
+One pass gathers counts, histograms and random samples of fixed size, so that memory does not grow
+with the dive. `add_points` is the compiled loop, the only one of the report that visits every
+point.
 """
 
 from collections.abc import Iterator

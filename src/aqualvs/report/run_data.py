@@ -1,9 +1,8 @@
-"""Read what a run left behind: `run.yaml`, `posture.csv`, truth and the bare-lens posture.
+"""A run's folder read for its report: `run.yaml`, `posture.csv`, truth, the bare-lens posture.
 
-The rig as `run.yaml` holds it: lasers' planes, their own frames, and facts for the table.
-
-A laser behind a window has a bent sheet; it is shown in the plane that fits the sheet best where
-the camera sees it.
+`run.yaml` also holds the rig; its lasers are returned with their planes and frames (paper, Eq.
+37-40), and its facts as rows of a table. A laser behind a window has a bent sheet, which is shown
+as the plane that fits the sheet best where the camera sees it.
 """
 
 from collections.abc import Mapping

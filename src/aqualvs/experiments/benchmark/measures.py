@@ -1,6 +1,7 @@
-"""Scores: how often, how well and how honestly a system answered.
+"""Scores of systems on a benchmark set: availability, accuracy, and honesty of the stated sigmas.
 
-Scores of systems side by side: tables to read, tables to compute with.
+`compare` holds answers against the truth; `score_systems` puts the scores of several systems side
+by side, as tables to read and as CSV and JSON to compute with.
 """
 
 import csv

@@ -1,10 +1,7 @@
-"""A benchmark set on disk: what its dives are, and the truth of their frames.
+"""The public benchmark set on disk, and the answers of a system to it.
 
-What a benchmark set says to whoever opens its folder.
-
-`aqualvs benchmark`: render the public benchmark set, or a part of it.
-
-What a system answered: plain CSV, frame by frame.
+`aqualvs benchmark` renders the set or a part of it: dives, the truth of their frames, and a README
+for whoever opens its folder. The answers of a system are plain CSV, frame by frame.
 """
 
 import csv
