@@ -69,7 +69,7 @@ class WorkersGoneError(AqualvsError):
 
 
 class Workers(Protocol):
-    """Processes that take tasks."""
+    """Pool of processes that take tasks."""
 
     @property
     def n_slots(self) -> int:

@@ -31,7 +31,7 @@ _EXIT_INCOMPLETE = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchRequest:
-    """What to measure, with what, and where.
+    """Request for a batch: dives, rig, options and the folder to write.
 
     Attributes
     ----------

@@ -79,7 +79,7 @@ class Notes:
 
 
 class NoteTaker:
-    """Takes notes while a piece is measured.
+    """Collector of the notes on a piece while it is measured.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ NOTES = "notes.npz"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PieceResult:
-    """How the measuring of a piece went.
+    """Outcome of measuring one piece.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ _OF_NET = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole
 
 
 class DiveState(StrEnum):
-    """How a dive stands; the value is what `dives.parquet` says in `state`."""
+    """Status of a dive; the value is that of `state` in `dives.parquet`."""
 
     FINISHED = "finished"
     INCOMPLETE = "incomplete"
@@ -31,7 +31,7 @@ class DiveState(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiveRecord:
-    """How a dive stands, and what was found.
+    """Status and results of a dive.
 
     Attributes
     ----------

@@ -108,7 +108,7 @@ _MOST_BEGINNINGS = 3
 
 
 class Watcher(Protocol):
-    """Is told how a batch goes on."""
+    """Observer of a batch's progress."""
 
     def expect(self, n_bytes: int) -> None:
         """Note that there is so much more, or less, to be worked through than was said."""
@@ -164,7 +164,7 @@ def join(work: DiveWork, found: Survey, results: Sequence[PieceResult]) -> dict[
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What the processes do for a dive, one after the other.
+    """Tasks of a dive, in the order in which the processes do them.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ class Steps:
 
 
 class Season:
-    """Measures many dives with many processes.
+    """Scheduler that measures many dives with many processes.
 
     Parameters
     ----------

@@ -173,7 +173,7 @@ _MEMORY = "survey"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Survey:
-    """What the first look at a dive has found.
+    """Result of the first look at a dive: its content, and where it is cut.
 
     Attributes
     ----------
@@ -203,12 +203,12 @@ class Survey:
 
     @property
     def key(self) -> str:
-        """Of everything that the dive's result depends on."""
+        """Key of everything that the dive's result depends on."""
         return digest({"source": self.source_key, "result": self.result_key})
 
     @property
     def is_whole(self) -> bool:
-        """Whether the dive is not cut."""
+        """True if the dive is not cut."""
         return [span.kind for span in self.spans] == [SpanKind.WHOLE]
 
     def only(self, number: int) -> "Survey":

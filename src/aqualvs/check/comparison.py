@@ -252,12 +252,12 @@ class Part:
 
     @property
     def is_same(self) -> bool:
-        """Whether it has not changed at all."""
+        """True if nothing has changed at all."""
         return self.sigmas == 0.0
 
     @property
     def sentence(self) -> str:
-        """Say it."""
+        """Return the change in one sentence."""
         if self.sigmas is None:
             told = "no sigma is known"
         else:

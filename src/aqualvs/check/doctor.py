@@ -195,7 +195,7 @@ _STREAM_S = 8.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorRequest:
-    """What to look at beyond the machine itself.
+    """Things to check beyond the machine itself: stream, rig, autopilot.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ from aqualvs.optics.rig import Rig, RigUncertainty
 
 
 class Severity(StrEnum):
-    """How much a finding matters."""
+    """Severity of a finding."""
 
     OK = "ok"
     WARN = "warn"

@@ -203,7 +203,7 @@ _EXIT_FAILED = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceRequest:
-    """What is asked for; see `aqualvs reproduce --help`.
+    """Request for `aqualvs reproduce`; see its `--help`.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class ReproduceRequest:
 
 
 def tell_experiments(tell: Tell) -> None:
-    """Tell every experiment's name, title and place in the paper."""
+    """Print the name, title and place in the paper of every experiment."""
     width = max(map(len, catalogue.MODULES))
     for name in catalogue.MODULES:
         found = catalogue.experiment(name)

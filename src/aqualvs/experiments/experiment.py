@@ -77,7 +77,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What an experiment found.
+    """Results of an experiment.
 
     Attributes
     ----------

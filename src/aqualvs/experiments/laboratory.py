@@ -75,7 +75,7 @@ class Dive:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A dive as one scanner saw it, frame by frame, N of them, beside the truth.
+    """Dive as one scanner measured it, frame by frame, N of them, beside the truth.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Measured:
 
     @property
     def valid(self) -> BoolArray:
-        """Whether each frame has a posture, shape (N,)."""
+        """True for frames that have a posture, shape (N,)."""
         return np.array([posture is not None for posture in self.postures], np.bool_)
 
     @property

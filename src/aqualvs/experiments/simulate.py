@@ -136,7 +136,7 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
 
 
 def tell_scenarios(tell: Callable[[str], object]) -> None:
-    """Tell the built-in scenarios, one line each."""
+    """Print the built-in scenarios, one line each."""
     scenarios = {**list_scenarios(), CALIBRATION: _ABOUT_CALIBRATION}
     width = max(map(len, scenarios))
     for name, about in scenarios.items():

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """What the index is said to be after each frame, F of them, shape (F,) each.
+    """Index and its uncertainty after each frame, F of them, shape (F,) each.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class Decentred:
-    """How well an index is known by how far the lens is off the dome's centre, shape (L,) each.
+    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ _MOST_SHIFTS = 40_000
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """What is added to a dive's places to lay them on those of the first dive.
+    """Offset added to a dive's places to align them with those of the first dive.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Shifts that are tried.
+    """Grid of the shifts that are tried.
 
     Attributes
     ----------

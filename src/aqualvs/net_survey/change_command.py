@@ -31,7 +31,7 @@ _GIVEN = "the user"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetChangeRequest:
-    """What to compare.
+    """Request for `aqualvs net-change`.
 
     Attributes
     ----------

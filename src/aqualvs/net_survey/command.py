@@ -26,7 +26,7 @@ from aqualvs.terminal import StopSignals, progress
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetSource:
-    """Where the net was seen, and where its state goes.
+    """Source of a survey: a dive or a run, and the folder to write.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class NetSource:
 
 
 def net(place: NetSource, request: NetRequest, tell: Callable[[str], object]) -> int:
-    """Find the state of a net, write it and tell it.
+    """Evaluate the condition of a net, write it and print it.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
 
 
 class StoredDive:
-    """What a run's folder tells of its dive.
+    """Dive as stored in a run's folder.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class StoredDive:
 
     @property
     def n_frames(self) -> int | None:
-        """How many frames the run has measured, if that is known."""
+        """Number of frames that the run has measured, if known."""
         summary = self._content.get("summary")
         count = summary.get("n_frames") if isinstance(summary, dict) else None
         return count if isinstance(count, int) else None

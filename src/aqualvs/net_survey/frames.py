@@ -26,7 +26,7 @@ _MAD = 1.4826
 
 @dataclass(frozen=True, slots=True)
 class WallFrame:
-    """What u means.
+    """Meaning of the coordinate u on a wall: around a round net, or along a flat one.
 
     Attributes
     ----------
@@ -227,7 +227,7 @@ class Raster:
 
     @property
     def n(self) -> int:
-        """How many squares there are."""
+        """Number of squares."""
         return self.shape[0] * self.shape[1]
 
     def index(self, places: FloatArray) -> IntArray:

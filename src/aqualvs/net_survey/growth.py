@@ -27,7 +27,7 @@ FALSE_SHARE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """A rate per day, or a difference.
+    """Growth with its sigma: a rate per day, or a difference.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class CellChange:
-    """What became of a cell.
+    """Change of a cell between dates.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class WallHistory:
 
     @property
     def known(self) -> BoolArray:
-        """Which cells were seen on which dates, shape (C, V)."""
+        """True for the dates on which a cell was seen, shape (C, V)."""
         return np.isfinite(self.solidity)
 
     @property

@@ -189,7 +189,7 @@ class Survey:
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the survey in messages."""
         return self.folder.name or str(self.folder)
 
 

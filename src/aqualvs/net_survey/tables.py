@@ -208,7 +208,7 @@ def _hole_lines(wall: OnWall) -> Iterator[str]:
 
 
 def _since(wall: OnWall, sites: Sequence[Site]) -> Iterator[str]:
-    """Tell which of the holes that stay are newer than the first look at their places."""
+    """Report the remaining holes that are newer than the first look at their places."""
     for v, day in enumerate(wall.history.dates[1:-1], start=1):
         mine = [
             one

@@ -107,7 +107,7 @@ class ParameterRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectationRow:
-    """What the calibration lets expect on a target, as standard deviations.
+    """Standard deviations of posture to expect on a target after the calibration.
 
     Attributes
     ----------

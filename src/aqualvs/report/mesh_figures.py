@@ -59,7 +59,7 @@ _NAMES = ("adaptive filter", "paper's filter")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reflections:
-    """What one laser lit in one frame, N points.
+    """Points that one laser lit in one frame, N of them.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ def _dots(axes: "Axes", xy: FloatArray, size: float, colour: str, label: str = "
 
 
 def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
-    """As figure 13: everything that the laser lit, and the zone in which it is believed."""
+    """Draw figure 13: all points that the laser lit, and the zone in which they are accepted."""
     xy = 1e3 * r.in_laser
     low, high = _span(xy, 0.08)
     near, far = (1e3 * distance for distance in r.working_range)
@@ -168,7 +168,7 @@ def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
 
 
 def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
-    """As figure 14, for both filters side by side."""
+    """Draw figure 14 for both filters side by side."""
     xy = 1e3 * r.in_laser[r.usable]
     low, high = _span(xy, 0.06)
     # Room for the legend, and no strip where all lies in one line.

@@ -127,7 +127,7 @@ class FramePoints:
 
 @dataclass(slots=True)
 class PointSummary:
-    """What the report needs of all points of a dive; its size does not grow with their number.
+    """Statistics of all points of a dive for the report; their size does not grow with the dive.
 
     Attributes
     ----------

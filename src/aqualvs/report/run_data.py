@@ -300,7 +300,7 @@ class LaserFacts:
 
     @property
     def known(self) -> bool:
-        """Whether the plane is known and has a frame of its own."""
+        """True if the plane is known and has a frame of its own."""
         forward_part = 1.0 - self.normal[1] ** 2
         return bool(np.isfinite(self.offset) and forward_part > _SQUARE)
 

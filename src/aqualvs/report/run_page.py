@@ -44,7 +44,7 @@ from aqualvs.text import clock
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """What a report shows.
+    """Content of a run's report.
 
     Attributes
     ----------

@@ -62,7 +62,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
-    """How a system did in some frames.
+    """Score of a system on some frames.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Bars:
-    """How long error bars are on a level, in those of the clear twins: medians.
+    """Median length of error bars on a level, relative to those of the clear twins.
 
     Attributes
     ----------

@@ -185,7 +185,7 @@ class BenchmarkSet:
 
     @property
     def title(self) -> str:
-        """What scores say they were made with."""
+        """Title of the set in scores."""
         frames = sum(len(dive.frames) for dive in self.dives)
         part = "" if self.whole else ", a PART of the set: not to be compared with the whole"
         size = f"{len(self.dives)} dives, {frames} frames"
@@ -403,7 +403,7 @@ def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
 
 
 def tell_dives(tell: Callable[[str], object]) -> None:
-    """Tell the levels and their dives, one line each."""
+    """Print the levels and their dives, one line each."""
     for level, about in LEVELS.items():
         names = (dive.name for dive in benchmark_dives() if dive.level == level)
         tell(f"{level:8} {about}: {', '.join(names)}")
