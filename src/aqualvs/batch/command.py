@@ -80,7 +80,7 @@ class BatchRequest:
 
 
 def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
-    """Measure dives, tell how it goes line by line, and write results, summary and data set.
+    """Measure dives, report progress line by line, and write results, summary and data set.
 
     What an earlier batch in the same folder has finished, of the same dives with the same rig,
     options and versions, is checked and taken as it is.

@@ -93,7 +93,7 @@ def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] 
 
 
 def read_seal(folder: Path) -> dict[str, Any] | None:
-    """Return the content of a seal, None where there is none that can be read."""
+    """Return the content of a seal, None if it is missing or unreadable."""
     try:
         content = read_json(folder / SEAL)
     except (OSError, ValueError):

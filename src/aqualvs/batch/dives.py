@@ -33,7 +33,7 @@ _DEEPEST = 4
 
 
 def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) -> list[str]:
-    """Return a name for every dive, no two the same, whatever the file system makes of case.
+    """Return a unique name for every dive, also on file systems that ignore case.
 
     Parameters
     ----------

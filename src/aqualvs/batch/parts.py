@@ -124,14 +124,14 @@ class NoteTaker:
 
 
 def _slim(scan: Scan) -> Scan:
-    """Return a scan that keeps nothing in memory but what a watcher may look at."""
+    """Return a scan that keeps in memory only what a monitor may look at."""
     points = scan.points
     kept = {name: np.array(getattr(points, name), copy=True) for name in _POINT_COLUMNS}
     return replace(scan, points=_scan_points(kept))
 
 
 class _Witness:
-    """A scan that notices when its points are looked at."""
+    """Scan that records accesses to its points."""
 
     def __init__(self, scan: Scan) -> None:
         self.posture = scan.posture
@@ -145,7 +145,7 @@ class _Witness:
 
 
 class _Unseen:
-    """The points of a frame that no watcher should want."""
+    """Placeholder for the points of a frame that no monitor should need."""
 
     def __getattr__(self, name: str) -> Any:
         if name not in ScanPoints.__dataclass_fields__:
@@ -183,7 +183,7 @@ def write_notes(notes: Notes, path: Path) -> None:
 
 
 def stand_ins(path: Path) -> Iterator[Scan]:
-    """Yield scans that tell a run's watchers and its summary what the piece's own told them.
+    """Yield scans that give a run's monitors and summary the same information as the piece's.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def stand_ins(path: Path) -> Iterator[Scan]:
 
 
 def stored_bars(path: Path) -> "array[float]":
-    """Return what the piece's `NetCheck` found."""
+    """Return the bars that the piece's `NetCheck` found."""
     with np.load(path) as file:
         return array("d", file["bars"])
 
@@ -331,7 +331,7 @@ def measure_piece(work: DiveWork, survey: Survey, number: int) -> PieceResult:
 
 
 def peak_bytes() -> int:
-    """Return the most memory that this process has had."""
+    """Return the peak memory of this process."""
     try:
         import resource
     except ImportError:  # Windows has no such count.
@@ -396,7 +396,7 @@ def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[
 def _blocks(
     dive: OpenDive, span: Span, frames: Iterator[Frame], meter: Meter
 ) -> Iterator[list[Measured]]:
-    """Yield what is found in a piece's frames, and what stands for lost ones."""
+    """Yield the results of a piece's frames, and refusals in place of lost frames."""
     # A recording tells of lost frames itself.
     first = None if dive.replay is not None else span.first
     pairs = with_losses(frames, first, dive.rig.n_water)

@@ -72,12 +72,12 @@ class DiveRecord:
 
     @property
     def net(self) -> Mapping[str, Any]:
-        """Return the state of the net as `net_facts` has it, empty where it was not told."""
+        """Return the condition of the net as `net_facts` has it, empty if it was not evaluated."""
         found: Mapping[str, Any] = self.facts.get("net", {})
         return found
 
     def net_words(self) -> str:
-        """Return the state of the net in a few words; empty where it was not told."""
+        """Return the condition of the net in a few words; empty if it was not evaluated."""
         if not self.net:
             return ""
         if not self.net["n_stretches"]:
@@ -123,7 +123,7 @@ _SPEED_OVER_S = 600.0
 
 
 class BatchProgress(Closing):
-    """Shows a bar where standard error is a terminal, and tells each dive; a context manager.
+    """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager.
 
     Parameters
     ----------

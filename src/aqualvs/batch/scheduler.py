@@ -32,7 +32,7 @@ NET = "net"
 
 
 def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a finished dive's facts with the state of its net, which is told now if it is wanted.
+    """Return a finished dive's facts with the condition of its net, evaluated now if it is wanted.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 
 
 def known_net(home: Path, key: str) -> dict[str, Any]:
-    """Return what was told of a dive's net, as `with_net` does it; empty if nothing was.
+    """Return the stored condition of a dive's net, as from `with_net`; empty if there is none.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
 
 
 def join(work: DiveWork, found: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
-    """Do as `join_dive`, and tell the state of the dive's net, if it is wanted."""
+    """Merge as `join_dive` does, and evaluate the dive's net if it is wanted."""
     return with_net(work, found.key, join_dive(work, found, results))
 
 
@@ -297,7 +297,7 @@ class Season:
             self._ready.appendleft((task, self._steps.join, (dive.work, found, results)))
 
     def _mend(self, dive: _Dive, error: BaseException) -> None:
-        """Try again what may go better, and give up the rest."""
+        """Retry the tasks that may succeed, and give up the others."""
         again = dive.n_beginnings < _MOST_BEGINNINGS
         if isinstance(error, UnlikeSurveyError) and dive.survey is not None:
             if not dive.survey.is_whole:
@@ -311,7 +311,7 @@ class Season:
         return self._end(dive, _record(dive, DiveState.FAILED, words))
 
     def _as_whole(self, dive: _Dive, why: str) -> None:
-        """Measure a dive in one piece, of which the pieces turned out not to be sound."""
+        """Measure a dive in one piece after its pieces turned out to be unusable."""
         if dive.survey is None:
             return
         dive.n_beginnings += 1

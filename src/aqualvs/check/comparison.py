@@ -445,7 +445,7 @@ def _part(
 def _laser_move(
     rig: Rig, new: Laser, old: Laser, difference: RigDifference
 ) -> tuple[float, float, float]:
-    """Angle between two planes, mean distance of the new stripe from the old sheet, its sigma.
+    """Return the angle between two planes, the stripe's distance from the old sheet, its sigma.
 
     The stripe is that on a wall `_WALL_M` ahead; NaN where the camera does not see it.
     """
@@ -467,7 +467,7 @@ def _names(laser: Laser) -> tuple[str, ...]:
 
 
 def _shared_lasers(new: Rig, old: Rig) -> list[tuple[Laser, Laser]]:
-    """Pairs (new, old) of lasers of one name, in the order of the old rig."""
+    """Return pairs (new, old) of lasers of the same name, in the order of the old rig."""
     by_name = {laser.name: laser for laser in new.lasers}
     return [(by_name[laser.name], laser) for laser in old.lasers if laser.name in by_name]
 
@@ -571,7 +571,7 @@ def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> 
 
 
 def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
-    """Sigma of a laser's turn in the direction in which it has turned."""
+    """Return the sigma of a laser's rotation in the direction in which it has turned."""
     rows = [difference.names.index(name) for name in _names(laser)[:2]]
     tilt = difference.change[rows]
     length = float(np.linalg.norm(tilt))
@@ -581,7 +581,7 @@ def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
 
 
 def _value(rig: Rig, name: str) -> float:
-    """Value of one of a camera's numbers, NaN for rotations, which are told by their change."""
+    """Return one of a camera's numbers, NaN for rotations, which are given by their change."""
     values: dict[str, float | FloatArray] = {
         **dict(zip(POSE_PARAMETERS[:3], rig.dome_from_cam.translation.tolist(), strict=True)),
         **dict.fromkeys(POSE_PARAMETERS[3:], math.nan),

@@ -161,7 +161,7 @@ def error_table(errors: Sequence[ExpectedError]) -> Table:
 
 
 def index_sigma(rig: Rig) -> float:
-    """Uncertainty of the water's index from a known target, infinite where it cannot be seen.
+    """Return the sigma of the water's index from a known target, infinite if not observable.
 
     The target is a plate of 10 by 6 corners, 180 by 100 mm, held 0.4 m ahead at a known place,
     each corner found to 0.1 px: what an index target on the vehicle gives in one picture.
@@ -178,7 +178,7 @@ def index_sigma(rig: Rig) -> float:
 
 
 def _shown_units(sigmas: FloatArray) -> tuple[float, float, float]:
-    """Millimetres and degrees of (range, pitch, yaw)."""
+    """Return (range, pitch, yaw) in millimetres and degrees."""
     range_m, pitch, yaw = sigmas.tolist()
     return range_m * 1e3, math.degrees(pitch), math.degrees(yaw)
 

@@ -274,7 +274,7 @@ def _worst(laboratory: Laboratory, dive: Dive, rig: Rig) -> float:
 
 
 def _slope(steps: Sequence[float], percent: FloatArray) -> float:
-    """Return the cost per step; where no plane was found any more there is none to be told."""
+    """Return the cost per step; none where no plane was found any more."""
     told = np.isfinite(percent)
     return float(abs(np.polyfit(np.array(steps)[told], percent[told], 1)[0]))
 

@@ -279,7 +279,7 @@ class _Book:
         self.records, self.seconds = read_results(folder)
 
     def run(self, name: str, load: Load, laboratory: Laboratory) -> None:
-        """Run one experiment and keep what comes of it, whatever that is."""
+        """Run one experiment and store its outcome or its fault."""
         started = time.perf_counter()
         self.records[name] = self._record(name, load, laboratory)
         self.seconds[name] = time.perf_counter() - started

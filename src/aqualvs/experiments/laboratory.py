@@ -135,7 +135,7 @@ class Measured:
 
 
 class Laboratory:
-    """Renders dives and measures in them; the same call twice costs once.
+    """Simulated tank that renders dives and measures them; repeated calls reuse the results.
 
     Parameters
     ----------
@@ -492,4 +492,4 @@ def _lasers(files: CalibrationFiles, draft: Path, rig: Path, n_lasers: int) -> N
 
 
 def _say_nothing(_line: str) -> None:
-    """Take a line for the user, whom the experiment's own result interests more."""
+    """Discard a line for the user; the experiment reports its own result."""

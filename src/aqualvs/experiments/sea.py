@@ -159,12 +159,12 @@ class _Descent:
         return Guidance(setpoint=self._setpoint, down=_DESCENT, stage=Stage.CHANGING_DEPTH)
 
     def restart(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: no state is kept."""
 
 
 @dataclass(slots=True)
 class _Watched:
-    """Steers by sampled postures, and looks at rendered pictures now and then.
+    """Sensor for control: sampled postures, with a rendered picture measured now and then.
 
     A picture takes longer to render than all the rest of a second together; what the scanner makes
     of every tenth of them is written down.

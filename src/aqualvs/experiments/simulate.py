@@ -33,7 +33,7 @@ def simulate(
     camera: str,
     overwrite: bool,
 ) -> None:
-    """Render a scenario into a folder and tell how to run it.
+    """Render a scenario into a folder and print how to run it.
 
     Parameters
     ----------

@@ -292,7 +292,7 @@ def _plane_through(points: FloatArray) -> Plane:
 
 
 def decentred(rig: Rig, lens_mm: Sequence[float] = _DECENTRED_MM) -> Decentred:
-    """Return what ten pictures tell of the index with the lens so far in front of the centre."""
+    """Return how well ten pictures determine the index, by the lens's distance from the centre."""
     exact = replace(_OPTIONS, sigma_place=0.0, sigma_turn=0.0)
     rows = []
     for far in lens_mm:

@@ -152,7 +152,7 @@ class StoredDive:
         return Path(path) if isinstance(path, str) and Path(path).is_file() else None
 
     def net_pass(self, request: NetRequest) -> NetPass:
-        """Return what the dive's scans are to be given to, so that it tells the net's state.
+        """Return the evaluation of the net, to which the dive's scans are to be given.
 
         Raises
         ------

@@ -220,7 +220,7 @@ def find_runs(folder: Path) -> list[Path]:
 
 
 def left_out(folder: Path) -> list[str]:
-    """Return what to tell of the dives of a batch that have no state of their net; mostly none."""
+    """Return messages on the dives of a batch whose net was not evaluated; mostly none."""
     if (folder / NET_CSV).is_file():
         return []
     runs = sorted(path.parent for path in folder.glob(f"{_DIVES}/*/{POSTURE_CSV}"))

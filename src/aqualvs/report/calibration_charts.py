@@ -327,7 +327,7 @@ def _frame(size_px: tuple[int, int], scale: _Scale) -> Iterator[str]:
 def _view_groups(
     points: _Points, rows: IntArray, starts: FloatArray, vectors: FloatArray, names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield the used points, view by view; a pointer over one tells the view and its rms."""
+    """Yield the used points, view by view, with a tooltip of the view and its rms."""
     style = f'stroke="{draw.ACCENT}" fill="none" stroke-linecap="round"'
     rows = rows[points.used[rows]]
     for view in np.unique(points.view[rows]).tolist():

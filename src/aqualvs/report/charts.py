@@ -34,7 +34,7 @@ class Stretch:
 
 
 def rounded(values: ArrayLike, digits: int) -> list[Any]:
-    """Return numbers for JSON, rounded, None where there is none."""
+    """Return rounded numbers for JSON, None for NaN."""
     array = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(array)
     # Adding zero turns a rounded -0.0 into 0.0.

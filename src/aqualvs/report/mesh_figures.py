@@ -235,7 +235,7 @@ def _square(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _cells(
     axes: "Axes", lit: BoolArray, corner: FloatArray, dd: float, middle: FloatArray, reach: float
 ) -> None:
-    """Lit cells around a place, each as large as it is."""
+    """Draw the lit cells around a place to scale."""
     extent = (corner[0], corner[0] + dd * lit.shape[0], corner[1], corner[1] + dd * lit.shape[1])
     from matplotlib.colors import ListedColormap
 
@@ -287,7 +287,7 @@ def _rings(
 
 
 def _typical(r: Reflections, corner: FloatArray, dd: float) -> FloatArray:
-    """Centre (mm) of a lit cell amid the net: of one that the paper keeps, if it keeps any."""
+    """Return the centre (mm) of a lit cell amid the net, if possible one that the paper keeps."""
     for wanted in (r.paper & r.usable, r.adaptive & r.usable, r.usable):
         if wanted.any():
             xy = 1e3 * r.in_laser[wanted]
@@ -324,7 +324,7 @@ def _plane_axes(axes: "Axes", low: FloatArray, high: FloatArray) -> None:
 
 
 def _span(xy: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner of nearly all points, with a margin; one square metre of nothing."""
+    """Return the corners of a box around nearly all points, with a margin; 1 m² without any."""
     if not len(xy):
         return np.array([-500.0, 0.0]), np.array([500.0, 1000.0])
     low = np.quantile(xy, _STRAGGLERS, axis=0)

@@ -22,7 +22,7 @@ Row: TypeAlias = Mapping[str, str]
 
 @dataclass(frozen=True, slots=True)
 class NetTables:
-    """The files that tell the state of a net, read again.
+    """Files on the condition of a net, read from a run's folder.
 
     Attributes
     ----------

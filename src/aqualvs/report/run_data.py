@@ -325,7 +325,7 @@ def lasers_of(rig: Mapping[str, Any]) -> list[LaserFacts]:
 
 
 def _fitted(lasers: list[LaserFacts], rig: Mapping[str, Any]) -> list[LaserFacts]:
-    """Give the lasers behind windows the planes of their sheets, NaN if the rig does not tell."""
+    """Return the lasers, those behind windows with the planes of their sheets; NaN if unknown."""
     try:
         known = rig_from_mapping(rig, source_name="run.yaml")
     except RigError:

@@ -128,7 +128,7 @@ def score_and_tell(
     dives: bool,
     overwrite: bool = False,
 ) -> None:
-    """Score systems side by side and tell the table.
+    """Score systems side by side and print the table.
 
     Parameters
     ----------
