@@ -59,7 +59,7 @@ class Picture:
     caption : str
         What it shows and which figure of the paper it stands beside.
     figure : matplotlib.figure.Figure
-        From `style.new_figure`.
+        From `figure_style.new_figure`.
     """
 
     name: str
