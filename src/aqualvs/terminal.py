@@ -1,8 +1,6 @@
 """How far a run is, on standard error.
 
 Stopping in good order: Ctrl-C and SIGTERM end the run after the current frame.
-
-The progress bar of a terminal.
 """
 
 import contextlib
@@ -14,18 +12,6 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from types import FrameType
 from typing import Any, Self, TypeAlias
-
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
 
 from aqualvs.closing import Closing
 
@@ -73,47 +59,6 @@ class StopSignals(Closing):
         self._previous = {}
 
 
-# Until the first frame is done; compiled code is kept for the next run.
-_FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
-
-
-class _Rate(ProgressColumn):
-    """Frames, or whatever is counted, per second."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        """Return the rate as text."""
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.0f} {self._unit}/s")
-
-
-@contextlib.contextmanager
-def terminal_bar(label: str, n_frames: int | None, unit: str) -> Iterator[Callable[[int], None]]:
-    """Show a bar on standard error; nothing where Rich does not take that for a terminal.
-
-    Parameters and what it yields are those of `aqualvs.terminal.progress`.
-    """
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit))
-    bar = Progress(
-        *columns,
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with bar:
-        task = bar.add_task(f"{label} {_FIRST_RUN}", total=n_frames)
-
-        def tick(n_done: int) -> None:
-            bar.update(task, advance=n_done, description=label)
-
-        yield tick
-
-
 Tick: TypeAlias = Callable[[int], None]
 
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
@@ -152,6 +97,8 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     if _HIDDEN.get() or not _may_be_terminal():
         yield _tell_nobody
         return
+
+    from aqualvs.terminal_bar import terminal_bar
 
     with terminal_bar(label, n_frames, unit) as tick:
         yield tick

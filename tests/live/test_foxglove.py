@@ -234,12 +234,12 @@ def test_without_the_sdk_it_says_what_to_install(monkeypatch):
 
 
 def test_nothing_is_made_that_nobody_watches(output, samples, monkeypatch):
-    from aqualvs.live.outputs import foxglove as output
+    from aqualvs.live.outputs import foxglove
 
     def made(*_):
         raise AssertionError("a picture for nobody")
 
-    monkeypatch.setattr(output, "jpeg_of", made)
+    monkeypatch.setattr(foxglove, "jpeg_of", made)
     for sample in samples:
         output.send(sample)
 

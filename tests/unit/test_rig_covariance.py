@@ -23,7 +23,7 @@ from aqualvs.optics.solved import (
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
-from aqualvs.scanning.posture import Posture, range_pitch_yaw
+from aqualvs.scanning.posture import Posture, Refusal, range_pitch_yaw
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import Returns
 from aqualvs.simulation.render import Renderer
@@ -114,8 +114,11 @@ def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) ->
         scanner = Scanner(with_uncertainty(moved, uncertainty))
         for view, truth in views:
             posture = scanner.measure(0, 0.0, view).posture
-            assert isinstance(posture, Posture)
+            if isinstance(posture, Refusal):
+                continue
             z.append((three(posture) - truth) / np.sqrt(np.diag(posture.total_covariance)))
+    # A rig that is off may leave a net without a plane that fits, in one frame of a hundred.
+    assert len(z) >= 0.99 * len(draws) * len(views)
     # The noise of three views is part of it, and the robust fit, which drops some of the stripes
     # that disagree, does not answer in proportion.
     rms = np.sqrt(np.mean(np.square(z), axis=0))

@@ -1,7 +1,7 @@
-"""The processes that do the work: on this machine, or of a scheduler elsewhere (dask.distributed).
+"""Worker processes of a batch: on this machine, or of a Dask scheduler (dask.distributed).
 
-Dask brings tasks to processes, starts a process again that died, and gives its task to another. It
-is imported here and nowhere else.
+Dask sends tasks to processes, restarts a process that died, and gives its task to another. It is
+imported here and nowhere else.
 """
 
 import logging
@@ -69,7 +69,7 @@ class WorkersGoneError(AqualvsError):
 
 
 class Workers(Protocol):
-    """Processes that take tasks."""
+    """Pool of processes that take tasks."""
 
     @property
     def n_slots(self) -> int:

@@ -1,4 +1,4 @@
-"""`aqualvs batch`: a season's dives, on this machine or on many."""
+"""`aqualvs batch`: many dives measured on one machine or on many."""
 
 import json
 import os
@@ -31,7 +31,7 @@ _EXIT_INCOMPLETE = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchRequest:
-    """What to measure, with what, and where.
+    """Request for a batch: dives, rig, options and the folder to write.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class BatchRequest:
 
 
 def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
-    """Measure dives, tell how it goes line by line, and write results, summary and data set.
+    """Measure dives, report progress line by line, and write results, summary and data set.
 
     What an earlier batch in the same folder has finished, of the same dives with the same rig,
     options and versions, is checked and taken as it is.

@@ -1,14 +1,15 @@
-"""The batch's Parquet data set: one partition for each dive, in folders `dive=NAME`.
+"""Parquet data set of a batch, one partition a dive in folders `dive=NAME`, and sealed folders.
 
 ::
 
     dataset/posture/dive=NAME/posture.parquet   one row for every frame
     dataset/points/dive=NAME/points.parquet     one row for every stripe point
-    dataset/net/dive=NAME/net.parquet           one row for every stretch of net, if told
-    dataset/holes/dive=NAME/holes.parquet       one row for every hole in it, if told
+    dataset/net/dive=NAME/net.parquet           one row for every stretch of net, if evaluated
+    dataset/holes/dive=NAME/holes.parquet       one row for every hole in it, if evaluated
     dataset/dives.parquet                       one row for every dive
 
-Folders that are whole or not there: finished work with its checksums, kept for the next time.
+A folder of finished work is complete or absent: it is filled as a draft, then renamed, and its seal
+records the checksums of its files, so that a later batch can reuse it.
 """
 
 import contextlib
@@ -92,7 +93,7 @@ def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] 
 
 
 def read_seal(folder: Path) -> dict[str, Any] | None:
-    """Return the content of a seal, None where there is none that can be read."""
+    """Return the content of a seal, None if it is missing or unreadable."""
     try:
         content = read_json(folder / SEAL)
     except (OSError, ValueError):

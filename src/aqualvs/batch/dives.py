@@ -1,16 +1,14 @@
-"""Which dives a batch is about: files, folders, patterns and lists, and the rig of each dive.
+"""Dives of a batch: files, folders, patterns and lists, with the rig and the name of each dive.
 
-Names of dives: folders and partitions that keep dives of the same file name apart.
-
-Lists of dives, as CSV or YAML.
-
-::
+Dives of the same file name get different names, which become their folders and partitions. A list
+of dives is CSV ::
 
     dive,rig,name,water_n,temperature_c,salinity,log,log_offset_s
     north/0412.mp4,rig_april.yaml,north_april,,6.5,34,north/0412.tlog,
     north/0610.mp4,rig_june.yaml,north_june,,9.0,33,north/0610.BIN,-3.2
 
-or the same as a list of mappings in YAML. Only `dive` is needed; paths are relative to the list.
+or a list of mappings with the same keys in YAML. Only `dive` is required; paths are relative to the
+list.
 """
 
 import csv
@@ -35,7 +33,7 @@ _DEEPEST = 4
 
 
 def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) -> list[str]:
-    """Return a name for every dive, no two the same, whatever the file system makes of case.
+    """Return a unique name for every dive, also on file systems that ignore case.
 
     Parameters
     ----------

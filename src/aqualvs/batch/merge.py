@@ -1,6 +1,6 @@
-"""From the pieces of a dive to its folder, as `aqualvs run` would have written it.
+"""Merge of a dive's pieces into its folder, equal to what `aqualvs run` would have written.
 
-The summary of a dive from the notes of its pieces.
+Rows and points are joined in order; the summary comes from the notes of the pieces.
 """
 
 import os

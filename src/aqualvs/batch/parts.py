@@ -1,11 +1,10 @@
-"""A piece of a dive, measured by itself: rows, points, and notes for the join.
+"""Measurement of one piece of a dive: its rows, its points, and notes for the merge.
 
-What a join must know of the frames of a piece beyond the rows and points that are on disk.
-
-A run watches its lasers and its net over the whole dive. Its verdicts rest on the scans of some
-frames in full precision; which ones, the watchers decide as the dive goes on. A piece asks a
-watcher of its own, which knows nothing of the pieces before and therefore looks at more frames than
-the dive's will, and keeps those.
+The notes hold what the merge needs beyond the rows and points on disk. A run monitors its lasers
+and its net over the whole dive, and bases its verdicts on the scans of some frames in full
+precision, which the monitors choose as the dive goes on. A piece runs monitors of its own. They
+know nothing of the pieces before, and therefore look at more frames than those of the dive will;
+these are kept.
 """
 
 import threading
@@ -80,7 +79,7 @@ class Notes:
 
 
 class NoteTaker:
-    """Takes notes while a piece is measured.
+    """Collector of the notes on a piece while it is measured.
 
     Parameters
     ----------
@@ -125,14 +124,14 @@ class NoteTaker:
 
 
 def _slim(scan: Scan) -> Scan:
-    """Return a scan that keeps nothing in memory but what a watcher may look at."""
+    """Return a scan that keeps in memory only what a monitor may look at."""
     points = scan.points
     kept = {name: np.array(getattr(points, name), copy=True) for name in _POINT_COLUMNS}
     return replace(scan, points=_scan_points(kept))
 
 
 class _Witness:
-    """A scan that notices when its points are looked at."""
+    """Scan that records accesses to its points."""
 
     def __init__(self, scan: Scan) -> None:
         self.posture = scan.posture
@@ -146,7 +145,7 @@ class _Witness:
 
 
 class _Unseen:
-    """The points of a frame that no watcher should want."""
+    """Placeholder for the points of a frame that no monitor should need."""
 
     def __getattr__(self, name: str) -> Any:
         if name not in ScanPoints.__dataclass_fields__:
@@ -184,7 +183,7 @@ def write_notes(notes: Notes, path: Path) -> None:
 
 
 def stand_ins(path: Path) -> Iterator[Scan]:
-    """Yield scans that tell a run's watchers and its summary what the piece's own told them.
+    """Yield scans that give a run's monitors and summary the same information as the piece's.
 
     Raises
     ------
@@ -209,7 +208,7 @@ def stand_ins(path: Path) -> Iterator[Scan]:
 
 
 def stored_bars(path: Path) -> "array[float]":
-    """Return what the piece's `NetCheck` found."""
+    """Return the bars that the piece's `NetCheck` found."""
     with np.load(path) as file:
         return array("d", file["bars"])
 
@@ -260,7 +259,7 @@ NOTES = "notes.npz"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PieceResult:
-    """How the measuring of a piece went.
+    """Outcome of measuring one piece.
 
     Attributes
     ----------
@@ -332,7 +331,7 @@ def measure_piece(work: DiveWork, survey: Survey, number: int) -> PieceResult:
 
 
 def peak_bytes() -> int:
-    """Return the most memory that this process has had."""
+    """Return the peak memory of this process."""
     try:
         import resource
     except ImportError:  # Windows has no such count.
@@ -397,7 +396,7 @@ def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[
 def _blocks(
     dive: OpenDive, span: Span, frames: Iterator[Frame], meter: Meter
 ) -> Iterator[list[Measured]]:
-    """Yield what is found in a piece's frames, and what stands for lost ones."""
+    """Yield the results of a piece's frames, and refusals in place of lost frames."""
     # A recording tells of lost frames itself.
     first = None if dive.replay is not None else span.first
     pairs = with_losses(frames, first, dive.rig.n_water)

@@ -1,6 +1,6 @@
-"""How the dives of a batch stand.
+"""Status of a batch: a record for each dive, and its progress on standard error.
 
-How far a batch is: a bar with the time left on standard error, and a line for every dive.
+Progress is a bar with the time left, and a line for every dive that has ended.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ _OF_NET = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole
 
 
 class DiveState(StrEnum):
-    """How a dive stands; the value is what `dives.parquet` says in `state`."""
+    """Status of a dive; the value is that of `state` in `dives.parquet`."""
 
     FINISHED = "finished"
     INCOMPLETE = "incomplete"
@@ -31,7 +31,7 @@ class DiveState(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiveRecord:
-    """How a dive stands, and what was found.
+    """Status and results of a dive.
 
     Attributes
     ----------
@@ -72,12 +72,12 @@ class DiveRecord:
 
     @property
     def net(self) -> Mapping[str, Any]:
-        """Return the state of the net as `net_facts` has it, empty where it was not told."""
+        """Return the condition of the net as `net_facts` has it, empty if it was not evaluated."""
         found: Mapping[str, Any] = self.facts.get("net", {})
         return found
 
     def net_words(self) -> str:
-        """Return the state of the net in a few words; empty where it was not told."""
+        """Return the condition of the net in a few words; empty if it was not evaluated."""
         if not self.net:
             return ""
         if not self.net["n_stretches"]:
@@ -123,7 +123,7 @@ _SPEED_OVER_S = 600.0
 
 
 class BatchProgress(Closing):
-    """Shows a bar where standard error is a terminal, and tells each dive; a context manager.
+    """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager.
 
     Parameters
     ----------

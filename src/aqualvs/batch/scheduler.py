@@ -1,6 +1,8 @@
-"""From many dives to their results: what is to be done next, and what to make of what was done.
+"""Scheduler of a batch: hands the next task to the processes, and takes care of its outcome.
 
-The state of a dive's net, told from its finished run and kept until something changes.
+A dive is surveyed, measured piece by piece, and merged; failed tasks are tried again or given up.
+Where the condition of the net is wanted, it is evaluated from the finished run and kept until
+something that it depends on changes.
 """
 
 import os
@@ -30,7 +32,7 @@ NET = "net"
 
 
 def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a finished dive's facts with the state of its net, which is told now if it is wanted.
+    """Return a finished dive's facts with the condition of its net, evaluated now if it is wanted.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 
 
 def known_net(home: Path, key: str) -> dict[str, Any]:
-    """Return what was told of a dive's net, as `with_net` does it; empty if nothing was.
+    """Return the stored condition of a dive's net, as from `with_net`; empty if there is none.
 
     Parameters
     ----------
@@ -106,7 +108,7 @@ _MOST_BEGINNINGS = 3
 
 
 class Watcher(Protocol):
-    """Is told how a batch goes on."""
+    """Observer of a batch's progress."""
 
     def expect(self, n_bytes: int) -> None:
         """Note that there is so much more, or less, to be worked through than was said."""
@@ -156,13 +158,13 @@ def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
 
 
 def join(work: DiveWork, found: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
-    """Do as `join_dive`, and tell the state of the dive's net, if it is wanted."""
+    """Merge as `join_dive` does, and evaluate the dive's net if it is wanted."""
     return with_net(work, found.key, join_dive(work, found, results))
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What the processes do for a dive, one after the other.
+    """Tasks of a dive, in the order in which the processes do them.
 
     Attributes
     ----------
@@ -176,7 +178,7 @@ class Steps:
 
 
 class Season:
-    """Measures many dives with many processes.
+    """Scheduler that measures many dives with many processes.
 
     Parameters
     ----------
@@ -295,7 +297,7 @@ class Season:
             self._ready.appendleft((task, self._steps.join, (dive.work, found, results)))
 
     def _mend(self, dive: _Dive, error: BaseException) -> None:
-        """Try again what may go better, and give up the rest."""
+        """Retry the tasks that may succeed, and give up the others."""
         again = dive.n_beginnings < _MOST_BEGINNINGS
         if isinstance(error, UnlikeSurveyError) and dive.survey is not None:
             if not dive.survey.is_whole:
@@ -309,7 +311,7 @@ class Season:
         return self._end(dive, _record(dive, DiveState.FAILED, words))
 
     def _as_whole(self, dive: _Dive, why: str) -> None:
-        """Measure a dive in one piece, of which the pieces turned out not to be sound."""
+        """Measure a dive in one piece after its pieces turned out to be unusable."""
         if dive.survey is None:
             return
         dive.n_beginnings += 1

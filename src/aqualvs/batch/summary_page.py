@@ -1,6 +1,6 @@
-"""The page about all dives of a batch; it opens anywhere, without a network.
+"""`summary.html`: one page about all dives of a batch, which opens anywhere without a network.
 
-The range over a dive as a picture of the size of a word.
+The range over each dive is shown as a sparkline.
 """
 
 from collections.abc import Iterator, Sequence
@@ -161,7 +161,7 @@ def _cards(records: Sequence[DiveRecord]) -> list[Card]:
 
 
 def _notes(records: Sequence[DiveRecord]) -> Iterator[str]:
-    """Yield what deserves a look, dive by dive; not more than can be read."""
+    """Yield the points that deserve attention, dive by dive, up to a readable number."""
     notes = [note for record in records for note in _notes_on(record)]
     yield from notes[:_MOST_NOTES]
     if len(notes) > _MOST_NOTES:
@@ -224,7 +224,7 @@ def _link(folder: Path, record: DiveRecord) -> str:
 
 
 def _net(folder: Path, record: DiveRecord) -> str:
-    """Return the state of a dive's net, with the way to its map."""
+    """Return the condition of a dive's net, with a link to its map."""
     if not record.net:
         return ""
     return _linked(folder, record, NET_MAP_PNG, record.net_words(), "map of the net")

@@ -1,6 +1,7 @@
-"""What is to be done for one dive, as it travels to the processes that do it.
+"""Work on one dive of a batch, as it is sent to the processes, and the first look at the dive.
 
-The first look at a dive: whether it can be measured, what it holds, and where it is cut.
+The first look (`survey`) finds whether the dive can be measured, what its source holds, and where
+it is cut into pieces.
 """
 
 import hashlib
@@ -172,7 +173,7 @@ _MEMORY = "survey"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Survey:
-    """What the first look at a dive has found.
+    """Result of the first look at a dive: its content, and where it is cut.
 
     Attributes
     ----------
@@ -202,12 +203,12 @@ class Survey:
 
     @property
     def key(self) -> str:
-        """Of everything that the dive's result depends on."""
+        """Key of everything that the dive's result depends on."""
         return digest({"source": self.source_key, "result": self.result_key})
 
     @property
     def is_whole(self) -> bool:
-        """Whether the dive is not cut."""
+        """True if the dive is not cut."""
         return [span.kind for span in self.spans] == [SpanKind.WHOLE]
 
     def only(self, number: int) -> "Survey":

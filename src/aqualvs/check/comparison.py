@@ -1,6 +1,8 @@
-"""`aqualvs check new.yaml --against old.yaml`: what has moved between two rigs, and what of it.
+"""`aqualvs check new.yaml --against old.yaml`: changes between two rigs, and their consequence.
 
-What lies between two rigs, such as before and after maintenance: numbers and their sigmas.
+Two rigs are compared number by number, for example before and after maintenance. Each difference
+has a sigma from the covariances of both rigs, so that a move can be told from chance. The
+consequence is what the old rig would read of a wall where the new one is right.
 """
 
 import math
@@ -250,12 +252,12 @@ class Part:
 
     @property
     def is_same(self) -> bool:
-        """Whether it has not changed at all."""
+        """True if nothing has changed at all."""
         return self.sigmas == 0.0
 
     @property
     def sentence(self) -> str:
-        """Say it."""
+        """Return the change in one sentence."""
         if self.sigmas is None:
             told = "no sigma is known"
         else:
@@ -443,7 +445,7 @@ def _part(
 def _laser_move(
     rig: Rig, new: Laser, old: Laser, difference: RigDifference
 ) -> tuple[float, float, float]:
-    """Angle between two planes, mean distance of the new stripe from the old sheet, its sigma.
+    """Return the angle between two planes, the stripe's distance from the old sheet, its sigma.
 
     The stripe is that on a wall `_WALL_M` ahead; NaN where the camera does not see it.
     """
@@ -465,7 +467,7 @@ def _names(laser: Laser) -> tuple[str, ...]:
 
 
 def _shared_lasers(new: Rig, old: Rig) -> list[tuple[Laser, Laser]]:
-    """Pairs (new, old) of lasers of one name, in the order of the old rig."""
+    """Return pairs (new, old) of lasers of the same name, in the order of the old rig."""
     by_name = {laser.name: laser for laser in new.lasers}
     return [(by_name[laser.name], laser) for laser in old.lasers if laser.name in by_name]
 
@@ -569,7 +571,7 @@ def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> 
 
 
 def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
-    """Sigma of a laser's turn in the direction in which it has turned."""
+    """Return the sigma of a laser's rotation in the direction in which it has turned."""
     rows = [difference.names.index(name) for name in _names(laser)[:2]]
     tilt = difference.change[rows]
     length = float(np.linalg.norm(tilt))
@@ -579,7 +581,7 @@ def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
 
 
 def _value(rig: Rig, name: str) -> float:
-    """Value of one of a camera's numbers, NaN for rotations, which are told by their change."""
+    """Return one of a camera's numbers, NaN for rotations, which are given by their change."""
     values: dict[str, float | FloatArray] = {
         **dict(zip(POSE_PARAMETERS[:3], rig.dome_from_cam.translation.tolist(), strict=True)),
         **dict.fromkeys(POSE_PARAMETERS[3:], math.nan),

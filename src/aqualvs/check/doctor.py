@@ -1,6 +1,7 @@
-"""`aqualvs doctor`: whether machine, stream and autopilot are ready, in words.
+"""`aqualvs doctor`: readiness of machine, stream and autopilot, in words.
 
-`aqualvs doctor --mavlink`: what the autopilot tells, and what its settings mean for us.
+With `--mavlink` it waits for the autopilot's heartbeat, reads its parameters, and says what they
+mean for us.
 """
 
 import contextlib
@@ -194,7 +195,7 @@ _STREAM_S = 8.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorRequest:
-    """What to look at beyond the machine itself.
+    """Things to check beyond the machine itself: stream, rig, autopilot.
 
     Attributes
     ----------

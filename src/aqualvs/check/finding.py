@@ -1,6 +1,8 @@
-"""Findings: what `aqualvs check` has to say, one sentence each.
+"""Findings of `aqualvs check`, one sentence each, and the errors to expect of a rig.
 
-What a rig can measure, in words and tables: errors of posture, and of the water's index.
+The accuracy part predicts what a rig can measure, in sentences and tables: standard deviations of
+the posture to a wall ahead, from noise and from the uncertainty of the rig, and of the water's
+index.
 """
 
 import math
@@ -23,7 +25,7 @@ from aqualvs.optics.rig import Rig, RigUncertainty
 
 
 class Severity(StrEnum):
-    """How much a finding matters."""
+    """Severity of a finding."""
 
     OK = "ok"
     WARN = "warn"
@@ -159,7 +161,7 @@ def error_table(errors: Sequence[ExpectedError]) -> Table:
 
 
 def index_sigma(rig: Rig) -> float:
-    """Uncertainty of the water's index from a known target, infinite where it cannot be seen.
+    """Return the sigma of the water's index from a known target, infinite if not observable.
 
     The target is a plate of 10 by 6 corners, 180 by 100 mm, held 0.4 m ahead at a known place,
     each corner found to 0.1 px: what an index target on the vehicle gives in one picture.
@@ -176,7 +178,7 @@ def index_sigma(rig: Rig) -> float:
 
 
 def _shown_units(sigmas: FloatArray) -> tuple[float, float, float]:
-    """Millimetres and degrees of (range, pitch, yaw)."""
+    """Return (range, pitch, yaw) in millimetres and degrees."""
     range_m, pitch, yaw = sigmas.tolist()
     return range_m * 1e3, math.degrees(pitch), math.degrees(yaw)
 

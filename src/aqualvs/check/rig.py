@@ -1,8 +1,8 @@
-"""`aqualvs check rig.yaml`: is this rig sane, and what can it measure? In words.
+"""`aqualvs check rig.yaml`: plausibility of a rig and its expected accuracy, in words.
 
-From what a rig was solved, how long ago and how well; and what should not be believed of it.
-
-How much of the outer medium a camera sees.
+The findings follow the light through the rig. They include the age, order and quality of its
+calibrations, numbers that were assumed or that the calibration did not determine, and the part of
+the picture that sees nothing of the outer medium.
 """
 
 import itertools
@@ -140,7 +140,7 @@ def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
 
 
 def _out_of_order(steps: dict[str, SolvedStep]) -> Iterator[Finding]:
-    """Each of camera, dome and lasers rests on the one before."""
+    """Yield findings on calibration steps that are older than the steps they are based on."""
     chain = [name for name in ("camera", "dome", "lasers") if name in steps]
     for before, after in itertools.pairwise(chain):
         if steps[before].date > steps[after].date:
@@ -153,7 +153,7 @@ def _out_of_order(steps: dict[str, SolvedStep]) -> Iterator[Finding]:
 
 
 def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
-    """Numbers that nobody has said the uncertainty of, and what is assumed in its place."""
+    """Yield findings on numbers without a stated uncertainty, and on what is assumed for them."""
     if is_exact(rig):
         yield Finding(
             Severity.OK,
@@ -181,7 +181,7 @@ def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
 
 
 def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
-    """Numbers that are known so badly that the calibration did not determine them."""
+    """Yield findings on numbers that the calibration did not determine."""
     lens = _largest(uncertainty, POSE_PARAMETERS[:3])
     if lens > _LENS_M:
         yield _warning(
@@ -218,7 +218,7 @@ def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
 
 
 def _largest(uncertainty: RigUncertainty, names: tuple[str, ...]) -> float:
-    """Largest standard deviation of any combination of some numbers; 0 where none is known."""
+    """Return the largest sigma of any combination of some numbers; 0 where none is known."""
     return math.sqrt(max(float(np.linalg.eigvalsh(uncertainty.of(names))[-1]), 0.0))
 
 
@@ -227,7 +227,7 @@ def _warning(fact: str, remedy: str) -> Finding:
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Horizontal and vertical field of view in the outer medium, in radians; NaN where none."""
+    """Return the horizontal and vertical field of view in the outer medium, rad; NaN if none."""
     width, height = camera.size_px
     middle_x, middle_y = (width - 1) / 2.0, (height - 1) / 2.0
     ends = [[-0.5, middle_y], [width - 0.5, middle_y], [middle_x, -0.5], [middle_x, height - 0.5]]
@@ -236,7 +236,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def blind_fraction(camera: Camera) -> float:
-    """Fraction of the pixels, on a grid, that see nothing of the outer medium."""
+    """Return the fraction of the pixels, on a grid, that see nothing of the outer medium."""
     width, height = camera.size_px
     x, y = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33))
     rays = camera.rays(np.stack([x, y], axis=-1))

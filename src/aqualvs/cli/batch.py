@@ -1,4 +1,4 @@
-"""The command line of batches: a signature only; the body is imported in it."""
+"""Signature of `aqualvs batch`; the body is imported when the command runs."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,8 +1,8 @@
-"""A command whose values are checked before it runs, whatever they are for.
+"""Base of all commands: a command class that checks values, shared options, and fast imports.
 
-Imports of much, without looking for garbage on the way.
-
-Options that several commands share, and which of them the user gave.
+`CheckedCommand` checks the values of every option and argument before the command runs. `given`
+tells which parameters the user set. `importing` switches garbage collection off during large
+imports.
 """
 
 import contextlib

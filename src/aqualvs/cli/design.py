@@ -1,4 +1,4 @@
-"""The command line of `aqualvs design`: a signature only; its body is imported when it runs."""
+"""Signature of `aqualvs design`; the body is imported when the command runs."""
 
 import re
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""The command line of the paper's experiments: a signature only; the body is imported in it.
-
-The command line of the benchmark: signatures only; bodies are imported when they run.
-"""
+"""Signatures of `aqualvs reproduce`, `benchmark` and `score`; bodies are imported when they run."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,4 @@
-"""The command line of hold and follow: a signature only; bodies are imported when they run.
-
-The command line of controllers: signatures only; bodies are imported when they run.
-"""
+"""Signatures of `aqualvs follow` and `aqualvs tune`; bodies are imported when they run."""
 
 import math
 from pathlib import Path

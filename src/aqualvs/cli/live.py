@@ -1,4 +1,4 @@
-"""The command line of live runs: signatures only; bodies are imported when they run."""
+"""Signatures of `aqualvs live` and `aqualvs doctor`; bodies are imported when they run."""
 
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,9 +1,8 @@
-"""The command line: signatures and help only.
+"""The `aqualvs` program: signatures, help and exit codes.
 
-Bodies live in their own modules and are imported when their command runs, so that `--help` needs
-neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
-
-Standard output and standard error, whose loss costs no result.
+Command bodies live in other packages and are imported when their command runs, so that `--help`
+needs neither NumPy nor OpenCV. `main` is the one place where an exception becomes an exit code.
+Standard output and standard error are wrapped, so that losing them costs no result.
 """
 
 import contextlib

@@ -1,8 +1,6 @@
-"""The command line of dives, measured and simulated: signatures only.
+"""Signatures of the commands on dives and rigs; bodies are imported when they run.
 
-Bodies are imported when they run.
-
-The command line that compares a net between dates: a signature; the body is imported in it.
+`run`, `report`, `figures`, `net`, `net-change`, `simulate`, `demo` and `check`.
 """
 
 from pathlib import Path

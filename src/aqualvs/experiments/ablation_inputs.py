@@ -1,8 +1,8 @@
-"""What a wrong refractive index and a wrong place of the lens cost.
+"""Ablations of the inputs: wrong rig numbers, the refracted sheet, and video coding.
 
-What video coding costs: H.264 at several qualities against uncompressed pictures.
-
-What the refracted-sheet model is worth where a laser sits behind a tilted window.
+They measure the cost of a wrong refractive index and of a wrong place of the lens; the gain of the
+refracted-sheet model where a laser sits behind a tilted window; and the cost of H.264 at several
+qualities against uncompressed pictures.
 """
 
 from collections.abc import Sequence
@@ -274,7 +274,7 @@ def _worst(laboratory: Laboratory, dive: Dive, rig: Rig) -> float:
 
 
 def _slope(steps: Sequence[float], percent: FloatArray) -> float:
-    """Return the cost per step; where no plane was found any more there is none to be told."""
+    """Return the cost per step; none where no plane was found any more."""
     told = np.isfinite(percent)
     return float(abs(np.polyfit(np.array(steps)[told], percent[told], 1)[0]))
 

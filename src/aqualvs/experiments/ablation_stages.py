@@ -1,8 +1,8 @@
-"""What the adaptive mesh filter is worth over the paper's, whatever its parameters.
+"""Ablations of the stages: stripe detector, plane fit and mesh filter against the paper's.
 
-What a sub-pixel stripe detector is worth over the paper's threshold.
-
-What a robust, weighted fit is worth over the paper's pseudo-inverse.
+They compare the sub-pixel stripe detector with the paper's threshold, the robust weighted fit with
+the paper's pseudo-inverse, and the adaptive mesh filter with the paper's over a grid of its
+parameters.
 """
 
 import itertools

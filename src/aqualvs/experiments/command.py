@@ -1,6 +1,6 @@
-"""`aqualvs reproduce`: run the experiments one after the other and put them on one page.
+"""`aqualvs reproduce`: the experiments, run one after the other and shown on one page.
 
-How far `aqualvs reproduce` is, on standard error: experiment, frames, and time left.
+Standard error shows the experiment, its frames and the time left.
 """
 
 import contextlib
@@ -203,7 +203,7 @@ _EXIT_FAILED = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceRequest:
-    """What is asked for; see `aqualvs reproduce --help`.
+    """Request for `aqualvs reproduce`; see its `--help`.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class ReproduceRequest:
 
 
 def tell_experiments(tell: Tell) -> None:
-    """Tell every experiment's name, title and place in the paper."""
+    """Print the name, title and place in the paper of every experiment."""
     width = max(map(len, catalogue.MODULES))
     for name in catalogue.MODULES:
         found = catalogue.experiment(name)
@@ -279,7 +279,7 @@ class _Book:
         self.records, self.seconds = read_results(folder)
 
     def run(self, name: str, load: Load, laboratory: Laboratory) -> None:
-        """Run one experiment and keep what comes of it, whatever that is."""
+        """Run one experiment and store its outcome or its fault."""
         started = time.perf_counter()
         self.records[name] = self._record(name, load, laboratory)
         self.seconds[name] = time.perf_counter() - started

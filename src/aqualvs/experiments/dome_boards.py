@@ -1,4 +1,4 @@
-"""Where the lens sits in the dome, from boards at known places; the paper's figures 3 and 4."""
+"""Place of the lens in the dome, from boards at known places; the paper's figures 3 and 4."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

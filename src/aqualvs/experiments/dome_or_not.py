@@ -1,4 +1,4 @@
-"""What the dome model is worth from 300 to 1250 mm, where the paper has figures 19 and 20."""
+"""Gain of the dome model from 300 to 1250 mm, where the paper has figures 19 and 20."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

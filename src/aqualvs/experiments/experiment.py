@@ -1,8 +1,7 @@
-"""What an experiment is, and what comes out of one.
+"""Experiments and their outcomes, and the catalogue of experiments by name.
 
-A figure in the style of all experiments, from what draws it.
-
-The experiments by name, in the paper's order; each is imported when it is run.
+An experiment is a function that returns findings, figures and series. All figures are drawn in one
+style. The catalogue has the paper's order; each experiment is imported when it is run.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -60,7 +59,7 @@ class Picture:
     caption : str
         What it shows and which figure of the paper it stands beside.
     figure : matplotlib.figure.Figure
-        From `style.new_figure`.
+        From `figure_style.new_figure`.
     """
 
     name: str
@@ -78,7 +77,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What an experiment found.
+    """Results of an experiment.
 
     Attributes
     ----------

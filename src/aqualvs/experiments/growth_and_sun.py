@@ -1,6 +1,7 @@
 """Growth on the net and sunlight, on which the paper's system failed (figure 24).
 
-How much stripe each frame of a dive truly shows.
+Each frame's stripe points that stand out of the picture are counted by rendering the dive once
+more, so that the frames from which a posture can be asked for are known.
 """
 
 import os

@@ -1,8 +1,8 @@
-"""The water tank of the experiments: dives with truth, rendered once, and measured at will.
+"""Simulated water tank of the experiments: rendered dives with truth, and measurements of them.
 
-The same dive measured in several ways, side by side.
-
-The rig as a user gets it: calibrated from pictures, as the commands do it.
+A dive is rendered once and measured as often as wanted; `Variant` compares several ways to measure
+the same dive. `calibrated_rig` is the rig as a user gets it: calibrated from pictures, as the
+commands do it.
 """
 
 import hashlib
@@ -75,7 +75,7 @@ class Dive:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A dive as one scanner saw it, frame by frame, N of them, beside the truth.
+    """Dive as one scanner measured it, frame by frame, N of them, beside the truth.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Measured:
 
     @property
     def valid(self) -> BoolArray:
-        """Whether each frame has a posture, shape (N,)."""
+        """True for frames that have a posture, shape (N,)."""
         return np.array([posture is not None for posture in self.postures], np.bool_)
 
     @property
@@ -135,7 +135,7 @@ class Measured:
 
 
 class Laboratory:
-    """Renders dives and measures in them; the same call twice costs once.
+    """Simulated tank that renders dives and measures them; repeated calls reuse the results.
 
     Parameters
     ----------
@@ -492,4 +492,4 @@ def _lasers(files: CalibrationFiles, draft: Path, rig: Path, n_lasers: int) -> N
 
 
 def _say_nothing(_line: str) -> None:
-    """Take a line for the user, whom the experiment's own result interests more."""
+    """Discard a line for the user; the experiment reports its own result."""

@@ -1,4 +1,4 @@
-"""The lasers' planes from a box of markers, and what range error remains; the paper's figure 7."""
+"""Laser planes from a box of markers, and the range error that remains; the paper's figure 7."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ _BAR_PERCENT, _BAR_DEG, _BAR_SIGMAS = 0.5, 0.5, 3.0
 
 @dataclass(frozen=True, slots=True)
 class PlaneError:
-    """How far a found plane is from the true one.
+    """Error of a found laser plane against the true one.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class PlaneError:
 
 @dataclass(frozen=True, slots=True)
 class Remaining:
-    """What a calibration makes of walls square ahead, without any noise, W of them.
+    """Range errors that a calibration leaves on walls square ahead, without noise, W of them.
 
     Attributes
     ----------

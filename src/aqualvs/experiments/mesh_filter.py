@@ -1,8 +1,8 @@
-"""The mesh filter before a net, a box and a wall, where the paper has figures 12 to 14.
+"""The mesh filters before a net, a box and a wall, where the paper has figures 12 to 14.
 
-Points as the paper's filter takes them, and reflections that either filter keeps.
-
-Points and reflections that are said to lie on the net, against those that do.
+Points and reflections that the adaptive filter or the paper's takes for the net are judged by
+precision and recall against the points that truly lie on it. The paper's filter gets every bright
+pixel, as in the paper.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,7 @@
-"""The page of `aqualvs reproduce`: the paper's figures beside ours, in one file that prints well.
+"""Page and folder of `aqualvs reproduce`: the paper's figures beside ours.
 
-There are no scripts, and nothing is asked of a network; figures are embedded, and link to the files
-beside the page.
-
-The folder that `aqualvs reproduce` writes: results, pictures, numbers, and times.
+The page is one file that prints well, without scripts or requests to a network; figures are
+embedded, and link to the files beside the page. The folder holds
 
 ==================  ========================================================================
 `reproduce.html`    everything, on one page

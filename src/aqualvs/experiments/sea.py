@@ -1,6 +1,7 @@
-"""Down along a net at sea, distance and heading kept, where the paper has figure 22.
+"""Runs along a net under control, where the paper has figures 22 and 23.
 
-Distance and yaw under control before a net, where the paper has figure 23.
+Figure 22 is a descent along a net at sea with distance and heading kept; figure 23 is distance and
+yaw under control before a net.
 """
 
 import math
@@ -158,12 +159,12 @@ class _Descent:
         return Guidance(setpoint=self._setpoint, down=_DESCENT, stage=Stage.CHANGING_DEPTH)
 
     def restart(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: no state is kept."""
 
 
 @dataclass(slots=True)
 class _Watched:
-    """Steers by sampled postures, and looks at rendered pictures now and then.
+    """Sensor for control: sampled postures, with a rendered picture measured now and then.
 
     A picture takes longer to render than all the rest of a second together; what the scanner makes
     of every tenth of them is written down.

@@ -33,7 +33,7 @@ def simulate(
     camera: str,
     overwrite: bool,
 ) -> None:
-    """Render a scenario into a folder and tell how to run it.
+    """Render a scenario into a folder and print how to run it.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
 
 
 def tell_scenarios(tell: Callable[[str], object]) -> None:
-    """Tell the built-in scenarios, one line each."""
+    """Print the built-in scenarios, one line each."""
     scenarios = {**list_scenarios(), CALIBRATION: _ABOUT_CALIBRATION}
     width = max(map(len, scenarios))
     for name, about in scenarios.items():

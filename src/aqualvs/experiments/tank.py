@@ -1,6 +1,6 @@
-"""Distance to the wall of a tank, where the paper has figure 15.
+"""Runs before the wall of a tank, where the paper has figures 15 to 17.
 
-Pitch and yaw before the wall of a tank, where the paper has figures 16 and 17.
+Figure 15 is the distance to the wall; figures 16 and 17 are pitch and yaw.
 """
 
 from typing import TYPE_CHECKING

@@ -1,6 +1,7 @@
-"""The index of the water from a target on the vehicle, fresh to sea; the paper's figure 5.
+"""Refractive index of the water from a target on the vehicle, fresh to sea; the paper's figure 5.
 
-The figures of the index experiment: the number on the screen, and where it can be had.
+The figures show the index on the screen frame by frame, and its standard deviation by the place of
+the lens in the dome.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """What the index is said to be after each frame, F of them, shape (F,) each.
+    """Index and its uncertainty after each frame, F of them, shape (F,) each.
 
     Attributes
     ----------
@@ -59,7 +60,7 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class Decentred:
-    """How well an index is known by how far the lens is off the dome's centre, shape (L,) each.
+    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each.
 
     Attributes
     ----------
@@ -291,7 +292,7 @@ def _plane_through(points: FloatArray) -> Plane:
 
 
 def decentred(rig: Rig, lens_mm: Sequence[float] = _DECENTRED_MM) -> Decentred:
-    """Return what ten pictures tell of the index with the lens so far in front of the centre."""
+    """Return how well ten pictures determine the index, by the lens's distance from the centre."""
     exact = replace(_OPTIONS, sigma_place=0.0, sigma_turn=0.0)
     rows = []
     for far in lens_mm:

@@ -1,9 +1,9 @@
-"""How far a dive's bearings and depths are off those of earlier dives, from what stayed.
+"""Alignment of a dive's bearings and depths with those of earlier dives along the same net.
 
-Compasses and depth sensors are off by a little that differs from dive to dive. The pattern of
-growth and the holes that are still there tell by how much: a shift in u and d is weighed by the
-chance that the later dive's stretches and holes were seen at the earlier dives' places. Where that
-tells no one shift, none is made, and the places keep the uncertainty of their instruments.
+Compasses and depth sensors have a small offset that differs from dive to dive. The pattern of
+growth and the holes that are still there reveal it: each shift in u and d is scored by the
+likelihood of the later dive's stretches and holes at the places of the earlier dives. Where no
+single shift stands out, none is applied, and the places keep the uncertainty of their instruments.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ _MOST_SHIFTS = 40_000
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """What is added to a dive's places to lay them on those of the first dive.
+    """Offset added to a dive's places to align them with those of the first dive.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Shifts that are tried.
+    """Grid of the shifts that are tried.
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ _GIVEN = "the user"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetChangeRequest:
-    """What to compare.
+    """Request for `aqualvs net-change`.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class NetChangeRequest:
 
 
 def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comparison:
-    """Compare dives along the same net, write and tell what changed.
+    """Compare dives along the same net, write the changes and print them.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comp
 
 
 def _surveys(request: NetChangeRequest) -> tuple[list[Survey], dict[str, str]]:
-    """Return the dives, and what told the date of each."""
+    """Return the dives, and the source of each date."""
     given = given_dates(request.dates, len(request.runs))
     surveys, origins = [], {}
     for folder, day in zip(request.runs, given, strict=True):

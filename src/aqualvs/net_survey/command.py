@@ -1,4 +1,4 @@
-"""`aqualvs net`: the state of a net, from a dive or from a run of it."""
+"""`aqualvs net`: the condition of a net, from a dive or from a run of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from aqualvs.terminal import StopSignals, progress
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetSource:
-    """Where the net was seen, and where its state goes.
+    """Source of a survey: a dive or a run, and the folder to write.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class NetSource:
 
 
 def net(place: NetSource, request: NetRequest, tell: Callable[[str], object]) -> int:
-    """Find the state of a net, write it and tell it.
+    """Evaluate the condition of a net, write it and print it.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
 
 
 class StoredDive:
-    """What a run's folder tells of its dive.
+    """Dive as stored in a run's folder.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class StoredDive:
 
     @property
     def n_frames(self) -> int | None:
-        """How many frames the run has measured, if that is known."""
+        """Number of frames that the run has measured, if known."""
         summary = self._content.get("summary")
         count = summary.get("n_frames") if isinstance(summary, dict) else None
         return count if isinstance(count, int) else None
@@ -152,7 +152,7 @@ class StoredDive:
         return Path(path) if isinstance(path, str) and Path(path).is_file() else None
 
     def net_pass(self, request: NetRequest) -> NetPass:
-        """Return what the dive's scans are to be given to, so that it tells the net's state.
+        """Return the evaluation of the net, to which the dive's scans are to be given.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The comparison of dives along the same net, from their files to what changed."""
+"""Comparison of dives along the same net: from the files of the runs to the changes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ _OTHER_NET = 0.1
 
 @dataclass(frozen=True, slots=True)
 class OnWall:
-    """What the places tell.
+    """Changes by place: cells and hole sites on the wall.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class OnWall:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What changed.
+    """Result of comparing dives along the same net.
 
     Attributes
     ----------

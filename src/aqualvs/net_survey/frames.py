@@ -1,10 +1,9 @@
-"""A common place on the net for all dives: metres around a round net, or along a flat one.
+"""Common coordinates (u, d) on a net for all dives, and a raster of its wall.
 
-u is metres: radius times bearing around a round net, so that dives agree without further ado but
-for the error of their compasses; or metres along a flat net that faces one way, whose origin is
-where each dive began. d is the depth in metres.
-
-The wall as a raster: what a dive passed over, looked at, and found there.
+u is in metres. Around a round net it is radius times bearing, on which dives agree up to the error
+of their compasses. Along a flat net that faces one way it is the distance from where each dive
+began. d is the depth in metres. The raster cells record what a dive passed over, looked at, and
+found.
 """
 
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.surveys import Survey
 
-# A round net shows in how its bearing grows along the way (as in net_places).
+# A round net shows in how its bearing grows along the way (as in `nets.places`).
 _LEAST_TURN, _LEAST_AGREEMENT = np.deg2rad(5.0), 0.9
 _LEAST_KNOWN = 3
 # Flat nets are the same side of a pen if they face the same way up to a compass's error.
@@ -27,7 +26,7 @@ _MAD = 1.4826
 
 @dataclass(frozen=True, slots=True)
 class WallFrame:
-    """What u means.
+    """Meaning of the coordinate u on a wall: around a round net, or along a flat one.
 
     Attributes
     ----------
@@ -228,7 +227,7 @@ class Raster:
 
     @property
     def n(self) -> int:
-        """How many squares there are."""
+        """Number of squares."""
         return self.shape[0] * self.shape[1]
 
     def index(self, places: FloatArray) -> IntArray:

@@ -1,9 +1,7 @@
-"""Growth cell by cell, and of the whole wall: the same places on several dates.
+"""Fouling growth: solidity of the same places on several dates, by cell and over the whole wall.
 
-What a cell was on a date is a weighted mean of stretches; every number here is a linear sum of
-their solidities, so that its variance follows exactly from theirs.
-
-Fouling growth from the history of a wall: per cell, over the whole wall, date by date.
+The solidity of a cell on a date is a weighted mean over stretches. Every number here is a linear
+combination of the stretches' solidities, so that its variance follows exactly from theirs.
 """
 
 from collections.abc import Sequence
@@ -29,7 +27,7 @@ FALSE_SHARE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """A rate per day, or a difference.
+    """Growth with its sigma: a rate per day, or a difference.
 
     Attributes
     ----------
@@ -48,7 +46,7 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class CellChange:
-    """What became of a cell.
+    """Change of a cell between dates.
 
     Attributes
     ----------
@@ -115,7 +113,7 @@ class WallHistory:
 
     @property
     def known(self) -> BoolArray:
-        """Which cells were seen on which dates, shape (C, V)."""
+        """True for the dates on which a cell was seen, shape (C, V)."""
         return np.isfinite(self.solidity)
 
     @property

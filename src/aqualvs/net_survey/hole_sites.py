@@ -1,4 +1,4 @@
-"""Holes of several dates: which are the same, which are new, which are gone or were not passed."""
+"""Hole sites over several dates: holes that stay, are new, are gone, or were not passed again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ MISSED = 0.3
 
 
 class HoleState(StrEnum):
-    """What became of a hole; the value is what `holes_change.csv` says."""
+    """Change of a hole between dates; the value is that of `state` in `holes_change.csv`."""
 
     NEW = "new"
     """Seen on the last date, and not when an earlier dive looked there."""
@@ -189,7 +189,7 @@ def _counterparts(distance: FloatArray, group: IntArray) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class _Looks:
-    """Where lasers of each dive looked, and how sure the places are."""
+    """Places that the lasers of each dive looked at, with their uncertainty."""
 
     raster: Raster
     seen: list[BoolArray]

@@ -1,8 +1,7 @@
-"""`net_change.html`: what changed, on one page that opens anywhere, without a network.
+"""`net_change.html` and its map: the changes of a net on one page, without a network.
 
-The map of what changed: growth by colour, holes by what became of them.
-
-Drawn without a display; Matplotlib is loaded only when a map is drawn.
+The map shows growth by colour and holes by what became of them. Matplotlib is imported only when a
+map is drawn; no display is needed.
 """
 
 import base64

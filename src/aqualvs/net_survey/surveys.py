@@ -1,6 +1,6 @@
-"""Runs of dives along a net, read again from the files that `aqualvs net` wrote.
+"""Surveys of a net: runs read from the files that `aqualvs net` wrote, and their dates.
 
-When a dive took place: what the user says, else what its names say, else its video's clock.
+The date of a dive is what the user gives, else what the names say, else the clock of its video.
 """
 
 import csv
@@ -189,7 +189,7 @@ class Survey:
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the survey in messages."""
         return self.folder.name or str(self.folder)
 
 
@@ -220,7 +220,7 @@ def find_runs(folder: Path) -> list[Path]:
 
 
 def left_out(folder: Path) -> list[str]:
-    """Return what to tell of the dives of a batch that have no state of their net; mostly none."""
+    """Return messages on the dives of a batch whose net was not evaluated; mostly none."""
     if (folder / NET_CSV).is_file():
         return []
     runs = sorted(path.parent for path in folder.glob(f"{_DIVES}/*/{POSTURE_CSV}"))

@@ -1,7 +1,4 @@
-"""`net_change.csv` and `holes_change.csv`.
-
-What changed on a net, in sentences.
-"""
+"""Tables and sentences of a comparison: `net_change.csv`, `holes_change.csv`, and the summary."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -211,7 +208,7 @@ def _hole_lines(wall: OnWall) -> Iterator[str]:
 
 
 def _since(wall: OnWall, sites: Sequence[Site]) -> Iterator[str]:
-    """Tell which of the holes that stay are newer than the first look at their places."""
+    """Report the remaining holes that are newer than the first look at their places."""
     for v, day in enumerate(wall.history.dates[1:-1], start=1):
         mine = [
             one

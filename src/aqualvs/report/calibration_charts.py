@@ -1,6 +1,8 @@
-"""Residuals over the picture: vectors, coverage, and their histogram.
+"""Charts of the residuals and pictures of a calibration.
 
-Pictures of a calibration with points drawn over them, small enough to embed.
+Residuals over the picture are shown as vectors, as coverage (points per cell), and as a histogram
+beside the Gaussian of their rms. Pictures with detected points drawn over them are embedded as
+JPEG, scaled down to a size that suits a page.
 """
 
 import base64
@@ -325,7 +327,7 @@ def _frame(size_px: tuple[int, int], scale: _Scale) -> Iterator[str]:
 def _view_groups(
     points: _Points, rows: IntArray, starts: FloatArray, vectors: FloatArray, names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield the used points, view by view; a pointer over one tells the view and its rms."""
+    """Yield the used points, view by view, with a tooltip of the view and its rms."""
     style = f'stroke="{draw.ACCENT}" fill="none" stroke-linecap="round"'
     rows = rows[points.used[rows]]
     for view in np.unique(points.view[rows]).tolist():

@@ -1,9 +1,8 @@
-"""What the page of a calibration shows: plain values, filled in by the commands.
+"""Content of a calibration's page, as plain values that the calibration commands fill in.
 
-Units are those of the page, as the suffixes say. A number that is not known is NaN, or None where
-the type allows it; the page shows a dash for it. Every part of a page may be empty.
-
-Parts of a calibration's page that all steps have.
+`Page` is the whole page; the functions below it make the parts that all steps share. Units are
+those of the page, as the suffixes of the names say. An unknown number is NaN, or None where the
+type allows it; the page shows a dash for it. Every part of a page may be empty.
 """
 
 import math
@@ -108,7 +107,7 @@ class ParameterRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectationRow:
-    """What the calibration lets expect on a target, as standard deviations.
+    """Standard deviations of posture to expect on a target after the calibration.
 
     Attributes
     ----------

@@ -1,9 +1,7 @@
-"""The report of a calibration: one page of plain HTML that opens anywhere and prints well.
+"""Report of a calibration: one static HTML page that opens anywhere and prints well.
 
-The commands fill a `Page`; everything in it is escaped here. There are no scripts, and nothing is
-asked of a network.
-
-The tables of a calibration's page; what is not known shows as a dash.
+The commands fill a `calibration_material.Page`; the tables and sections here escape all of its
+text. Unknown values are shown as a dash. There are no scripts and no requests to a network.
 """
 
 import math

@@ -1,6 +1,7 @@
-"""The numbers behind the charts, as plain data that `report.js` draws.
+"""Data of the charts in a run's report, as plain values that `report.js` draws.
 
-Long series made short enough to draw, with their gaps and extremes kept.
+Long series are thinned to what a screen can show; their gaps and extremes are kept. Consecutive
+frames without a posture become one `Stretch`, with the commonest reasons in words.
 """
 
 from collections import Counter
@@ -33,7 +34,7 @@ class Stretch:
 
 
 def rounded(values: ArrayLike, digits: int) -> list[Any]:
-    """Return numbers for JSON, rounded, None where there is none."""
+    """Return rounded numbers for JSON, None for NaN."""
     array = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(array)
     # Adding zero turns a rounded -0.0 into 0.0.

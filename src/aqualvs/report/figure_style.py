@@ -1,6 +1,6 @@
-"""Figures that are written to files: no display is needed.
+"""Matplotlib figures written to files without a display, in the style of a journal.
 
-How the printed figures look: one column of a journal, or two.
+Figures are one or two columns wide and use the Agg canvas.
 """
 
 from collections.abc import Mapping

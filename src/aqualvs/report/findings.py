@@ -1,4 +1,4 @@
-"""What a run amounts to: the headline and the warnings, in plain words."""
+"""Headline numbers and warnings of a run's report, in plain words."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

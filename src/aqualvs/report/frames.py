@@ -1,4 +1,4 @@
-"""Which frames the report shows, and their pictures decoded again from the source."""
+"""Selection of the frames that a report shows, decoded again from the source."""
 
 import base64
 import contextlib
@@ -199,7 +199,7 @@ def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImageP
 
 
 def _rows_at_key_frames(source: Path, track: Track, rows: list[int]) -> list[int]:
-    """Return the row of the last key frame up to each row, as far as the file tells."""
+    """Return the row of the last key frame up to each row, as far as the file states it."""
     found: list[int] = []
     half = 0.5 * _step_s(track)
     with contextlib.suppress(*_BROKEN), av.open(str(source)) as container:

@@ -1,4 +1,4 @@
-"""From the numbers of a run to the parts of the page; everything from files is escaped here."""
+"""HTML parts of a run's page, made from its numbers; all text from files is escaped here."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence

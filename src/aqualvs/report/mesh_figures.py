@@ -1,9 +1,10 @@
-"""Reflections in a laser's plane as print-ready pictures, after figures 9, 13 and 14 of the paper.
+"""`aqualvs figures`: reflections in a laser's plane and the mesh filter, from a run's folder.
 
-Constantinou, Georgiades and Loizou, Robotics 2021, 10, 126. Matplotlib is asked for when a picture
-is drawn, and only its Agg canvas: no display is needed.
+The print-ready pictures follow figures 9, 13 and 14 of the paper (Constantinou, Georgiades and
+Loizou, Robotics 2021, 10, 126): what a laser lit in one frame (13), what each mesh filter keeps of
+it (14), and the laser-plane image (Eq. 41-42) with the structuring elements (9) to scale.
 
-`aqualvs figures`: the paper's pictures of its mesh filter, made from a run of one's own.
+Matplotlib is imported when a picture is drawn, with its Agg canvas only: no display is needed.
 """
 
 from collections.abc import Callable, Mapping
@@ -58,7 +59,7 @@ _NAMES = ("adaptive filter", "paper's filter")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reflections:
-    """What one laser lit in one frame, N points.
+    """Points that one laser lit in one frame, N of them.
 
     Attributes
     ----------
@@ -144,7 +145,7 @@ def _dots(axes: "Axes", xy: FloatArray, size: float, colour: str, label: str = "
 
 
 def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
-    """As figure 13: everything that the laser lit, and the zone in which it is believed."""
+    """Draw figure 13: all points that the laser lit, and the zone in which they are accepted."""
     xy = 1e3 * r.in_laser
     low, high = _span(xy, 0.08)
     near, far = (1e3 * distance for distance in r.working_range)
@@ -167,7 +168,7 @@ def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
 
 
 def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
-    """As figure 14, for both filters side by side."""
+    """Draw figure 14 for both filters side by side."""
     xy = 1e3 * r.in_laser[r.usable]
     low, high = _span(xy, 0.06)
     # Room for the legend, and no strip where all lies in one line.
@@ -234,7 +235,7 @@ def _square(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _cells(
     axes: "Axes", lit: BoolArray, corner: FloatArray, dd: float, middle: FloatArray, reach: float
 ) -> None:
-    """Lit cells around a place, each as large as it is."""
+    """Draw the lit cells around a place to scale."""
     extent = (corner[0], corner[0] + dd * lit.shape[0], corner[1], corner[1] + dd * lit.shape[1])
     from matplotlib.colors import ListedColormap
 
@@ -286,7 +287,7 @@ def _rings(
 
 
 def _typical(r: Reflections, corner: FloatArray, dd: float) -> FloatArray:
-    """Centre (mm) of a lit cell amid the net: of one that the paper keeps, if it keeps any."""
+    """Return the centre (mm) of a lit cell amid the net, if possible one that the paper keeps."""
     for wanted in (r.paper & r.usable, r.adaptive & r.usable, r.usable):
         if wanted.any():
             xy = 1e3 * r.in_laser[wanted]
@@ -323,7 +324,7 @@ def _plane_axes(axes: "Axes", low: FloatArray, high: FloatArray) -> None:
 
 
 def _span(xy: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner of nearly all points, with a margin; one square metre of nothing."""
+    """Return the corners of a box around nearly all points, with a margin; 1 m² without any."""
     if not len(xy):
         return np.array([-500.0, 0.0]), np.array([500.0, 1000.0])
     low = np.quantile(xy, _STRAGGLERS, axis=0)

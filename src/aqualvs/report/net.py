@@ -1,4 +1,4 @@
-"""The state of the net in a run's report: what its files say, as a section and a card."""
+"""Condition of the net in a run's report: section, card and warnings, read from its net files."""
 
 import base64
 import csv
@@ -22,7 +22,7 @@ Row: TypeAlias = Mapping[str, str]
 
 @dataclass(frozen=True, slots=True)
 class NetTables:
-    """The files that tell the state of a net, read again.
+    """Files on the condition of a net, read from a run's folder.
 
     Attributes
     ----------

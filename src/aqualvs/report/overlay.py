@@ -1,4 +1,4 @@
-"""Stripes and posture drawn onto a picture, and the video made of such pictures."""
+"""Overlay of stripe points and posture on a picture, and the video of such pictures."""
 
 from fractions import Fraction
 from pathlib import Path

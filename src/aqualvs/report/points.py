@@ -1,6 +1,8 @@
-"""One pass over a run's points, batch by batch: counts, histograms, a sample of everything.
+"""Statistics of a run's points, read once and batch by batch.
 
-The one loop of the report that touches every point of a dive.
+One pass gathers counts, histograms and random samples of fixed size, so that memory does not grow
+with the dive. `add_points` is the compiled loop, the only one of the report that visits every
+point.
 """
 
 from collections.abc import Iterator
@@ -125,7 +127,7 @@ class FramePoints:
 
 @dataclass(slots=True)
 class PointSummary:
-    """What the report needs of all points of a dive; its size does not grow with their number.
+    """Statistics of all points of a dive for the report; their size does not grow with the dive.
 
     Attributes
     ----------

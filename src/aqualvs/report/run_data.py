@@ -1,9 +1,8 @@
-"""Read what a run left behind: `run.yaml`, `posture.csv`, truth and the bare-lens posture.
+"""A run's folder read for its report: `run.yaml`, `posture.csv`, truth, the bare-lens posture.
 
-The rig as `run.yaml` holds it: lasers' planes, their own frames, and facts for the table.
-
-A laser behind a window has a bent sheet; it is shown in the plane that fits the sheet best where
-the camera sees it.
+`run.yaml` also holds the rig; its lasers are returned with their planes and frames (paper, Eq.
+37-40), and its facts as rows of a table. A laser behind a window has a bent sheet, which is shown
+as the plane that fits the sheet best where the camera sees it.
 """
 
 from collections.abc import Mapping
@@ -301,7 +300,7 @@ class LaserFacts:
 
     @property
     def known(self) -> bool:
-        """Whether the plane is known and has a frame of its own."""
+        """True if the plane is known and has a frame of its own."""
         forward_part = 1.0 - self.normal[1] ** 2
         return bool(np.isfinite(self.offset) and forward_part > _SQUARE)
 
@@ -326,7 +325,7 @@ def lasers_of(rig: Mapping[str, Any]) -> list[LaserFacts]:
 
 
 def _fitted(lasers: list[LaserFacts], rig: Mapping[str, Any]) -> list[LaserFacts]:
-    """Give the lasers behind windows the planes of their sheets, NaN if the rig does not tell."""
+    """Return the lasers, those behind windows with the planes of their sheets; NaN if unknown."""
     try:
         known = rig_from_mapping(rig, source_name="run.yaml")
     except RigError:

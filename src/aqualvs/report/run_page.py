@@ -1,6 +1,7 @@
-"""The report of a run: one page that opens anywhere, without a network.
+"""Report of a run: one HTML page that opens anywhere, without a network.
 
-Everything the page is made of, gathered from the run folder once.
+`gather` reads everything that the page shows from the run's folder, once, into a `Material`;
+`write_report` turns it into the page.
 """
 
 from collections.abc import Mapping
@@ -43,7 +44,7 @@ from aqualvs.text import clock
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """What a report shows.
+    """Content of a run's report.
 
     Attributes
     ----------

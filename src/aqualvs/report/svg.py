@@ -1,6 +1,6 @@
-"""Static charts for paper and screen: inline SVG, drawn without scripts.
+"""Static charts for screen and paper, as inline SVG without scripts.
 
-Places are in the units of a chart's own view box, which a browser scales to the page. Words are
+Places are in the units of a chart's own view box, which the browser scales to the page. Text is
 escaped here.
 """
 

@@ -1,6 +1,7 @@
-"""Scores: how often, how well and how honestly a system answered.
+"""Scores of systems on a benchmark set: availability, accuracy, and honesty of the stated sigmas.
 
-Scores of systems side by side: tables to read, tables to compute with.
+`compare` holds answers against the truth; `score_systems` puts the scores of several systems side
+by side, as tables to read and as CSV and JSON to compute with.
 """
 
 import csv
@@ -61,7 +62,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
-    """How a system did in some frames.
+    """Score of a system on some frames.
 
     Attributes
     ----------
@@ -220,7 +221,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Bars:
-    """How long error bars are on a level, in those of the clear twins: medians.
+    """Median length of error bars on a level, relative to those of the clear twins.
 
     Attributes
     ----------

@@ -1,6 +1,7 @@
-"""`aqualvs score`: hold answers in plain CSV against the truth of a benchmark set.
+"""`aqualvs score`: answers in plain CSV compared with the truth of a benchmark set.
 
-The systems that come with aqualvs, run over a benchmark set: itself, and what it is held to.
+Systems that come with aqualvs can be run over the set as well: aqualvs itself, and what it is
+compared with (`OWN_SYSTEMS`).
 """
 
 import shutil
@@ -127,7 +128,7 @@ def score_and_tell(
     dives: bool,
     overwrite: bool = False,
 ) -> None:
-    """Score systems side by side and tell the table.
+    """Score systems side by side and print the table.
 
     Parameters
     ----------

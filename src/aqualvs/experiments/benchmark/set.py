@@ -1,10 +1,7 @@
-"""A benchmark set on disk: what its dives are, and the truth of their frames.
+"""The public benchmark set on disk, and the answers of a system to it.
 
-What a benchmark set says to whoever opens its folder.
-
-`aqualvs benchmark`: render the public benchmark set, or a part of it.
-
-What a system answered: plain CSV, frame by frame.
+`aqualvs benchmark` renders the set or a part of it: dives, the truth of their frames, and a README
+for whoever opens its folder. The answers of a system are plain CSV, frame by frame.
 """
 
 import csv
@@ -188,7 +185,7 @@ class BenchmarkSet:
 
     @property
     def title(self) -> str:
-        """What scores say they were made with."""
+        """Title of the set in scores."""
         frames = sum(len(dive.frames) for dive in self.dives)
         part = "" if self.whole else ", a PART of the set: not to be compared with the whole"
         size = f"{len(self.dives)} dives, {frames} frames"
@@ -406,7 +403,7 @@ def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
 
 
 def tell_dives(tell: Callable[[str], object]) -> None:
-    """Tell the levels and their dives, one line each."""
+    """Print the levels and their dives, one line each."""
     for level, about in LEVELS.items():
         names = (dive.name for dive in benchmark_dives() if dive.level == level)
         tell(f"{level:8} {about}: {', '.join(names)}")
