@@ -1,4 +1,4 @@
-"""What is closed when a `with` statement ends."""
+"""Base class of context managers that close themselves."""
 
 from types import TracebackType
 from typing import Self

@@ -1,4 +1,4 @@
-"""Files that are none: pipes, devices and sockets, which may never end, or never begin."""
+"""Refusal of special files: pipes, devices and sockets, which may block or never end."""
 
 import stat
 from pathlib import Path

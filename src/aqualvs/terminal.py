@@ -1,8 +1,6 @@
-"""How far a run is, on standard error.
+"""The terminal during a run: a progress bar on standard error, and an orderly stop.
 
-Stopping in good order: Ctrl-C and SIGTERM end the run after the current frame.
-
-The progress bar of a terminal.
+Ctrl-C and SIGTERM end the run after the current frame (`StopSignals`).
 """
 
 import contextlib

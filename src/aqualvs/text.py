@@ -1,4 +1,4 @@
-"""How the report and the overlay call things, and the colours that they share.
+"""Words and colours that the report and the overlay share.
 
 Colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), which remain distinct under
 the common forms of colour blindness.

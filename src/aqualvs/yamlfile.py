@@ -1,12 +1,10 @@
-"""Read YAML files: the only reader of the package.
+"""YAML files: the only reader of the package, the writer of rig files, and their comments.
 
 Values are plain: None, bool, int, float, str, lists and dicts of them. Numbers are decimal, as
-PyYAML writes them; what looks like a date, an octal or a sexagesimal number is text. Nothing is
-built by recursion, so that no file, however nested, exhausts the stack.
+PyYAML writes them; text that looks like a date, an octal or a sexagesimal number stays text.
+Parsing does not recurse, so that no file, however nested, exhausts the stack.
 
-Write the text of a rig file.
-
-Carry the comments of a YAML text over to a new text of the same file.
+`carry_comments` transfers the comments of a YAML text to a new text of the same file.
 """
 
 import re

@@ -1,17 +1,16 @@
-"""A typed door to Numba: every compiled kernel of the project goes through `kernel`.
+"""Numba decorators of the compiled kernels: `kernel` and its variants, typed, with a disk cache.
 
-Kernels round after every operation, in the order in which it is written, as Python does. Were LLVM
-free to fuse and to reorder, the last bits of a result would depend on the processor, on where
-arrays lie in memory, and on which of its callers a kernel was compiled for: a dive measured on
-several machines, or by several processes, would not equal the same dive measured by one.
+Kernels round after every operation, in the order in which it is written, as Python does. If LLVM
+could fuse and reorder operations, the last bits of a result would depend on the processor, on the
+memory layout of arrays and on the callers that a kernel was compiled for: a dive measured by
+several machines or processes would not equal the same dive measured by one.
 
-Kernels from disk without setting up Numba's compiler.
-
-Before Numba loads machine code from its cache, it registers everything that it can compile; it
-imports the modules that the code was once compiled from, SciPy's linear algebra among them; and it
-reads what other functions would inline. That takes three quarters of all loading, and only
-compiling needs it: here it waits until something is compiled. It rests on private parts of Numba,
-and is used with versions of it that it was tested with.
+Machine code on disk is loaded without setting up Numba's compiler (`load_lightly`). By default
+Numba first registers everything that it can compile, imports the modules that the code was compiled
+from (SciPy's linear algebra among them), and reads the intermediate code that other functions could
+inline. These steps take three quarters of the loading time, and only compilation needs them, so
+they are deferred until something is compiled. This relies on private parts of Numba and is enabled
+only for the versions that it was tested with.
 """
 
 import functools
@@ -150,7 +149,7 @@ def _import_absent() -> None:
     _absent.clear()
 
 
-# What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
+# `load_lightly` uses private parts of Numba: only versions that it was tested with are trusted.
 _LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
 if _LOADS_LIGHTLY:
     pass

@@ -1,10 +1,7 @@
-"""Positive definite systems of a few unknowns inside compiled kernels, by Cholesky's factor.
+"""Small linear algebra for compiled kernels, where calling LAPACK costs more than the solution.
 
-They are solved in less time than it takes to hand them to LAPACK.
-
-Three-vectors as tuples, for kernels: they stay in registers.
-
-Symmetric 3 x 3 systems inside compiled kernels, where calling LAPACK costs more than the job.
+Three-vectors are tuples, so that they stay in registers. Symmetric 3 x 3 systems are solved by
+cofactors, positive definite systems of a few unknowns by their Cholesky factor.
 """
 
 import math

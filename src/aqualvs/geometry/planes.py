@@ -1,7 +1,4 @@
-"""Planes n·X = d.
-
-Rays: where light enters the outer medium, and whither it goes.
-"""
+"""Planes n·X = d, and the rays of a camera in the outer medium that intersect them."""
 
 from dataclasses import dataclass
 

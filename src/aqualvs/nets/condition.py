@@ -1,7 +1,7 @@
-"""The condition of a net, stretch by stretch: mesh size, twine, solidity, holes.
+"""The condition of a net, by sections of the dive: mesh size, twine, solidity, holes.
 
-Scans go in one by one. A stretch of net is evaluated as a whole when the vehicle has passed it, so
-that what is known of its lattice, its light and its twine serves all of its frames.
+Scans are added one by one. A section of net ("stretch") is evaluated as a whole when the vehicle
+has passed it, so that its lattice, light and twine serve all of its frames.
 """
 
 from collections.abc import Iterable

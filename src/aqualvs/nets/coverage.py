@@ -1,24 +1,22 @@
-"""How much of the net its strands cover, and what dashes of one kind look like.
+"""Solidity of a net, and thickness of its twine, from the lit parts of the lasers' lines.
 
-The share of a line that is lit is, in expectation, the share of the area that strands cover
-(Delesse, C. R. Acad. Sci. 25 (1847) 544; Rosiwal, Verh. k. k. geol. Reichsanst. 1898, 143). What
-the detector adds to every dash is taken off, as `net_twine` says it.
+**Solidity.** The share of a line that is lit is, in expectation, the share of the area that strands
+cover (Delesse, C. R. Acad. Sci. 25 (1847) 544; Rosiwal, Verh. k. k. geol. Reichsanst. 1898, 143).
+The amount that the detector adds to every dash is subtracted (`Twine.excess`).
 
-Thickness of twine, from how long and how wide the light is on strands that cross at angles.
-
-The light on a strand is where strand and laser sheet overlap: a parallelogram with rounded corners.
-Search lines meet it over a length that follows in quadrature from strand and sheet, and across the
-line it is as wide as the sheet or as the strand lets it be, whichever is less:
+**Twine.** The light on a strand is where strand and laser sheet overlap: a parallelogram with
+rounded corners. Search lines meet it over a length that follows in quadrature from strand and
+sheet, and across the line it is as wide as the narrower of sheet and strand:
 
     (length / b)² = (l / sin a)² + (w k)²,    width⁻ᵖ = (r w)⁻ᵖ + (k sin a / (d + e))ᵖ,
 
 with the silhouette d, its lit width l, the crossing angle a, the sheet's lit width w and the slant
-k, by which the strand runs away from the search lines on its way across the sheet. Dashes at
-several angles tell strand and sheet apart; r says how the sheet's width at half height compares
-with its lit one. A dash ends where its light falls below a share of its own peak (`net_dashes`), so
-that its length depends on brightness little, as b says: overexposed tops are cut off, and faint
-edges are lost. l is less than d, because round strands are dim at their edges, and more by blur.
-How much was measured in simulation; the uncertainty holds what it varied.
+k, by which the strand runs away from the search lines on its way across the sheet; r is the ratio
+of the sheet's width at half height to its lit width. Dashes at several angles separate strand and
+sheet. A dash ends where its light falls below a share of its own peak (`aqualvs.nets.dashes`), so
+that its length depends only weakly on brightness, by the factor b: overexposed tops are cut off,
+and faint edges are lost. l is less than d, because round strands are dim at their edges, and more
+by blur; the amount was measured in simulation, and the uncertainty covers its variation.
 """
 
 import math

@@ -1,6 +1,7 @@
-"""Dashes: the pieces of a laser's line that strands light, and the dark gaps between them.
+"""Dashes: the lit pieces of a laser's line on strands, and the dark gaps between them.
 
-Cutting the lasers' lines into dashes, gaps and spans.
+`find_dashes` cuts the lines of one frame into dashes, gaps and spans (pieces of line seen without
+interruption).
 """
 
 from dataclasses import dataclass

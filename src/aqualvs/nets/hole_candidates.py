@@ -1,18 +1,16 @@
-"""Strands that the lattice predicts, one by one: seen, missed, or not to be seen.
+"""Candidate holes: evidence from single strands that the lattice predicts, summed over discs.
 
-Where the lattice lies in a frame is known, and so is where each laser's line crosses each strand.
-What is lit there is a strand seen; what is dark, with light enough to either side, one missed.
+**Strands.** The place of the lattice in a frame is known, and so is the point where each laser's
+line crosses each strand. A lit crossing is a strand seen; a dark one, with enough light on either
+side, a strand missed (`predicted_strands`).
 
-Looks at strands that a net should have: what each says for a hole, and what they say together.
+**Looks.** Each crossing is a look: evidence for a hole there or against it. The rate at which
+existing strands are missed is estimated from the dive itself. Looks of one laser at one small cell
+of the net are alike and count as one, however many (`Looks`).
 
-A look finds a strand or misses it. How often strands that are there are missed, the dive itself
-tells. Looks of one laser at one small cell of the net are alike and count as one, however many.
-
-Round patches of the net in which strands are missing, by likelihood.
-
-Every place where a strand was looked for speaks for a hole there or against it. The evidence adds
-up over discs of many sizes around many middles; the discs that explain it, each with its
-likelihood, say where a hole is, how large, and how well that is known where its edge was not seen.
+**Discs.** The log-likelihood adds up over discs of many sizes around many middles; the discs that
+explain it, each with its likelihood, give the place and size of a hole, and their uncertainty where
+its edge was not seen (`find_discs`).
 """
 
 from dataclasses import dataclass, field

@@ -1,9 +1,9 @@
 """Holes: places on the net where strands that the lattice predicts are missing.
 
-Every crossing of a laser's line with a strand that should be there is looked at: seen, or missed.
-Looks from many places are put together on a map that is fixed to the net. However often the same
-piece of strand was looked at from much the same place, it counts once; how often strands that are
-there are missed is told by the dive itself.
+Every crossing of a laser's line with a strand that should be there is checked: seen, or missed.
+Looks from many places are combined on a map that is fixed to the net. Repeated looks at one piece
+of strand from much the same place count once; the rate at which existing strands are missed is
+estimated from the dive itself.
 """
 
 from collections.abc import Sequence

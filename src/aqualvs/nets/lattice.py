@@ -1,10 +1,10 @@
-"""The lattice of a net: how far apart its strands are and which way they run.
+"""The lattice of a net: spacing and directions of its strands, and the track along the net.
 
-Where the net's lattice lies in every frame, and so how the vehicle moved along the net.
-
-A lattice fixes the place of the net but for whole meshes; which one is taken follows from how the
-vehicle moved before (a Kalman filter with constant velocity). So the move from frame to frame must
-be foreseen to better than half a mesh: say how fast the vehicle goes where another sensor knows it.
+`find_lattice` fits the lattice to the crossings of some frames. `LatticeFitter` finds its place in
+each frame, and `NetTrack` follows the vehicle's motion along the net from these places. A lattice
+fixes the place of the net only up to whole meshes; the right one is chosen from the motion so far
+(a Kalman filter with constant velocity). So the motion from frame to frame must be predicted to
+better than half a mesh: pass the vehicle's velocity where another sensor measures it.
 """
 
 from collections.abc import Sequence

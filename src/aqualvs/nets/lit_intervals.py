@@ -1,8 +1,8 @@
-"""What each laser shows of a net in one frame: where its line across it is lit, and where dark.
+"""Lit intervals: the lit, dark and hidden parts of each laser's line across the net in one frame.
 
 A laser sheet cuts the target plane in a line. Every search line of the detector looks at one place
-of it, so a frame gives one signal per laser: dark, lit (a strand crosses there), or hidden, where
-nobody could tell.
+of it, so a frame gives one signal per laser: dark, lit (a strand crosses there), or hidden (not
+observable).
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A picture of the net wall, unrolled: fouling by colour, holes to scale, the vehicle's way.
+"""A picture of the net wall, unrolled: fouling by colour, holes to scale, the vehicle's track.
 
 Drawn without a display; Matplotlib is loaded only when a map is drawn.
 """

@@ -1,7 +1,7 @@
-"""What things before a net hide of it: from the camera, and from the lasers' light.
+"""Occlusion of the net by objects before it: from the camera, and from the lasers' light.
 
-Only the stripes on a thing are seen, not its outline; it is taken to be half as wide as they are
-long. Too much hidden costs looks at the net, too little would make holes of fish.
+Only the stripes on an object are seen, not its outline; it is taken to be half as wide as they are
+long. Too large an occlusion costs looks at the net, too small a one would turn fish into holes.
 """
 
 from dataclasses import dataclass

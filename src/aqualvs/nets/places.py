@@ -1,13 +1,12 @@
-"""Where on the net what a dive saw is: the lattice's track and the vehicle's log put together.
+"""Places on the net: the lattice's track and the vehicle's log combined.
 
-The track knows every step along the net, to a fraction of a mesh, as long as it lasts; where it
-breaks, its pieces have nothing in common. The log knows depth and heading all the time, but
-coarsely. So the track gives the places within a piece, and the log puts the pieces where they
-belong: depth pins their height, the bearing of the net their place along a round cage.
+The track measures every step along the net, to a fraction of a mesh, as long as it lasts; where it
+breaks, its pieces have nothing in common. The log has depth and heading all the time, but coarsely.
+So the track gives the places within a piece, and the log positions the pieces: depth fixes their
+height, the bearing of the net their place along a round cage (`place_net`).
 
-What the vehicle's log says of the net that a dive looked at, moment by moment.
-
-The vehicle's log beside a dive: read it, and lay it on the dive's clock.
+`open_log` and `lay_log` read the log beside a dive and align it with the dive's clock; `Seen` gives
+depth, bearing and heading at the moments of the dive's postures.
 """
 
 from collections.abc import Sequence

@@ -1,17 +1,15 @@
-"""Power of plane waves in where lasers cross the strands of a net.
+"""Spectrum of the crossings of laser lines with strands, and lattice hypotheses from its peaks.
 
 Strands of one family are parallel and evenly spaced, so their crossings with the lasers' lines all
 have nearly one phase in a plane wave whose crests are the strands. The power of such waves, summed
-over frames, peaks at the families' wave vectors, wherever the net was in each frame. Uneven cover
-(the lasers' lines themselves) would peak as well; it is taken out by comparing with crossings
-spread evenly over what could be seen. Power spectra of point processes: Bartlett, J. R. Stat. Soc.
-B 25 (1963) 264, doi:10.1111/j.2517-6161.1963.tb00508.x.
+over frames, peaks at the families' wave vectors, wherever the net was in each frame. Uneven
+coverage (the lasers' lines themselves) would peak as well; it is removed by comparison with
+crossings spread evenly over the visible parts of the lines. Power spectra of point processes:
+Bartlett, J. R. Stat. Soc. B 25 (1963) 264, doi:10.1111/j.2517-6161.1963.tb00508.x.
 
-Lattices that a net may have, and how likely each is.
-
-Which lattice explains the peaks of a spectrum is decided by likelihood. How many crossings there
-are per metre of line tells a lattice from its multiples and fractions, and that the sides of a mesh
-are equally long tells it from chance.
+The lattice that explains the peaks is chosen by likelihood (`score`). The number of crossings per
+metre of line separates a lattice from its multiples and fractions; equal lengths of the sides of a
+mesh separate it from chance.
 """
 
 from collections.abc import Sequence

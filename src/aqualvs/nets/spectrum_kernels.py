@@ -1,12 +1,11 @@
-"""Kernels of `net_spectrum`: sums of plane waves over places and over pieces of line.
+"""Compiled kernels of `aqualvs.nets.spectrum`: sums of plane waves, and log-likelihood gains.
 
 A piece of line of length l with ends b and e adds l sinc(q·(e - b)) exp(2 pi i q·(b + e)/2), times
 the crossings per metre that are expected on it.
 
-How much likelier a lattice makes the crossings that were seen: kernels of `net_hypotheses`.
-
-Powers of plane waves (`net_spectrum`) are exponentially distributed about their mean: 1 where
-crossings lie at random, more on the waves that a lattice is made of.
+Powers are exponentially distributed about their mean: 1 where crossings lie at random, more on the
+waves that a lattice is made of. The gain is the log-likelihood of the crossings with the lattice
+over that of random ones.
 """
 
 import numpy as np
@@ -339,7 +338,7 @@ def shell_gain(
     Parameters
     ----------
     place, start, begin, end, expected, span_start
-        As for `net_waves.comb_power`.
+        As for `comb_power`.
     basis : array, shape (2, 2)
         Two waves of the first shell.
     """
@@ -374,7 +373,7 @@ def families_gain(
     Parameters
     ----------
     place, start, begin, end, expected, span_start
-        As for `net_waves.comb_power`.
+        As for `comb_power`.
     line, span_line : int array, shape (N,) and (M,)
         Lines that crossings and spans lie on.
     n_lines : int

@@ -1,12 +1,8 @@
-"""`net.csv`, `holes.csv` and `net.geojson`: the state of a net as tables.
+"""Tables and texts of a net's condition: `net.csv`, `holes.csv`, `net.geojson`, the summary.
 
-The net wall unrolled into a plane: what the map and `net.geojson` are drawn in.
-
-x is metres along the net to the right, as seen from the vehicle, from where the dive began; y is
-minus the depth in metres, or, without a log, metres above the start. Where there is no track, x is
-the bearing of the net in degrees.
-
-The state of a net in a few words and numbers.
+The map and `net.geojson` use coordinates of the unrolled net (`NetWall`): x is metres along the net
+to the right, as seen from the vehicle, from where the dive began; y is minus the depth in metres,
+or, without a log, metres above the start. Without a track, x is the bearing of the net in degrees.
 """
 
 import csv

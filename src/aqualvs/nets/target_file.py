@@ -1,4 +1,4 @@
-"""What the lasers hit, as a word or a short file (`net.yaml`).
+"""The target that a user expects: a word or a short file (`net.yaml`), and the check against it.
 
 ::
 
@@ -13,17 +13,13 @@
       r_min_mm: 15
       r_max_mm: 35
 
-The adaptive filter needs none of this. Where the net is given, the paper's filter takes what
-`mesh_filter` leaves out from it.
+The adaptive filter needs none of this. Where the net is given, the paper's filter derives from it
+what `mesh_filter` leaves out. `NetRequest` holds the options of a run's net condition.
 
-What a user wants to know of a net.
-
-Whether the net that is seen is the one that the target file describes.
-
-Along a laser's line strands follow one another at distances that depend on the way the mesh is
-turned; over three lasers and a dive their mean tells the bar. For parallel lines thrown at random
-on a net with a length L of twine on every square metre it is pi / (2 L) (Crofton); L is 2 / bar for
-square and diamond meshes and 2 / (sqrt(3) bar) for hexagons.
+`NetCheck` compares the net in view with the file. Along a laser's line the distances between
+strands depend on the roll of the mesh; over three lasers and a dive their mean gives the bar. For
+parallel lines thrown at random on a net with a length L of twine on every square metre it is
+pi / (2 L) (Crofton); L is 2 / bar for square and diamond meshes and 2 / (sqrt(3) bar) for hexagons.
 """
 
 import math

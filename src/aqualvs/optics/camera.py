@@ -1,9 +1,9 @@
 """The camera: pixels to rays in the outer medium, points to pixels, and every derivative.
 
-For kernels of other modules: `trace_pixel(camera.params, u, v)` and
+`BareCamera` and `DomeCamera` share one set of numbers: `parameter_names` gives their order in every
+parameter Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs
+them for kernels. For kernels of other modules `trace_pixel(camera.params, u, v)` and
 `project_point(camera.params, x, y, z)` are scalar compiled functions to call inside a `@kernel`.
-
-The numbers of a camera: their names, small changes to them, and the form that kernels take.
 """
 
 from collections.abc import Sequence

@@ -1,17 +1,7 @@
-"""Batch kernels of the camera, backward: rows of points to rows of pixels.
+"""Batch kernels of the camera: pixels to rays, points to pixels, and the Jacobians of both.
 
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`. See
-`lens_batch` for how the blocks work.
-
-Batch kernels of the camera, forward: rows of pixels to rows of rays.
-
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`. See
-`lens_batch` for how the blocks work.
-
-Batch kernels of the camera, backward with derivatives: points to pixels and their Jacobians.
-
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`. See
-`lens_batch` for how the blocks work.
+Every kernel writes into arrays that it is given, and NaN wherever it writes False into `valid`. The
+block layout of the scratch array is that of `aqualvs.optics.lens`.
 """
 
 import numpy as np

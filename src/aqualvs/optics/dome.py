@@ -1,8 +1,7 @@
-"""The dome: two concentric spheres with acrylic or glass between them.
+"""Refraction by the dome: two concentric spheres with acrylic or glass between them.
 
-Forward through the dome: from a pixel to the ray that it sees in the outer medium.
-
-Back through the dome: from a point in the outer medium to the direction at the lens.
+Unprojection (`trace_pixel`) follows a pixel's ray from the lens into the outer medium. Projection
+(`direction_to_point`) finds the direction at the lens whose ray meets a point in the outer medium.
 
 In concentric spheres n * rho * sin(incidence) is constant along a ray (Bouguer; Born and Wolf,
 Principles of Optics, 3.2.1). With the lens at distance l from the centre and alpha the ray's angle
@@ -14,20 +13,19 @@ polar angle
 
 Solving theta(alpha) = angle of the point takes a few Newton steps. No angle is ever formed: each
 asin is the unit complex number (sqrt(1 - s^2), s), sums are products, and the residual is the sine
-of theta - target. Sines are carried divided by b, so that nothing breaks when the lens sits in the
+of theta - target. Sines are carried divided by b, so that nothing breaks when the lens is in the
 centre, where b vanishes.
 
-Derivatives of the direction at the lens, by the implicit function theorem.
-
+The derivatives of the projection follow from the implicit function theorem (`back_derivative`).
 With u the unit vector along which the direction turns as alpha grows, m the normal of the plane of
-refraction, and theta(alpha; rho, r, R, n) of `dome_back`, the derivative of the direction is
+refraction, and D = theta - alpha, the derivative of the direction is
 
     by the point   u (u_target / rho - theta_rho p)^T / theta_alpha + (k / rho) m m^T
     by the lens    (n_air dD/db / theta_alpha) u u^T + n_air (sin D / b) k m m^T
     by any other   -u theta_x / theta_alpha
 
-where k = sin alpha / sin theta, which becomes 1 / theta_alpha on the axis. None of it divides by
-the decentring.
+where k = sin alpha / sin theta, which becomes 1 / theta_alpha on the axis. No term divides by the
+decentring.
 """
 
 import math

@@ -1,11 +1,10 @@
-"""What a rig can measure: errors of the posture to a wall, from its calibration and from noise.
+"""Expected error of the posture to a wall, from a rig's calibration and from pixel noise.
 
-The plane m·X = 1 is fitted by least squares (paper, Eq. 23-26) at a wall square ahead,
-m = (0, 1/range, 0), each point weighed by what its pixel error makes of m·X. Errors of the pixels
-differ from point to point and from frame to frame; those of the calibration are the same in all
-frames of a dive, and no averaging removes them.
-
-Where a rig's stripes fall in the picture on a wall ahead, and what a pixel on them is worth.
+The plane m·X = 1 is fitted by least squares (paper, Eq. 23-26) to a wall square ahead,
+m = (0, 1/range, 0), each point weighted by the effect of its pixel error on m·X. The points are
+those of the stripes that the camera sees on the wall (`StripeView`). Pixel errors differ from point
+to point and from frame to frame; calibration errors are the same in all frames of a dive, and
+averaging does not reduce them.
 """
 
 from collections.abc import Sequence

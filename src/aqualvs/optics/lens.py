@@ -1,13 +1,10 @@
 """The lens: pixels to directions in `cam` and back, with OpenCV's two distortion models.
 
-Batch kernels of the lens: rows of pixels to rows of directions and back.
-
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`.
-
-The hot kernels work in blocks: rows of coordinates are copied into one flat scratch array, each
-quantity in a row of its own, and loops of constant length without branches run over it. One array
-and constant offsets let LLVM prove that nothing overlaps and use vector instructions; whatever
-needs a branch is done lane by lane in between.
+The batch kernels behind `Lens` write into arrays that they are given, and NaN wherever they write
+False into `valid`. The hot kernels work in blocks: rows of coordinates are copied into one flat
+scratch array, each quantity in a row of its own, and loops of constant length without branches run
+over it. One array and constant offsets let LLVM prove that nothing overlaps and use vector
+instructions; operations that need a branch are done lane by lane in between.
 """
 
 import math

@@ -1,13 +1,8 @@
-"""Scalar kernels of a lens of either model, with exact Jacobians.
+"""Scalar kernels of a lens: both distortion models of OpenCV, their inverses and exact Jacobians.
 
-A lens as compiled kernels take it.
-
-The distortion of OpenCV's fisheye model (Kannala and Brandt 2006) and its inverse.
-
-The distortion of OpenCV's pinhole model, its exact Jacobian and its inverse.
-
-"Normalised" coordinates are x/z and y/z of a direction in `cam`, "distorted" ones are those after
-the distortion: (u - cx)/fx and (v - cy)/fy.
+`LensParams` holds a lens as compiled kernels take it: the rational pinhole model (`opencv`) or the
+fisheye model (`fisheye`; Kannala and Brandt 2006). "Normalised" coordinates are x/z and y/z of a
+direction in `cam`, "distorted" ones are those after the distortion: (u - cx)/fx and (v - cy)/fy.
 """
 
 import math

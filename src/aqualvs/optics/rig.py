@@ -1,6 +1,7 @@
 """The rig: one camera, its housing, the water and the lasers, in SI units.
 
-How well a rig is known: the joint covariance of its numbers, and how a rig moves by them.
+`RigUncertainty` is the joint covariance of a rig's numbers; `rig_moved_by` adds a small step to
+them. Planes of lasers are perturbed by rotations towards `tangent_basis` and by their offset.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,15 +1,16 @@
-"""What a rig's own uncertainty makes of a posture: the part of its error that all frames share.
+"""Covariance of a posture from the uncertainty of the rig: the error that all frames share.
 
 A surface is fitted by weighted least squares to points on the lasers' sheets. An error of a rig's
-parameter moves the ray of a pixel, or the sheet that it meets, and so the point: by dX, of which
+parameter moves the ray of a pixel, or the sheet that it meets, and so the point: by dX, whose
+component off the surface is
 
     s·dX = q·(dp + t dv) - (s·v)/(g·v) df,    q = s - (s·v)/(g·v) g,
 
-leads off the surface, where s is the surface's normal, p + t v the ray, f the signed distance from
-the sheet and g its gradient. The fit answers with dc = (sum w a a^T)^-1 sum w a (s·dX), a being the
-terms of its coefficients c (for the plane m·X = 1: X itself), and range, pitch and yaw follow
-(paper, Eq. 23-26). Errors of a rig are smooth over the picture: derivatives of rays are taken once
-per rig on a lattice of pixels, and a few pixels stand for each stripe.
+where s is the surface's normal, p + t v the ray, f the signed distance from the sheet and g its
+gradient. The fit responds with dc = (sum w a a^T)^-1 sum w a (s·dX), a being the terms of its
+coefficients c (for the plane m·X = 1: X itself); range, pitch and yaw follow (paper, Eq. 23-26).
+Errors of a rig are smooth over the picture: derivatives of rays are taken once per rig on a lattice
+of pixels, and a few pixels represent each stripe.
 """
 
 from typing import NamedTuple

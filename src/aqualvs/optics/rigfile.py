@@ -1,9 +1,9 @@
 """The rig file: `rig.yaml` to `Rig` and back.
 
-Files speak millimetres and degrees, `Rig` metres and radians. Whatever was loaded from a file is
-written back bit for bit; a rotation is written to 1e-12 degrees. docs/rig.md explains every key.
-
-Dated copies of files that are about to be replaced: `rig.2026-11-23T141503.yaml`, in UTC.
+Files use millimetres and degrees, `Rig` metres and radians. A value that was loaded from a file is
+written back bit for bit; a rotation is written to 1e-12 degrees. Before a file is replaced, a copy
+is kept under its date in UTC, such as `rig.2026-11-23T141503.yaml` (`keep_dated`). docs/rig.md
+explains every key.
 """
 
 import math

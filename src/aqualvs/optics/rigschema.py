@@ -1,7 +1,7 @@
-"""What a rig file may contain, and one line about what is wrong with it.
+"""Schema of the rig file: allowed keys and types, with one-line error messages.
 
-`parse_rig` checks the shape of the file alone: keys, types, limits of single values. What a rig
-must fulfil as a whole (the lens inside the dome, say) is checked in `rigfile`.
+`parse_rig` checks the shape of the file alone: keys, types, limits of single values. Conditions on
+the rig as a whole (the lens inside the dome, say) are checked in `aqualvs.optics.rigfile`.
 """
 
 import difflib

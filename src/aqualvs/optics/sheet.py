@@ -1,10 +1,8 @@
-"""Sheets of laser light as they are in the water: planes, or bent at a flat window.
+"""Sheets of laser light in the water: planes, or curved behind a flat window.
 
-A laser behind a window that is tilted to its beam lights no plane: the sheet leaves the window as
-another plane would, then strays from it by millimetres within the working range, and moves with the
-water's index. A `Sheet` answers for both kinds; `aqualvs.optics.sheet` has the mathematics.
-
-The sheet of a line laser behind a flat window: its implicit form, in compiled kernels.
+A laser behind a window that is tilted to its beam does not light a plane: the sheet leaves the
+window as another plane would, then deviates from it by millimetres within the working range, and
+moves with the water's index. A `Sheet` covers both cases.
 
 In air the sheet is the plane n·X = d, fanned out from a source S in it. The window's outer face
 w·X = c lies s in front of S; a point X in the water lies h in front of the face and, seen along w,

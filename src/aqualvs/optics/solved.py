@@ -1,6 +1,7 @@
-"""What calibrations note down in a rig: when and from what it was solved, and how well.
+"""Calibration records of a rig: date, data and residuals of each step, and the uncertainty.
 
-It stands in `Rig.solved_from`, and so in the rig file, in millimetres and degrees (docs/rig.md)::
+They are kept in `Rig.solved_from`, and so in the rig file, in millimetres and degrees
+(docs/rig.md)::
 
     solved_from:
       dome: {date: '2026-05-04T09:30:00Z', pictures: 14, points: 3040, rms_px: 0.09}
@@ -11,9 +12,9 @@ It stands in `Rig.solved_from`, and so in the rig file, in millimetres and degre
         - [0.93]
         - [-0.2, 0.1]
 
-Of a rig whose numbers are the truth because something was rendered with it: `uncertainty: exact`.
-
-Uncertainty of what nobody has calibrated: stated defaults for numbers written by hand.
+`uncertainty: exact` marks a rig whose numbers are the truth because pictures were rendered with it.
+Numbers that were never calibrated, such as those written by hand, get stated default uncertainties
+(`assumptions`, `completed_uncertainty`).
 """
 
 import difflib

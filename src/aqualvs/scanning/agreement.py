@@ -1,22 +1,17 @@
-"""Whether the lasers agree with each other on flat targets, and which one has drifted if not.
+"""Agreement of the lasers over a dive: detection of a laser whose sheet has moved.
 
-Two lines on a flat target share a plane, three more so: a laser whose sheet is no longer where the
-rig says leaves it. What one frame shows of that is little (of three lines, each with a shift and a
+Two lines on a flat target share a plane, and so do three: a laser whose sheet is no longer where
+the rig says leaves it. One frame shows little of that (of three lines, each with a shift and a
 turn, the target's own plane takes three numbers), but a sheet that has moved has done so by the
-same three numbers in all frames, at every range and angle of the target, and no bulge of a net or
-fish in front of it follows that pattern. So each laser in turn is taken for the one that has moved,
-and it is named if that explains all frames, and no other does.
+same three numbers in all frames, at every range and angle of the target; no bulge of a net or fish
+in front of it follows that pattern. So each laser in turn is assumed to have moved, and it is named
+if that explains all frames and no other laser does.
 
-Where each laser's stripe runs in one frame, in a few robust numbers, whatever its label.
-
-A laser that has drifted leaves the target's plane, and its points are then labelled as clutter or
-as another surface; here they count all the same.
-
-The fit behind `LaserAgreement`: flat targets of many frames, and one laser that may have moved.
-
-Every frame has a target plane m·X = 1 of its own. One laser's sheet, the same in all frames, may
-have turned and shifted by a small step of three numbers; the planes are eliminated from the normal
-equations (Schur complement), and weights are Tukey's.
+`bin_stripes` summarises each stripe of a frame by the middle of its light in a few bins, whatever
+its label: the points of a laser that has drifted are labelled as clutter or as another surface.
+`explain` fits a plane m·X = 1 to each frame and one step of three numbers (turns and shift) to one
+laser's sheet in all frames; the planes are eliminated from the normal equations (Schur complement),
+and weights are Tukey's. `LaserAgreement` collects the frames and gives the verdict.
 """
 
 import math

@@ -1,13 +1,13 @@
-"""The test of a surface against rival assignments of the same peaks to lasers.
+"""Laser assignment test: a surface against rival assignments of the same peaks to lasers.
 
 Where lasers are nearly parallel, a picture in which every stripe is read as its neighbour's may
 show a plane as well: shifted and tilted, with small residuals. The rivals of a surface are found by
 reading the peaks of two of its stripes as other lasers', which gives a plane, and refining that
 plane on all peaks. Each hypothesis is then judged by
 
-- the light that it explains: peaks of the same looks that are left over count against it;
-- the light that it misses: a laser whose stripe would lie in the picture, beside others that are
-  seen, and shows nothing. It may be switched off or hidden, so this is a cost and no gate;
+- the light that it explains: peaks of the same appearance that are left over count against it;
+- the light that it lacks: a laser whose stripe would lie in the picture, beside others that are
+  seen, and shows nothing. It may be switched off or hidden, so this is a cost, not a gate;
 - the residuals of each laser's stripe as a whole: the log-likelihood ratio of two fits with unknown
   noise is half the degrees of freedom times the logarithm of the ratio of the variances.
 

@@ -1,4 +1,4 @@
-"""The arithmetic of `AssignmentTest`: rivals of a plane, and what speaks for each of them."""
+"""Compiled kernels of `AssignmentTest`: rivals of a plane, and the evidence for each of them."""
 
 import math
 

@@ -1,10 +1,9 @@
-"""Readings: every return, read as a point of each laser that could have made it.
+"""Candidates: every stripe peak, triangulated as a point of each laser that could have made it.
 
-The arithmetic of `read_returns`: what a laser makes of the returns of its search direction.
-
-The arithmetic of `Readings`: chunks of stripe, and averages over groups of readings.
-
-Chunks: pieces of stripe, the units that agree with a surface or do not.
+`read_returns` links each laser's peaks (`Returns`) to segments and triangulates them; the result,
+`Readings`, holds the candidate correspondences of peaks and lasers. `Chunks` summarises them by
+subsegments, the units that agree with a surface or do not; `Readings.observations` averages any
+groups of them, weighted by intensity.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,7 @@
-"""Detection in a whole frame: one search for each direction that the lasers need.
+"""Stripe detection in a whole frame: one search for each direction that the lasers need.
 
-Search images: a picture as each search direction sees it, with search lines as rows.
+`SearchLines` makes the search images, in which search lines are rows; `FrameDetector` finds the
+peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,8 @@
-"""Labels: what each stripe point was found to be.
+"""Labels of stripe points: the kind of object that each was found on.
 
-The arithmetic of `label_readings`: what lies on which surface, and what is told by its shape.
+`label_readings` labels light on the other surfaces first, then light on the target (on a net also
+nearby light that the search left out). What lies on no surface is labelled by the shape of its
+segment.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Where in the image each laser can appear, and which way its stripe may run there.
+"""Laser bands: the part of the image where each laser can appear, and its possible slopes there.
 
 A laser sheet, limited to the working range, is seen only in a band of the image that follows from
 the rig. The band replaces the hand-drawn areas of the paper (section 3.1).

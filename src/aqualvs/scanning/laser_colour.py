@@ -1,13 +1,13 @@
-"""Colour of laser light: how it moves a pixel's chroma, and how likely a peak is laser light.
+"""Colour of laser light: its effect on a pixel's chroma, and the likelihood that a peak is laser.
 
 A camera sees a 532 nm line neither as pure green nor always as green: its colour filters overlap,
 white balance scales the channels, and an overexposed core is white inside a green halo. On nine
 cameras, in air and under water, green lines lower V in 94 to 100 % of their pixels, but U in 0 to
-100 %; red lines raise V. So colour is evidence and no gate: the wavelength says in which half of
-the chroma plane to look, the frame's own best stripes say in which direction, and how far for each
-grey level of height, its lines move the chroma, and every peak gets the likelihood that it is such
-a line and not paint, twine or glare. A frame learns from itself, so that a white balance that
-drifts needs no tracking, and a frame's answer depends on nothing but the frame.
+100 %; red lines raise V. So colour is evidence, not a gate: the wavelength gives the half of the
+chroma plane to look in; the frame's own best stripes give the direction in which its lines move the
+chroma, and the amount for each grey level of height; and every peak gets the likelihood that it is
+such a line and not paint, twine or glare. The colour is learned from each frame alone: a white
+balance that drifts needs no tracking, and a frame's result depends on nothing but the frame.
 """
 
 import math

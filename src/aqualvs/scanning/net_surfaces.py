@@ -1,12 +1,11 @@
-"""Whether the stripes on a surface are broken as those on a net are, and how far they reach.
+"""Net surfaces: classification of stripes as a net's, joining of coplanar pieces, and mean plane.
 
-How two surfaces share the stripes: side by side, or the one seen through the other.
-
-A net is the only surface that another one is seen through: along a stripe, light on it takes turns
-with light behind it. The flanks of a fold, which are found as planes of their own, lie side by
-side, and the one begins where the other ends.
-
-The mean plane of a net that is mostly folds, and the doubt that it casts on another.
+`describe_pattern` classifies the stripes on a surface by their lit lengths and gaps. A net is the
+only surface through which another one is seen: along a stripe, light on it alternates with light
+behind it (`seen_through`). The flanks of a fold, which are found as planes of their own, lie side
+by side, and the one begins where the other ends (`continues`); `joined_plane` gives their plane.
+For a net that is mostly folds `fit_mean` fits the mean plane, and `doubted` widens the covariance
+of a posture that disagrees with it.
 """
 
 from collections.abc import Sequence

@@ -1,13 +1,12 @@
-"""Curved nets: a paraboloid where a plane leaves too much over.
+"""Curved nets: fit of a paraboloid where the residuals of a plane ask for it.
 
 Over the plane that the search found, the net is a height
 
     h(u, v) = a + b u + c v + (p u² + 2 q u v + r v²) / 2
 
 with u to the right and v upward in that plane. The plane touches the net along a band only; the fit
-starts there and grows outward, because what it has learned in the band predicts the net beside it.
-
-The arithmetic of `quadric`: weighted least squares in six coefficients.
+starts there and grows outward, because the fitted band predicts the net beside it. Each step is a
+weighted least-squares fit of the six coefficients.
 """
 
 from dataclasses import replace

@@ -1,9 +1,7 @@
-"""Patches: pieces of paraboloids over a plane, and the point of them nearest to the vehicle.
+"""Patches: pieces of paraboloids over a plane, and their point nearest to the vehicle.
 
-The arithmetic of `Patch`: heights over it, and its point nearest to the vehicle.
-
-A patch is 16 numbers: normal and offset of its base, the two unit vectors along u and v, and the
-coefficients a, b, c, p, q, r of the height.
+For kernels a patch is 16 numbers: normal and offset of its base, the two unit vectors along u and
+v, and the coefficients a, b, c, p, q, r of the height.
 """
 
 from dataclasses import dataclass

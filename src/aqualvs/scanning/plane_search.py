@@ -1,13 +1,13 @@
-"""The search for one plane among chunks of stripe: a deterministic, locally optimised RANSAC.
+"""Search for one plane among subsegments: a deterministic, locally optimised RANSAC.
 
-Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44): chunks
-next to each other on a stripe more likely share a surface than distant ones, and chunks with more
-voice more likely lie on any surface than specks. Hypotheses are scored
-by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), the promising ones refined.
+Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44):
+subsegments (chunks) next to each other on a stripe more likely share a surface than distant ones,
+and those with a larger sampling weight (`voice`) more likely lie on any surface than specks.
+Hypotheses are scored by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), and the promising
+ones are refined.
 
 Chunks come as a table, one column a chunk and one row a quantity, so that scoring a hypothesis
-runs along memory and becomes vector instructions; what is then summed is kept chunk by chunk,
-because a sum has its order.
+runs along memory and is vectorised; the scores are then summed chunk by chunk, in a fixed order.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Posture relative to a plane target: range, pitch, yaw and how far to trust them."""
+"""Posture relative to a plane target: range, pitch and yaw, with their covariance."""
 
 import math
 from dataclasses import dataclass, field

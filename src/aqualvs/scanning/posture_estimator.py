@@ -1,6 +1,8 @@
-"""The posture to one surface: which readings it rests on, and the fit to them.
+"""The posture to one surface: its inliers, the fit to them, and the checks of the result.
 
-The arithmetic of `PostureMeter`: what is measured of a surface, and what a fit rests on.
+`PostureMeter.measure` selects the pieces of stripe on the surface, fits a plane or a paraboloid to
+them, follows a net where it leaves the surface, and replaces or widens the posture where a net is
+mostly folds.
 """
 
 import math

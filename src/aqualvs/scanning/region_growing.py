@@ -1,15 +1,13 @@
-"""Following a net where it leaves its plane: from strand to strand along each stripe.
-
-Where a net folds, its light leaves the plane, but not at once: the next strand is about as far
-away as the last one, give or take what a flank of a fold makes of the way between them. Readings
-of other lasers' light, bubbles and what is seen through the net have no such neighbours, or are
-farther off than the right reading of the same light.
-
-Light that belongs to the target although the search for planes left it out.
+"""Region growing: light of the target that the search for planes left out.
 
 A plane is sought with a narrow gate, among whole pieces of stripe, so that nothing foreign enters
-the posture. To say what a point lies on, the gate may be wider: a strand's light is off the plane
-by the strand's thickness, a net bulges, and where stripes cross two lasers share the light.
+the posture. To label points the gate may be wider (`recruit`): a strand's light is off the plane by
+the strand's thickness, a net bulges, and where stripes cross two lasers share the light.
+
+`follow_net` follows a net along each stripe, from strand to strand. Where a net folds, its light
+leaves the plane gradually: the next strand is about as far away as the last one, within the
+steepness of a flank. Candidates of other lasers' light, bubbles and light seen through the net have
+no such neighbours, or are farther off than the right candidate of the same light.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""What goes in and out of the scanner: frames, stripe points, scans."""
+"""Data types at the scanner's interface: frames in, stripe points and scans out."""
 
 from dataclasses import dataclass
 from enum import IntEnum

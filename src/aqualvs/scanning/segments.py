@@ -1,13 +1,13 @@
-"""Segments: returns of neighbouring search lines that follow one another.
+"""Segments: stripe peaks on neighbouring search lines that follow one another, and their shape.
 
-A stripe on a wall makes segments of hundreds of returns, a strand of a net one of a few. A long
+A stripe on a wall makes segments of hundreds of peaks, a strand of a net one of a few. A long
 segment that runs in a direction in which its laser's stripe cannot run belongs to another laser;
-a short one says nothing by its direction, because it follows the strand, not the stripe. Segments
-that go on where another ends, or meet there, make a stretch: one strand with its knots.
+the direction of a short one carries no information, because it follows the strand, not the stripe.
+Segments that continue where another ends, or meet there, form a connected component (a "stretch"):
+one strand with its knots.
 
-The shape of single stretches of light: straight, bent smoothly, or as high as they are wide.
-
-A flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
+`StretchShapes` describes single components: straight, bent smoothly, or as high as they are wide.
+The flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
 edge breaks it; a bubble is a spot.
 """
 

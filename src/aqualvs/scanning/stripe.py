@@ -1,10 +1,10 @@
-"""Stripe detection: sub-pixel returns along search lines.
+"""Stripe peaks: sub-pixel detection along search lines.
 
-A return is a run of pixels above the local background with one peak. The background on one side is
-the least pixel within reach; the higher of the two sides counts, so that a step edge (a box before
-a dark wall) has no contrast, and a stripe that runs along the search line has none either. The
-centre is the centroid of what stands above half height, which keeps its place when the top
-saturates.
+A peak ("return") is a run of pixels above the local background with one maximum. The background on
+one side is the least pixel within reach; the higher of the two sides counts, so that a step edge (a
+box before a dark wall) has no contrast, and a stripe that runs along the search line has none
+either. The centre is the centroid of the pixels above half height, which keeps its place when the
+top saturates.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,12 @@
-"""Pieces of stripes in a whole picture, and how likely each is a laser's line.
+"""Pieces of stripes in a whole picture, and the likelihood that each is a laser's line.
 
-A piece is a smooth chain of peaks of neighbouring search lines. One peak says little: noise,
-texture and printed edges make thousands, some of them of the laser's colour. Pooled along a piece,
-the evidence is strong: a laser's line is long for its width, thin, higher than what lies on either
-side, and moves the chroma along the wavelength's direction and not across it. The evidence is
-weighed by logistic regression, twice: first against what is known of lines in general, then against
-the picture's own lines, which are learned from the pieces that are certain. Where no piece is
-certain, there is no line.
+A piece is a smooth chain of peaks of neighbouring search lines. One peak carries little evidence:
+noise, texture and printed edges make thousands, some of them of the laser's colour. Pooled along a
+piece, the evidence is strong: a laser's line is long for its width, thin, higher than either side,
+and moves the chroma along the wavelength's direction and not across it. The evidence is weighted by
+logistic regression, twice: first with general statistics of lines, then with those of the picture's
+own lines, which are learned from the pieces that are certain. Where no piece is certain, there is
+no line.
 """
 
 from typing import NamedTuple

@@ -1,17 +1,12 @@
-"""Surfaces: planes that stripes of several lasers agree on.
+"""Surfaces of a frame: planes that the stripes of several lasers agree on.
 
-One pixel may belong to the bands of several lasers. Every reading of it is triangulated; wrong
-readings scatter in space, right ones share a plane. Planes are found one after another; the light
-that one explains is free for no other.
+One pixel may belong to the bands of several lasers. Every candidate of it is triangulated; wrong
+candidates scatter in space, right ones share a plane. Planes are found one after another; light
+that one explains is not available to the next, whichever laser it was read as.
 
-Cells of the image that hold the light of a surface.
-
-One return is read as several lasers' points, and one stripe by two search directions: what lies in
-or beside a cell in which a surface has light is the same light.
-
-The search for all surfaces of a frame: planes one after another, each with the light it takes.
-
-The light that one plane explains is free for no other, by whichever laser it was read.
+Light is identified by cells of the image: one peak yields candidates of several lasers, and one
+stripe may be found by two search directions, so candidates in or beside a cell in which a surface
+has light count as the same light.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The target: which of the surfaces in view the posture is measured to."""
+"""The target: the surface in view that the posture is measured to."""
 
 from collections.abc import Sequence
 from dataclasses import replace

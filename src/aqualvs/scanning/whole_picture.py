@@ -1,4 +1,4 @@
-"""Stripes in a whole picture, when nothing is known yet of the lasers that draw them."""
+"""Stripes in a whole picture, for lasers whose planes are not known yet."""
 
 import math
 from dataclasses import dataclass, replace

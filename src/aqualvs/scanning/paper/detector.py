@@ -1,13 +1,12 @@
-"""The paper's mesh filter behind either detector.
+"""The paper's stripe detection (section 3.1), and its mesh filter behind either detector.
 
-The paper takes every bright pixel for a point of its own, so that its regions count the lit cells
-of whole reflections. Returns of the threshold detector are given to it so; those of the sub-pixel
-detector are one point each, their centre.
+For comparison: every pixel above one threshold is detected. Bright pixels that follow one another
+on a search line are one return; its position and width determine them exactly, and
+`pixels_of_returns` gives them back one by one.
 
-The paper's stripe detection, for comparison: every pixel above one threshold (section 3.1).
-
-Bright pixels that follow one another on a search line are one return: position and width say
-exactly which they are, and `pixels_of_returns` gives them back one by one.
+The paper treats every bright pixel as a point of its own, so that its regions count the lit cells
+of whole reflections. `PaperFilter` passes returns of the threshold detector to the mesh filter in
+that form; those of the sub-pixel detector are one point each, their centre.
 """
 
 from collections.abc import Sequence

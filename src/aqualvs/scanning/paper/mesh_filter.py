@@ -2,10 +2,11 @@
 
 A laser plane cuts the threads of a net at intervals that lie between two limits. Seen in the laser
 plane, a reflection of a thread therefore has a small lit core, nothing around it, and the right
-amount of light in the ring where its two neighbours must be. docs/mesh-filter.md tells how the
-paper's text was read where it leaves a choice.
+amount of light in the ring where its two neighbours must be. docs/mesh-filter.md states the reading
+chosen where the paper's text is ambiguous.
 
-Counting lit cells near lit cells, with a spatial hash; what `mesh.mesh_filter` compiles to.
+`mesh_filter_dense` is Algorithm 1 line by line, `mesh_filter` its compiled form: it counts the lit
+cells near each lit cell with a spatial hash (`keep_points`).
 """
 
 import math
