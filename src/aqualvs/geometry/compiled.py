@@ -26,7 +26,7 @@ from numba.core.codegen import JITCodeLibrary, ll
 from numba.core.runtime import rtsys
 
 _NUMBA = "numba."
-# What is used of Numba beyond what it documents.
+# Private parts of Numba that are used.
 _OF_CACHES = ("_load_overload", "_guard_against_spurious_io_errors")
 _OF_LIBRARIES = (
     "_unserialize",
@@ -36,17 +36,17 @@ _OF_LIBRARIES = (
     "enable_object_caching",
 )
 
-# Names of modules of Numba that are not imported, and what stands for their contents.
+# Names of modules of Numba that are not imported, and placeholders for their contents.
 _absent: dict[str, dict[str, Any]] = {}
 
 
 def load_lightly(compiled: Any) -> None:
-    """Have a compiled function load its machine code without what only compiling needs.
+    """Make a compiled function load its machine code without setting up the compiler.
 
     Parameters
     ----------
     compiled : Any
-        What `numba.njit` returned.
+        Return value of `numba.njit`.
     """
     cache = getattr(compiled, "_cache", None)
     if _IS_KNOWN and all(hasattr(cache, name) for name in _OF_CACHES):
@@ -54,7 +54,7 @@ def load_lightly(compiled: Any) -> None:
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]
-    """Machine code whose intermediate code, for others to inline, is read when they want it."""
+    """Machine code whose intermediate code, for inlining by others, is read on demand."""
 
     _unread: bytes | None = None
 
@@ -74,7 +74,7 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
         """Return the address of a function; 0 where the library has no such function."""
         engine = self._codegen._engine
         if self._unread is not None and not engine.is_symbol_defined(name):
-            # Names stand as they are in either code, and this one is the function's own.
+            # Names are the same in either code, and this one is the function's own.
             if name.encode() in self._unread:
                 engine._defined_symbols.add(name)
             else:
@@ -102,10 +102,10 @@ _IS_KNOWN = (
 def _load_overload(cache: Any, signature: Any, target: Any) -> Any:
     """Return the machine code for a signature, None where the cache has none.
 
-    Called under Numba's lock for compiling, as `Cache.load_overload`, whose place it takes.
+    Replaces `Cache.load_overload`; called under Numba's lock for compiling.
     """
     found = None
-    # The code may call it, and Numba would have it set up among all the rest.
+    # The code may call the runtime, which Numba would set up with everything else.
     rtsys.initialize(target)
     target.codegen()._library_class = _Library
     with _without_imports(), cache._guard_against_spurious_io_errors():
@@ -117,10 +117,10 @@ def _load_overload(cache: Any, signature: Any, target: Any) -> Any:
 
 @contextmanager
 def _without_imports() -> Iterator[None]:
-    """Leave modules of Numba alone that code was compiled from.
+    """Avoid importing the modules of Numba that code was compiled from.
 
     Every function has an environment with the contents of its module, for Python objects that code
-    may look up by name; kernels have none.
+    may look up by name; kernels look up none.
     """
     usual = environment._rebuild_env
 
@@ -143,7 +143,7 @@ def _without_imports() -> Iterator[None]:
 
 
 def _import_absent() -> None:
-    """Give environments their contents: something is about to be compiled."""
+    """Fill the environments with their contents before something is compiled."""
     for name, contents in _absent.items():
         contents.update(vars(importlib.import_module(name)))
     _absent.clear()
@@ -194,8 +194,8 @@ def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str
     """Make machine code on disk depend on its options and the files of kernels that it may call.
 
     Numba compares only the stamp of the function's own file, so a change in an inlined kernel of
-    another module would leave stale machine code in use. Counted are all kernels that the module
-    has imported, whether this function calls them or not.
+    another module would leave stale machine code in use. The stamps of all kernels that the module
+    imports are included, whether this function calls them or not.
     """
     own = _cache_file(compiled)
     if own is None:

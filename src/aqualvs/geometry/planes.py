@@ -10,7 +10,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays in one frame.
+    """A batch of rays in one coordinate frame.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """The plane normal·X = offset in one frame.
+    """The plane normal·X = offset in one coordinate frame.
 
     Attributes
     ----------

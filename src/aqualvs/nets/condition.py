@@ -246,7 +246,7 @@ class NetCondition:
         self._waiting.clear()
 
     def _length_s(self) -> float:
-        """Time that the stretch under way takes at the speed of the last one."""
+        """Return the time that the stretch under way takes at the speed of the last one."""
         speed = float(np.hypot(*self._track.velocity))
         return min(self.options.stretch_s, max(self.options.stretch / max(speed, 1e-6), 1.0))
 

@@ -141,7 +141,7 @@ class Twine:
         return usual - self.body / across, np.asarray(sigma)
 
     def _lit(self, step: FloatArray) -> FloatArray:
-        """Lit width at the usual height, in metres."""
+        """Return the lit width at the usual height, in metres."""
         return np.asarray(self.body + self.halo + _HALO_STEPS * step)
 
 
@@ -390,7 +390,7 @@ def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
 def measure_solidity(
     lattice: NetLattice, twine: Twine, frames: Sequence[LaidView]
 ) -> tuple[float, float] | None:
-    """Share of the sound net that strands and growth cover, and its standard deviation.
+    """Return the share of the sound net that strands and growth cover, and its standard deviation.
 
     Of hexagons, whose strands every laser crosses in three directions, the lasers' lines as a
     whole. Of meshes with four sides family by family, each from the lasers that cross it at an
@@ -446,7 +446,7 @@ def _spread_of_mean(rows: FloatArray) -> float:
 
 
 def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
-    """Lines of each family that the lasers' lines cross in a metre, shape (L, F)."""
+    """Return the lines of each family that the lasers' lines cross in a metre, shape (L, F)."""
     known = np.isfinite(view.direction)
     direction = np.where(known, view.direction, lattice.normals[0])
     return np.asarray(np.abs(direction @ lattice.waves.T))

@@ -202,7 +202,7 @@ def _put_gap(
 def _ends(
     i: int, first: int, last: int, back: bool, along: FloatArray, step: FloatArray
 ) -> tuple[float, float]:
-    """Both ends of a run of search lines on the laser's line, ascending."""
+    """Return the both ends of a run of search lines on the laser's line, ascending."""
     a, b = _turned(first, along.shape[1], back), _turned(last, along.shape[1], back)
     return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
 
@@ -333,7 +333,7 @@ class NetView:
         return float(np.sum(self.span[:, 1] - self.span[:, 0]))
 
     def at(self, laser: IntArray, along: FloatArray) -> FloatArray:
-        """Places in `net`, shape (n, 2), of places on lasers' lines, shape (n,) each."""
+        """Return the places in `net`, shape (n, 2), of places on lasers' lines, shape (n,) each."""
         return np.asarray(self.origin[laser] + along[:, None] * self.direction[laser])
 
 

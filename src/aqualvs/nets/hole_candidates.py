@@ -104,7 +104,7 @@ class Looks:
         return np.asarray(says * margin)
 
     def stays_dark(self, middle: FloatArray, radius: float) -> bool:
-        """Tell whether a round patch is a hole, not hidden for a while by what shows no light.
+        """Return whether a round patch is a hole, not hidden for a while by what shows no light.
 
         A hole is there for every laser and whenever it is looked at. What drifts or swims by hides
         strands that are seen before and after, or by another laser from another side.
@@ -130,7 +130,7 @@ class Looks:
 def looks_say(
     laser: IntArray, family: IntArray, here: FloatArray, missed: BoolArray, run: IntArray
 ) -> FloatArray:
-    """Log-likelihood of a hole over sound net, of every crossing (N,).
+    """Return the log-likelihood of a hole over sound net, of every crossing (N,).
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def looks_say(
 def _missed_share(
     laser: IntArray, family: IntArray, missed: BoolArray, run: IntArray
 ) -> FloatArray:
-    """Share of strands that are missed though they are there, for every crossing (N,).
+    """Return the share of strands that are missed though they are there, for every crossing (N,).
 
     Told from single ones, between others that are seen, of the same laser and family.
     """
@@ -279,7 +279,7 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
 
 
 def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> FloatArray:
-    """Grid around the places where strands are missing, shape (C, 2)."""
+    """Return the grid around the places where strands are missing, shape (C, 2)."""
     missing, beside = place[weight > 0.0], _BESIDE * bar
     low, high = missing.min(axis=0) - beside, missing.max(axis=0) + beside
     sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
@@ -290,7 +290,7 @@ def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> 
 def _scores(
     place: FloatArray, weight: FloatArray, middles: FloatArray, radii: FloatArray
 ) -> FloatArray:
-    """Sum of the weights within each radius (R,) of each middle (C, 2), shape (C, R)."""
+    """Return the sum of the weights within each radius (R,) of each middle (C, 2), shape (C, R)."""
     score = np.zeros((len(middles), len(radii)))
     first, step = radii[0], radii[1] - radii[0]
     for c in range(len(middles)):
@@ -448,7 +448,7 @@ def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArr
 
 @kernel
 def _on_bar(x: float, y: float, basis: FloatArray, bar: float) -> bool:
-    """Whether a place on a line of bars of hexagons is on a bar, well within.
+    """Return whether a place on a line of bars of hexagons is on a bar, well within.
 
     A bar is as far from the middles of the two openings beside it, and farther from all others.
     """

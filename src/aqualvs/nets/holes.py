@@ -182,7 +182,7 @@ class HoleMap:
         self._meshes = np.unique(np.concatenate([self._meshes, column + _ROW * row]))
 
     def _near(self, hole: Hole) -> bool:
-        """Whether a hole lies where the map is still open."""
+        """Return whether a hole lies where the map is still open."""
         if self._last is None:
             return False
         return bool(np.abs(hole.place - self._last).max() < _SETTLED)
@@ -255,7 +255,7 @@ class HoleMap:
 
 
 def opening_area(lattice: NetLattice) -> float:
-    """Area of one opening, from strand to strand, in square metres."""
+    """Return the area of one opening, from strand to strand, in square metres."""
     if lattice.mesh is Mesh.SIX_SIDED:
         return float(1.5 * np.sqrt(3.0) * lattice.bar**2)
     a, b = lattice.waves
@@ -280,7 +280,7 @@ def _groups(places: FloatArray, reach: float) -> list[IntArray]:
 
 
 def _holds_any(disc: Disc, places: FloatArray) -> bool:
-    """Whether some of the places (n, 2) are in a disc."""
+    """Return whether some of the places (n, 2) are in a disc."""
     return bool(np.any(np.hypot(*(places - disc.middle).T) < disc.radius))
 
 
@@ -302,7 +302,7 @@ def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
 
 
 def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], float]:
-    """Middle (2,), width and height, and area that discs cover together."""
+    """Return the middle (2,), width and height, and area that discs cover together."""
     middles, radii = np.array([d.middle for d in discs]), np.array([d.radius for d in discs])
     low = (middles - radii[:, None]).min(axis=0)
     high = (middles + radii[:, None]).max(axis=0)
@@ -317,7 +317,7 @@ def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], fl
 
 
 def _same(one: Hole, other: Hole) -> bool:
-    """Whether two holes on one map overlap by half."""
+    """Return whether two holes on one map overlap by half."""
     apart = float(np.hypot(*(one.place - other.place)))
     return one.piece == other.piece and apart < 0.25 * (one.diameter + other.diameter)
 

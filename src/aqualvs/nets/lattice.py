@@ -96,7 +96,7 @@ class NetLattice:
         return np.mod(np.arctan2(self.waves[:, 1], self.waves[:, 0]) + 0.5 * np.pi, np.pi)
 
     def crossings_per_metre(self, direction: FloatArray) -> float:
-        """Crossings that a line of unit direction (2,) has with strands."""
+        """Return the crossings that a line of unit direction (2,) has with strands."""
         return float(np.abs(self.waves @ direction) @ self.density)
 
 
@@ -437,7 +437,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _at_first() -> FloatArray:
-    """Covariance of place and velocity where a piece of track begins."""
+    """Return the covariance of place and velocity where a piece of track begins."""
     return np.diag([_FOOT**2, _FOOT**2, _VELOCITY**2, _VELOCITY**2])
 
 
@@ -477,7 +477,7 @@ class NetTrack:
         return self._state[2:].copy()
 
     def begins(self, time_s: float) -> bool:
-        """Whether nothing is known of place and velocity at a time."""
+        """Return whether nothing is known of place and velocity at a time."""
         return self._origin is None or time_s - self._time_s > _FORGOTTEN
 
     def step(
@@ -524,7 +524,7 @@ class NetTrack:
         return shift
 
     def _ahead(self, time_s: float, velocity: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """State and covariance at a later time."""
+        """Return the state and covariance at a later time."""
         dt = time_s - self._time_s
         state, covariance = self._state.copy(), self._covariance.copy()
         if velocity is not None:

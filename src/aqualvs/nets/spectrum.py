@@ -215,7 +215,7 @@ class Spectrum:
         return place, (self.expected[first:last] / pieces)[number]
 
     def at(self, wave: FloatArray, n_harmonics: int = 1) -> FloatArray:
-        """Power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
+        """Return the power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
         power = np.zeros(n_harmonics)
         comb_power(
             self.place,
@@ -247,7 +247,7 @@ class Spectrum:
 
 
 def _swings(place: FloatArray, first: float, n: int) -> Swings:
-    """Waves of frequencies first, first + STEP and so on at places (N,), shape (N, n).
+    """Return the waves of frequencies first, first + STEP and so on at places (N,), shape (N, n).
 
     Each as a product of a coarse and a fine one, of which few are needed.
     """
@@ -313,7 +313,7 @@ class Hypothesis:
         return np.array([a + b, 2.0 * b - a, 2.0 * a - b])
 
     def density(self) -> FloatArray:
-        """Share of each family's lines that is really there."""
+        """Return the share of each family's lines that is really there."""
         return np.ones(2) if self.mesh is Mesh.FOUR_SIDED else np.full(3, 1.0 / 3.0)
 
 
@@ -415,7 +415,7 @@ def _four_sided(
 def _best_waves(
     gain: FloatArray, size: FloatArray, angle: FloatArray, n: int
 ) -> list[tuple[int, int]]:
-    """Rows and columns of the best waves that are not neighbours, best first."""
+    """Return the rows and columns of the best waves that are not neighbours, best first."""
     gain = np.where(
         ((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / _SHORTEST_BAR))[:, None], gain, -np.inf
     )
@@ -477,7 +477,7 @@ def _apart(one: Hypothesis, other: Hypothesis) -> float:
 
 
 def _distance(a: FloatArray, b: FloatArray) -> float:
-    """Distance between two waves; a wave and its opposite are the same."""
+    """Return the distance between two waves; a wave and its opposite are the same."""
     return float(min(np.hypot(*(a - b)), np.hypot(*(a + b))))
 
 
@@ -518,7 +518,7 @@ def _moved(at: Hypothesis, wave: int, axis: int, shift: float) -> Hypothesis:
 
 
 def bar_of(hypothesis: Hypothesis) -> float:
-    """Length of a side of the openings, in metres."""
+    """Return the length of a side of the openings, in metres."""
     a, b = hypothesis.basis
     size_a, size_b = np.hypot(*a), np.hypot(*b)
     if hypothesis.mesh is Mesh.SIX_SIDED:

@@ -129,7 +129,7 @@ def crest_phases(place: FloatArray, start: IntArray, qx: float, qy: float) -> Fl
 
 @inline_kernel
 def _off(turns: float) -> float:
-    """Distance from the nearest whole number."""
+    """Return the distance from the nearest whole number."""
     return float(abs(turns - np.rint(turns)))
 
 
@@ -333,7 +333,7 @@ def shell_gain(
     span_start: IntArray,
     basis: FloatArray,
 ) -> float:
-    """Gain from the waves of a honeycomb that are longer than those of its bars' lines.
+    """Return the gain from the waves of a honeycomb that are longer than those of its bars' lines.
 
     Parameters
     ----------
@@ -368,7 +368,7 @@ def families_gain(
     n_lines: int,
     families: FloatArray,
 ) -> float:
-    """Gain from the strongest family, from the next among what that leaves, and so on.
+    """Return the gain from the strongest family, from the next among what that leaves, and so on.
 
     Parameters
     ----------
@@ -416,7 +416,7 @@ def _comb_gain(
     wave: FloatArray,
     share: float,
 ) -> float:
-    """Gain from a family's harmonics that holds a share of the crossings."""
+    """Return the gain from a family's harmonics that holds a share of the crossings."""
     if place.shape[0] == 0:
         return -_NOTHING_LEFT
     per_frame = place.shape[0] / (start.shape[0] - 1)

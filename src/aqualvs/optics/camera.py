@@ -38,7 +38,7 @@ DOME_PARAMETERS = ("inner_radius", "thickness", "n_air", "n_acrylic", "n_water")
 
 
 class HasParameters(Protocol):
-    """What names the parameters of a camera."""
+    """A camera's lens and packed numbers, which determine the names of its parameters."""
 
     @property
     def lens(self) -> Lens:
@@ -180,7 +180,7 @@ __all__ = [
 
 
 class Camera(Protocol):
-    """What the rest of the project asks of a camera. Frames: `image` and `dome`."""
+    """Interface of a camera. Frames: `image` and `dome`."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -240,7 +240,7 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CompiledCamera:
-    """A camera whose arithmetic is all in compiled kernels, told by `params`.
+    """A camera computed by compiled kernels from the numbers in `params`.
 
     Attributes
     ----------

@@ -172,9 +172,9 @@ N_POINT_ROWS = 12
 
 @inline_kernel
 def project_point(camera: CameraParams, x: float, y: float, z: float) -> tuple[bool, float, float]:
-    """Project a point (metres, in `dome`); returns (valid, u, v).
+    """Project a point (metres, in `dome`); return (valid, u, v).
 
-    Where `valid` is False the numbers mean nothing.
+    Where `valid` is False the numbers are meaningless.
     """
     if camera.has_dome:
         reached, dx, dy, dz = direction_to_point(camera, x, y, z)
@@ -219,7 +219,7 @@ def polar_block(camera: CameraParams, w: FloatArray) -> None:
 
 @inline_kernel
 def solve_block(camera: CameraParams, count: int, w: FloatArray) -> None:
-    """Solve for the ray's angle at the lens, all lanes of a block; a zero becomes a sign.
+    """Solve for the ray's angle at the lens, all lanes of a block; set the signs of validity.
 
     Lanes that no round of steps solves are searched one by one.
     """
@@ -319,7 +319,7 @@ def _see_lane(
     j: int,
     seen: tuple[bool, float, float, Vector, Vector],
 ) -> None:
-    """Write what a lens sees into lane j."""
+    """Write the pixel and its gradients into lane j."""
     ok, w[U + j], w[V + j], u_d, v_d = seen
     w[GUX + j], w[GUY + j], w[GUZ + j] = dome_from_cam(camera, u_d[0], u_d[1], u_d[2])
     w[GVX + j], w[GVY + j], w[GVZ + j] = dome_from_cam(camera, v_d[0], v_d[1], v_d[2])

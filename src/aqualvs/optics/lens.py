@@ -234,7 +234,7 @@ _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 class LensModel(StrEnum):
-    """How a lens bends directions."""
+    """Distortion model of a lens."""
 
     OPENCV = "opencv"
     """Brown-Conrady and its rational extension, as `cv2.projectPoints`."""
@@ -268,9 +268,9 @@ class Lens:
 
     Notes
     -----
-    The distortion is believed only where it is monotone. Valid are directions inside the largest
-    disc round the image centre in which the Jacobian determinant of the distortion is positive,
-    and the pixels they map to: outside, two directions share a pixel.
+    The distortion is valid only where it is monotone: for directions inside the largest disc round
+    the image centre in which the Jacobian determinant of the distortion is positive, and for the
+    pixels they map to. Outside, two directions share a pixel.
     """
 
     model: LensModel = LensModel.OPENCV

@@ -356,7 +356,7 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
 
 
 def _plane(place: str, normal: Sequence[float], offset_mm: float) -> Plane:
-    """Plane with the direction of `normal`; the offset belongs to the unit normal."""
+    """Return the plane with the direction of `normal`; the offset belongs to the unit normal."""
     vector: FloatArray = np.array(normal, dtype=np.float64)
     length = math.hypot(*normal)
     if length == 0.0:

@@ -612,7 +612,7 @@ class LaserAgreement:
         )
 
     def _is_off(self, found: Explanation) -> bool:
-        """Whether a laser has moved clearly, and enough to matter."""
+        """Return whether a laser has moved clearly, and enough to matter."""
         step = found.step
         sigmas = math.sqrt(float(step @ np.linalg.solve(self._covariance(found), step)))
         matters = found.effect > _EFFECT or float(np.linalg.norm(step[:2])) > _ANGLE

@@ -125,7 +125,7 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
-        """Tell whether a surface is so small, and seen so unevenly, that it may be no surface.
+        """Return whether a surface is so small, and seen so unevenly, that it may be no surface.
 
         Parameters
         ----------

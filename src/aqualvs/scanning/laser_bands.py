@@ -144,7 +144,7 @@ def _points_on_grid(
 
 
 def _stripe_directions(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Stripe direction (rise along the rows, run along the columns) for several targets.
+    """Return the stripe direction (rise along the rows, run along the columns) for several targets.
 
     The stripe of a target n·X = d is the contour line of n·X over the image; square first.
     """
@@ -178,7 +178,7 @@ def _slope_bounds(rise: FloatArray, run: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _band_limits(in_band: BoolArray, n_lines: int, length: int) -> tuple[IntArray, IntArray]:
-    """First and last position on each line, one cell wider than the grid says."""
+    """Return the first and last position on each line, one cell wider than the grid says."""
     any_in = in_band.any(axis=0)
     first = np.argmax(in_band, axis=0)
     last = in_band.shape[0] - 1 - np.argmax(in_band[::-1], axis=0)

@@ -419,7 +419,7 @@ def _learn_beside_paint(
 
 @inline_kernel
 def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
-    """Tell whether a chroma step is within the widest angle of a direction."""
+    """Return whether a chroma step is within the widest angle of a direction."""
     along = u * step_u + v * step_v
     return along > 0.0 and along**2 > _LEAST_COSINE**2 * (step_u**2 + step_v**2)
 

@@ -39,7 +39,7 @@ _MAIN_SHARE = 0.5
 
 
 def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
-    """Tell whether what lies on one surface goes on, side by side, as another one.
+    """Return whether what lies on one surface goes on, side by side, as another one.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks)
 
 
 def seen_through(first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
-    """Tell whether one surface is seen through the gaps of another.
+    """Return whether one surface is seen through the gaps of another.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def _turns(
 
 @kernel
 def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
-    """Tell whether the step from one chunk to another is one that a fold makes."""
+    """Return whether the step from one chunk to another is one that a fold makes."""
     square = 0.0
     step = 0.0
     for k in range(3):

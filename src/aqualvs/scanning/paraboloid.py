@@ -137,7 +137,7 @@ def _asked_for(
     least_bend: float,
     rms: float,
 ) -> bool:
-    """Tell whether the residual of the base plane asks for curvature."""
+    """Return whether the residual of the base plane asks for curvature."""
     n_inside, square = 0, 0.0
     least, most = np.inf, -np.inf
     for i in range(height.shape[0]):

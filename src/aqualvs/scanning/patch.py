@@ -227,7 +227,7 @@ def packed_plane(plane: Plane) -> FloatArray:
 
 
 def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
-    """Tell whether the point at which a tangent touches is not far beside what is seen of a net.
+    """Return whether the point at which a tangent touches is not far beside what is seen of a net.
 
     Farther out a paraboloid says nothing of the net.
 

@@ -218,7 +218,7 @@ def _fit(
 
 @kernel
 def _huber_factor(z: FloatArray, cut: float) -> float:
-    """Factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
+    """Return the factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
 
     Counts what the outliers cost: they add no information, though the fit ignores them.
     """

@@ -147,7 +147,7 @@ def in_crossing(
     mean_width: FloatArray,
     focal_px: float,
 ) -> bool:
-    """Whether another laser's stripe crosses the target here (paper, section 3.1)."""
+    """Return whether another laser's stripe crosses the target here (paper, section 3.1)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
     m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
     for b in range(planes.shape[0]):
@@ -555,7 +555,7 @@ class PostureMeter:
         return mean if share < _MAIN_SHARE else _doubted(best, mean, 1.0 - share)
 
     def _tells(self, readings: Readings, curved: Measurement) -> bool:
-        """Tell whether the posture to a curved net may be relied on."""
+        """Return whether the posture to a curved net may be relied on."""
         posture = curved.posture
         return (
             isinstance(posture, Posture)

@@ -28,7 +28,7 @@ MUCH, SOME = 0.85, 0.5
 
 
 def much_beside(off: FloatArray, much: float = MUCH) -> bool:
-    """Tell whether so much light lies just off a plane that the net may bend away from it.
+    """Return whether so much light lies just off a plane that the net may bend away from it.
 
     Where stripes cross, wrong readings lie there as well.
 

@@ -91,7 +91,7 @@ class StretchShapes(NamedTuple):
 
 @inline_borrowing_kernel
 def is_bent(shapes: StretchShapes, s: int) -> bool:
-    """Tell whether stretch s is bent smoothly, as the flank of a fish."""
+    """Return whether stretch s is bent smoothly, as the flank of a fish."""
     sagitta_px = shapes.sagitta_px[s]
     smooth = shapes.rough_px[s] < _ROUGH_PX + _ROUGH_SHARE * sagitta_px
     bent = sagitta_px > _LEAST_SAGITTA_PX and smooth
@@ -100,20 +100,20 @@ def is_bent(shapes: StretchShapes, s: int) -> bool:
 
 @inline_borrowing_kernel
 def is_curved(shapes: StretchShapes, s: int) -> bool:
-    """Tell whether stretch s is no straight line, whatever the cause: not on a plane."""
+    """Return whether stretch s is no straight line, whatever the cause: not on a plane."""
     return bool(shapes.n_lines[s] >= _LEAST_LINES and shapes.sagitta_px[s] > _CURVED_PX)
 
 
 @inline_borrowing_kernel
 def is_straight(shapes: StretchShapes, s: int) -> bool:
-    """Tell whether stretch s is long and straight, as on a plane."""
+    """Return whether stretch s is long and straight, as on a plane."""
     is_long = shapes.n_lines[s] >= 2 * _LEAST_LINES
     return bool(is_long and shapes.sagitta_px[s] <= _LEAST_SAGITTA_PX)
 
 
 @inline_borrowing_kernel
 def is_round(shapes: StretchShapes, s: int, bright: float) -> bool:
-    """Tell whether stretch s is a spot of at least nearly the height `bright`."""
+    """Return whether stretch s is a spot of at least nearly the height `bright`."""
     n_lines = shapes.n_lines[s]
     ratio = n_lines / max(shapes.thickness[s], 1.0)
     spot = _ROUND_FROM <= ratio <= _ROUND_TO and n_lines >= _SPOT_LINES
@@ -545,7 +545,7 @@ def _direction_possible(
     slope_low: FloatArray,
     slope_high: FloatArray,
 ) -> bool:
-    """Whether a long segment runs as its laser's stripe can."""
+    """Return whether a long segment runs as its laser's stripe can."""
     n = members.shape[0]
     mean_line = 0.0
     mean_position = 0.0

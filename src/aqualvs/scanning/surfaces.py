@@ -441,7 +441,7 @@ def surface_on(plane: Plane, chunks: Chunks, n_lasers: int, focal_px: float) -> 
 
 
 def shares_light(one: Surface, other: Surface, chunks: Chunks) -> bool:
-    """Tell whether half of a surface's chunks are on another one as well."""
+    """Return whether half of a surface's chunks are on another one as well."""
     shared = chunks.n_lines[one.members & other.members].sum()
     return bool(shared > _SHARED * chunks.n_lines[one.members].sum())
 
@@ -509,7 +509,7 @@ def _joined(pieces: list[Surface], chunks: Chunks) -> Surface:
 
 
 def _is_dense_net(surface: Surface, surfaces: list[Surface], chunks: Chunks) -> bool:
-    """Whether another surface, broken by shadows, is seen through the gaps of this one.
+    """Return whether another surface, broken by shadows, is seen through the gaps of this one.
 
     A net that is near may fill most of the stripes; it then has more light than what it shadows.
     """

@@ -334,7 +334,7 @@ def laser_frame(plane: Plane) -> SE3:
 
 
 def _in_plane(axis: FloatArray, normal: FloatArray) -> FloatArray:
-    """Direction of an axis projected into a plane to which it is not square."""
+    """Return the direction of an axis projected into a plane to which it is not square."""
     direction = axis - normal * (normal @ axis)
     direction /= np.linalg.norm(direction)
     # What the first projection left along the normal grew when a short result became a unit.
@@ -481,7 +481,7 @@ def _limits(options: MeshFilterOptions) -> Limits:
 def _usable_in_laser(
     points: ArrayLike, plane: Plane, working_range: tuple[float, float] | None
 ) -> tuple[FloatArray, BoolArray]:
-    """Points (N, 2) in `laser`, and which of them the filter may see."""
+    """Return the points (N, 2) in `laser`, and which of them the filter may see."""
     array = np.asarray(points, dtype=np.float64)
     if array.size == 0:
         array = array.reshape(0, 3)
