@@ -100,7 +100,7 @@ def camera_params(
     Raises
     ------
     RigError
-        If the lens lies outside the inner sphere, an index or the size cannot be, or the pose is
+        If the lens lies outside the inner sphere, an index or the size is not valid, or the pose is
         not one finite rigid transform.
     """
     _check_size(size_px)
@@ -470,7 +470,7 @@ class DomeCamera(_CompiledCamera):
     Raises
     ------
     RigError
-        If the lens lies outside the inner sphere, an index or the size cannot be, or the pose is
+        If the lens lies outside the inner sphere, an index or the size is not valid, or the pose is
         not one finite rigid transform.
     """
 
