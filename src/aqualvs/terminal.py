@@ -31,10 +31,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignals(Closing):
-    """Note a request to stop instead of dying from it; a context manager.
+    """Context manager that catches the first SIGINT or SIGTERM as a request to stop.
 
-    The second request is no longer caught, so that whoever insists gets out. Outside of the main
-    thread, where Python allows no handlers, nothing is caught.
+    The second signal is not caught, so that it ends the process. Outside of the main thread, where
+    Python allows no handlers, no signal is caught.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ _FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
 
 
 class _Rate(ProgressColumn):
-    """Frames, or whatever is counted, per second."""
+    """Progress column with the frames, or other units, per second."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class _Rate(ProgressColumn):
 
 @contextlib.contextmanager
 def terminal_bar(label: str, n_frames: int | None, unit: str) -> Iterator[Callable[[int], None]]:
-    """Show a bar on standard error; nothing where Rich does not take that for a terminal.
+    """Show a bar on standard error, unless Rich does not recognise it as a terminal.
 
     Parameters and what it yields are those of `aqualvs.terminal.progress`.
     """
@@ -115,13 +115,13 @@ def terminal_bar(label: str, n_frames: int | None, unit: str) -> Iterator[Callab
 Tick: TypeAlias = Callable[[int], None]
 
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
-# What says of something else that it is a terminal (https://force-color.org).
+# Variables that declare any output a terminal (https://force-color.org).
 _CLAIMS = ("TTY_COMPATIBLE", "FORCE_COLOR")
 
 
 @contextlib.contextmanager
 def hidden_progress() -> Iterator[None]:
-    """Show no bars of what is done inside: two at a time overwrite each other."""
+    """Hide progress bars inside the context: two at a time would overwrite each other."""
     token = _HIDDEN.set(True)
     try:
         yield
@@ -131,21 +131,21 @@ def hidden_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
-    """Show a progress bar; nothing where standard error is not a terminal, or bars are hidden.
+    """Show a progress bar, unless standard error is not a terminal or bars are hidden.
 
     Parameters
     ----------
     label : str
-        What is going on.
+        Text before the bar.
     n_frames : int or None
         Frames to come, if known.
     unit : str
-        What is counted, if not frames.
+        Unit that is counted, if not frames.
 
     Yields
     ------
     tick : callable
-        To be called with the number of frames that have been done since the last call.
+        Call it with the number of frames completed since the last call.
     """
     if _HIDDEN.get() or not _may_be_terminal():
         yield _tell_nobody
