@@ -29,7 +29,6 @@ def refuse_special(
         kind = _KINDS.get(stat.S_IFMT(path.stat().st_mode))
     except (OSError, ValueError):
         # Opening the path will report the fault.
-
         return
     if kind is not None:
         raise error(f"{path}: is {kind}; {remedy}")

@@ -286,7 +286,6 @@ def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     ------
     RigError
         If the moved rig is not valid.
-
     """
     values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
     pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}

@@ -57,7 +57,6 @@ def seawater_index(
     array
         Of the broadcast shape of the three.
 
-
     Raises
     ------
     OptionError

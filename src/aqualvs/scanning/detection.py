@@ -339,7 +339,6 @@ def select_returns(
 ) -> IntArray:
     """Return the peaks that are likely laser light, and bright or one of many in a row.
 
-
     Parameters
     ----------
     line : int array, shape (N,)

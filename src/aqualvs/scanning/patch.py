@@ -269,7 +269,6 @@ def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
 def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
     """Return a patch as fitted to points (N, 3); the posture is that of its tangent.
 
-
     Parameters
     ----------
     patch : Patch

@@ -60,7 +60,7 @@ def select_pieces(
     focal_px: float,
     group: IntArray,
 ) -> tuple[int, int]:
-    """Number the pieces of stripe on the target; -1 for candidates elsewhere or in crossings.
+    """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
 
     A piece is used as a whole: the centre of a part of a strand's light would be off the sheet.
 

@@ -349,7 +349,6 @@ def _settle(
     stretch: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
 ) -> None:
     """Mark the candidates of the strands reached; only the cheapest of each peak."""
-
     best = np.full(taken.shape[0], np.inf)
     for i in range(stretch.shape[0]):
         best[source[i]] = min(best[source[i]], cost[stretch[i]])

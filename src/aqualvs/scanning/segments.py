@@ -570,7 +570,7 @@ def _direction_possible(
 
 @kernel
 def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray) -> IntArray:
-    """Number the connected components of segments whose ends meet, by their first segment.
+    """Assign each connected component of segments whose ends meet the number of its first segment.
 
     `first` and `last` are the returns at the segments' ends; segments are ordered by the first.
     """
