@@ -53,7 +53,7 @@ class ThresholdOptions:
 
 
 class ThresholdDetector:
-    """Finds the bright pixels on every search line of one direction, inside its band.
+    """Detector of the bright pixels on every search line of one direction, inside its band.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class ThresholdDetector:
         self._lines: NDArray[np.uint8] = np.zeros((len(lowest), length + 1), np.uint8)
 
     def detect(self, lines: NDArray[np.uint8]) -> Returns:
-        """Find the runs of bright pixels of one frame; colour is not looked at.
+        """Find the runs of bright pixels of one frame; colour is ignored.
 
         Parameters
         ----------
@@ -123,7 +123,7 @@ class ThresholdDetector:
 
 
 def pixels_of_returns(position: FloatArray, width: FloatArray) -> tuple[IntArray, FloatArray]:
-    """List the pixels that returns are made of, along their search lines.
+    """Return the pixels of returns, along their search lines.
 
     A return of the threshold detector gives its bright pixels, each once; a sub-pixel one those
     above half its height, at least one.
@@ -187,7 +187,7 @@ class FilteredPoints:
     points_in_dome : array, shape (M, 3)
         Metres. A pixel whose ray misses the laser's sheet is no point.
     on_mesh : bool array, shape (M,)
-        What the filter keeps.
+        Points that the filter keeps.
     """
 
     source: IntArray
@@ -204,7 +204,7 @@ class FilteredPoints:
 
 
 class PaperFilter:
-    """Applies the paper's filter to returns whose laser is known.
+    """The paper's filter, applied to returns of known lasers.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ from aqualvs.geometry.transforms import SE3
 
 
 class Limits(NamedTuple):
-    """When a cell belongs to the mesh (paper, Algorithm 1).
+    """Limits by which a cell belongs to the mesh (paper, Algorithm 1).
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: L
             in_a += distance <= limits.a
             in_ab += distance <= limits.b
             in_abc += distance <= limits.c
-        # Counts only grow: a cell amid a wall or a fish needs no further look.
+        # Counts only grow: a cell amid a wall or a fish needs no further counting.
         if in_abc > limits.most_in_ab + limits.most_in_c:
             return False
     in_c = in_abc - in_ab
@@ -396,7 +396,7 @@ def mesh_filter_dense(
 
 
 def _algorithm_1(lit: BoolArray, options: MeshFilterOptions) -> BoolArray:
-    """Im'' from Im (paper, Algorithm 1, lines 1-10)."""
+    """Return Im'' from Im (paper, Algorithm 1, lines 1-10)."""
     str_a, str_b, str_c = structuring_elements(options)
     pad, dg = options.padding, options.dg_theta
     padded = np.pad(lit, pad)
