@@ -31,7 +31,7 @@ from aqualvs.scanning.scan import Scan
 
 # Limit of the frames kept before the first lattice, to search them for holes once it is known.
 _MOST_WAITING = 1500
-# Ends of a laser's line that stay this much darker than the rest are beyond the laser's fan.
+# Ends of a laser's line that are darker than the rest by this factor are beyond the laser's fan.
 _BIN_LINES, _DIM = 24, 0.25
 _LEAST_LOOKED_AT = 600
 

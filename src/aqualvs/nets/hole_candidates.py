@@ -305,8 +305,8 @@ def _scores(
     return score
 
 
-# A strand lies within this share of its pitch of where it is predicted, and at least within so many
-# steps of the search lines.
+# Tolerance of a strand's predicted place, as a share of its pitch; at least this many steps of the
+# search lines.
 _OFF, _OFF_STEPS = 0.2, 1.5
 # Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
 _LEAST_ACROSS = 0.3

@@ -32,7 +32,7 @@ _SAMPLES = 129
 _LEAST_SLOPE = 1e-3
 # The detector needs dark flanks: no stripe is found next to the border.
 _BORDER_PX = 16.0
-# Near another laser's line the two stripes disturb each other: so many widths and pixels.
+# Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
 _CROSSING_WIDTHS, _CROSSING_PX = 1.5, 4.0
 # Distance in the picture of the places that determine directions on the net.
 _AHEAD_PX = 30.0

@@ -248,15 +248,15 @@ def _refuse_unknown(
 # A frame now and then is enough, and costs the run nothing.
 _EVERY = 5
 _ENOUGH_FRAMES = 5
-# Light is one strand's up to gaps of this width; a strand has so many points, a stripe so many
-# strands, a frame so many stripes.
+# Largest gap in the light of one strand, in metres; least number of points of a strand, of strands
+# of a stripe, and of stripes of a frame.
 _GAP = 3e-3
 _MIN_POINTS, _MIN_STRANDS, _MIN_LASERS = 3, 4, 2
-# Wider than so many usual distances is a hole, or what stands before the net.
+# Gaps wider than this many usual distances are holes, or objects before the net.
 _HOLE = 2.5
 # Strands that meet at a knot count once and dim ones are missed: found on random simulated nets.
 _MISSED = 1.2
-# On those nets the bar comes out at 0.67 to 1.45 of what it is, frame by frame.
+# On those nets the bar of single frames is estimated at 0.67 to 1.45 of its true length.
 _TOO_SHORT, _TOO_LONG = 0.62, 1.6
 
 

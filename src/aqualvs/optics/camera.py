@@ -46,7 +46,7 @@ class HasParameters(Protocol):
 
     @property
     def params(self) -> CameraParams:
-        """What compiled kernels take."""
+        """Packed numbers for compiled kernels."""
 
 
 def parameter_names(camera: HasParameters) -> tuple[str, ...]:
@@ -196,7 +196,7 @@ class Camera(Protocol):
 
     @property
     def params(self) -> CameraParams:
-        """What compiled kernels take."""
+        """Packed numbers for compiled kernels."""
 
     def rays(self, pixels: ArrayLike) -> Rays:
         """Return the rays in `dome` that pixels (..., 2) see."""
@@ -256,7 +256,7 @@ class _CompiledCamera:
     lens: Lens
     dome_from_cam: SE3
     params: CameraParams = field(init=False, repr=False, compare=False)
-    """What compiled kernels take."""
+    """Packed numbers for compiled kernels."""
 
     def rays(self, pixels: ArrayLike) -> Rays:
         """Trace pixels into the outer medium.

@@ -280,7 +280,7 @@ class Lens:
     cy: float
     distortion: tuple[float, ...] = ()
     params: LensParams = field(init=False, repr=False, compare=False)
-    """What compiled kernels take."""
+    """Packed numbers for compiled kernels."""
 
     def __post_init__(self) -> None:
         _check(self)

@@ -20,13 +20,13 @@ from aqualvs.scanning.plane_search import (
 )
 
 LIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
-"""What is found of a hypothesis: light that it explains, the same for each laser, dark lasers,
-variance of half stripes (px²) and its degrees of freedom."""
+"""Measures of a hypothesis: light that it explains, the same for each laser, dark lasers, variance
+of half stripes (px²) and its degrees of freedom."""
 N_FACTS = 5
 CELL_LINES = 16
-"""Search lines to a cell along a stripe."""
+"""Search lines per cell along a stripe."""
 SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
-"""Hypotheses that are so near each other (share of the range, radians) are one."""
+"""Largest difference of equal hypotheses (share of the range, radians)."""
 
 # Least light that a rival must explain, as a share of the surface's.
 _RIVAL_SHARE = 0.5

@@ -106,7 +106,7 @@ _STEEPEST = 1.2
 _LOOSE_SHARE = 0.006
 # A single strand is accepted within this share of the range; farther off only as part of a flank.
 _LONELY_SHARE = 0.015
-# Least number of strands of a fold that leave the surface by as much, of all lasers.
+# Least number of strands of a fold beyond that share, of all lasers.
 _LEAST_STRANDS = 6
 # Largest distance to the next strand: a share of the range, and in usual distances.
 _FARTHEST_SHARE, _FARTHEST_GAP = 0.15, 2.5
