@@ -1,14 +1,14 @@
-"""What is closed when a `with` statement ends."""
+"""Base class of context managers that close themselves."""
 
 from types import TracebackType
 from typing import Self
 
 
 class Closing:
-    """A context manager that closes itself; its classes say what there is to close."""
+    """A context manager that calls `close` at its end; subclasses override `close`."""
 
     def close(self) -> None:
-        """Let go of what is held: nothing, unless a class says otherwise."""
+        """Release resources; does nothing by default."""
 
     def __enter__(self) -> Self:
         """Return itself."""

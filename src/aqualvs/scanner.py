@@ -35,19 +35,19 @@ from aqualvs.scanning.triangulate import Triangulator
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScannerOptions:
-    """What a user may choose; the defaults need no tuning.
+    """Options of the scanner; the defaults need no tuning.
 
     Attributes
     ----------
     detector : StripeOptions or ThresholdOptions
-        Which stripe detector, and how.
+        Kind of stripe detector, and its options.
     mesh_filter : MeshFilterOptions or None
-        The paper's mesh filter; off by default. What it rejects is dropped, and the frame is
-        measured once more from the rest.
+        The paper's mesh filter; off by default. Points that it rejects are dropped, and the frame
+        is measured once more from the rest.
     target : TargetKind
-        What the posture is measured to.
+        Kind of surface that the posture is measured to.
     fit : FitMethod
-        How the plane is fitted.
+        Method of the plane fit.
     """
 
     detector: DetectorOptions = field(default_factory=StripeOptions)
@@ -57,7 +57,7 @@ class ScannerOptions:
 
 
 class Scanner:
-    """Turns frames into postures; a frame's answer depends on nothing but the frame.
+    """The scanner of one rig: frames in, postures out, each from its frame alone.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Scanner:
     options : ScannerOptions, optional
         Defaults if left out.
     camera : Camera, optional
-        In place of `rig.camera()`, such as `rig.bare_camera()` to see what ignoring the dome costs.
+        Replaces `rig.camera()`, such as `rig.bare_camera()` for the error of ignoring the dome.
     """
 
     def __init__(
@@ -125,13 +125,13 @@ class Scanner:
         time_s : float
             Of the frame.
         returns : dict
-            From `detect`; as they were recorded, they give what the frame gave.
+            From `detect`; recorded returns give the same result as their frame.
         """
-        # Each return read as a point of every laser that could have made it.
+        # Candidates: each peak as a point of every laser that could have made it.
         readings = read_returns(returns, self._searches, self._triangulator)
         found, points, listed = self._measured(readings)
         if self._paper_filter is not None:
-            # The paper's filter wants to know the laser of each return, which is known by now.
+            # The paper's filter needs the laser of each return, which is known by now.
             kept = np.zeros(len(readings), np.bool_)
             kept[listed] = _on_mesh(self._paper_filter, points)
             readings = readings.where(kept)
@@ -147,7 +147,7 @@ class Scanner:
         return PaperFilter(self.rig, camera, self._searches, options, every_pixel=every_pixel)
 
     def _measured(self, readings: Readings) -> tuple[Measurement, ScanPoints, IntArray]:
-        """Return the posture, the labelled points, and the rows of their readings."""
+        """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on, and the one that is the target.
         chunks, chunk_index = readings.chunks()
         surfaces = find_surfaces(
@@ -162,7 +162,7 @@ class Scanner:
         target = choose_target(surfaces, self.options.target, self.rig.working_range)
         tested = UNTESTED
         if target is not None:
-            # The same peaks, read as other lasers', may make a plane that is as good or better.
+            # The same peaks, read as other lasers', may give a plane that is as good or better.
             tested = self._assignment.test(readings, chunks, chunk_index, target)
             if tested.verdict is Verdict.RIVAL and tested.other is not None:
                 surfaces = self._with_rival(surfaces, target, tested.other, chunks)
@@ -177,7 +177,7 @@ class Scanner:
         else:
             found = self._meter.measure(readings, chunk_index, target)
             found = widened(found, tested)
-            # The mean plane of folds takes all of a net's light, a nearer part of it too.
+            # The mean plane of folds covers all of a net's light, nearer parts included.
             other = None if found.folded else self._assignment.outweighed(chunks, surfaces, target)
             if other is not None and found.posture:
                 found = _ambiguous(readings, target.plane, other.plane)
@@ -187,14 +187,14 @@ class Scanner:
         return found, points, listed
 
     def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
-        """Return the posture with what the rig's own uncertainty makes of it."""
+        """Return the posture with its covariance by the rig's uncertainty."""
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return posture
         m, points, weights = posture.normal_in_dome / posture.range, readings.points, found.weights
         surface = fitted_plane(m, points)
         if found.patch is not None:
-            # Heights over a patch are in metres, m·X is in ranges.
+            # Heights over a patch are in metres; m·X is relative to the range.
             surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
         covariance = self._rig_errors.covariance_of(
             surface, readings.pixels, readings.laser, points, weights
@@ -204,7 +204,7 @@ class Scanner:
     def _with_rival(
         self, surfaces: list[Surface], target: Surface, other: Plane, chunks: Chunks
     ) -> list[Surface]:
-        """Put the rival that explains the picture better in place of a surface."""
+        """Replace a surface by the rival that explains the picture better."""
         rival = surface_on(other, chunks, len(self.rig.lasers), self.rig.focal_px)
         kept = [
             one for one in surfaces if one is not target and not shares_light(one, rival, chunks)
@@ -246,7 +246,7 @@ def _why_no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKi
         return Refusal(Reason.NO_TARGET, f"surfaces in view, but none of kind {wanted.value}")
     if len(returns) < MIN_LINES:
         return Refusal(Reason.TOO_FEW_POINTS, f"only {len(returns)} stripe points")
-    # Lasers that a good many returns can only belong to.
+    # Lasers with many returns that can belong to no other laser.
     own = np.bincount(readings.laser[reading[readings_of == 1]])
     if np.count_nonzero(own >= MIN_LINES_PER_LASER) == 1:
         return Refusal(Reason.ONE_LASER, "stripes of one laser only")

@@ -1,4 +1,4 @@
-"""Files that are none: pipes, devices and sockets, which may never end, or never begin."""
+"""Refusal of special files: pipes, devices and sockets, which may block or never end."""
 
 import stat
 from pathlib import Path
@@ -18,7 +18,7 @@ def refuse_special(
     error: type[AqualvsError] = SourceError,
     remedy: str = "give a file or a folder",
 ) -> None:
-    """Refuse a path at which there is neither a file nor a folder; one that is free is fine.
+    """Refuse a path of a pipe, device or socket; accept files, folders and free paths.
 
     Raises
     ------
@@ -28,7 +28,7 @@ def refuse_special(
     try:
         kind = _KINDS.get(stat.S_IFMT(path.stat().st_mode))
     except (OSError, ValueError):
-        # Whoever opens the path says what is wrong with it.
+        # Opening the path will report the fault.
         return
     if kind is not None:
         raise error(f"{path}: is {kind}; {remedy}")

@@ -1,6 +1,6 @@
-"""How far a run is, on standard error.
+"""The terminal during a run: a progress bar on standard error, and an orderly stop.
 
-Stopping in good order: Ctrl-C and SIGTERM end the run after the current frame.
+Ctrl-C and SIGTERM end the run after the current frame (`StopSignals`).
 """
 
 import contextlib
@@ -19,10 +19,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignals(Closing):
-    """Note a request to stop instead of dying from it; a context manager.
+    """Context manager that catches the first SIGINT or SIGTERM as a request to stop.
 
-    The second request is no longer caught, so that whoever insists gets out. Outside of the main
-    thread, where Python allows no handlers, nothing is caught.
+    The second signal is not caught, so that it ends the process. Outside of the main thread, where
+    Python allows no handlers, no signal is caught.
 
     Attributes
     ----------
@@ -62,13 +62,13 @@ class StopSignals(Closing):
 Tick: TypeAlias = Callable[[int], None]
 
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
-# What says of something else that it is a terminal (https://force-color.org).
+# Variables that declare any output a terminal (https://force-color.org).
 _CLAIMS = ("TTY_COMPATIBLE", "FORCE_COLOR")
 
 
 @contextlib.contextmanager
 def hidden_progress() -> Iterator[None]:
-    """Show no bars of what is done inside: two at a time overwrite each other."""
+    """Hide progress bars inside the context: two at a time would overwrite each other."""
     token = _HIDDEN.set(True)
     try:
         yield
@@ -78,21 +78,21 @@ def hidden_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
-    """Show a progress bar; nothing where standard error is not a terminal, or bars are hidden.
+    """Show a progress bar, unless standard error is not a terminal or bars are hidden.
 
     Parameters
     ----------
     label : str
-        What is going on.
+        Text before the bar.
     n_frames : int or None
         Frames to come, if known.
     unit : str
-        What is counted, if not frames.
+        Unit that is counted, if not frames.
 
     Yields
     ------
     tick : callable
-        To be called with the number of frames that have been done since the last call.
+        Call it with the number of frames completed since the last call.
     """
     if _HIDDEN.get() or not _may_be_terminal():
         yield _tell_nobody

@@ -1,4 +1,4 @@
-"""How the report and the overlay call things, and the colours that they share.
+"""Words and colours that the report and the overlay share.
 
 Colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), which remain distinct under
 the common forms of colour blindness.
@@ -44,12 +44,12 @@ LABEL_COLOURS: dict[Label, str] = {
     Label.OUT_OF_RANGE: "#999999",
 }
 
-# The first ones stay visible on a dark green picture as well as on white paper.
+# The first colours are visible on a dark green picture and on white paper.
 LASER_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#D55E00", "#0072B2", "#009E73", "#F0E442")
 
 
 def reason_words(reason: str) -> str:
-    """Return a refusal in words; a reason unknown here comes back readable, not lost."""
+    """Return a refusal as text; an unknown reason is returned in readable form."""
     key, _, detail = reason.partition(":")
     words = REASON_WORDS.get(key.strip(), key.strip().replace("_", " ")) or "no reason given"
     return f"{words} ({detail.strip()})" if detail.strip() else words
@@ -76,7 +76,7 @@ def clock(seconds: float) -> str:
 
 
 def hole_count(n_holes: int) -> str:
-    """Return how many holes there are, in words."""
+    """Return the number of holes as text."""
     return "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
 
 

@@ -1,12 +1,10 @@
-"""Read YAML files: the only reader of the package.
+"""YAML files: the only reader of the package, the writer of rig files, and their comments.
 
 Values are plain: None, bool, int, float, str, lists and dicts of them. Numbers are decimal, as
-PyYAML writes them; what looks like a date, an octal or a sexagesimal number is text. Nothing is
-built by recursion, so that no file, however nested, exhausts the stack.
+PyYAML writes them; text that looks like a date, an octal or a sexagesimal number stays text.
+Parsing does not recurse, so that no file, however nested, exhausts the stack.
 
-Write the text of a rig file.
-
-Carry the comments of a YAML text over to a new text of the same file.
+`carry_comments` transfers the comments of a YAML text to a new text of the same file.
 """
 
 import re
@@ -21,12 +19,12 @@ from aqualvs.errors import AqualvsError
 from aqualvs.special_files import refuse_special
 
 _HEADER = "# A rig of aqualvs: lengths in mm, angles in degrees, frame 'dome' (docs/rig.md).\n"
-# A list stays on one line, however many digits it has.
+# Lists stay on one line, regardless of their digits.
 _WIDTH = 1000
 
 
 class TidyDumper(yaml.SafeDumper):
-    """Writes mappings in the style asked for, and lists of plain values always on one line."""
+    """YAML dumper with mappings in the requested style and lists of plain values on one line."""
 
 
 def _tidy_list(dumper: yaml.SafeDumper, values: Sequence[Any]) -> yaml.SequenceNode:
@@ -45,8 +43,8 @@ def rig_text(content: Mapping[str, Any]) -> str:
 
 
 def _block(key: str, value: object) -> str:
-    # YAML wraps a lone scalar in braces unless told to use the block style; what a calibration
-    # notes down reads better below one another.
+    # YAML wraps a lone scalar in braces unless told to use the block style; records of calibrations
+    # read better in block style.
     flow = None if isinstance(value, list | dict) and key != "solved_from" else False
     text: str = yaml.dump(
         {key: value},
@@ -66,7 +64,7 @@ MAX_BYTES = 8_000_000
 MAX_DEPTH = 50
 """Levels of lists and mappings; a rig in a run.yaml has 7."""
 MAX_VALUES = 400_000
-"""Scalars, lists and mappings of a file, each alias counted as what it stands for."""
+"""Scalars, lists and mappings of a file, each alias counted as its expansion."""
 
 # PyYAML's own resolver (YAML 1.1) less octal, hexadecimal, binary and sexagesimal numbers.
 _INT = re.compile(r"[-+]?(?:0|[1-9][0-9_]*)")
@@ -92,7 +90,7 @@ _MERGE: Final = object()
 
 
 class _TextError(Exception):
-    """What is wrong with a text, in which line (from 1; 0 if unknown), and the remedy."""
+    """A fault of a text, its line (from 1; 0 if unknown), and the remedy."""
 
     def __init__(self, problem: str, line: int, remedy: str = "mend that line") -> None:
         super().__init__(problem)
@@ -107,7 +105,7 @@ def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
     ----------
     path : Path
     what : str
-        What the file should be, as messages call it: "a rig file".
+        Kind of the file in messages, such as "a rig file".
     error : type
         Exception to raise.
 
@@ -160,7 +158,7 @@ def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:
     ----------
     text : str
     source : str
-        How messages call the text.
+        Name of the text in messages.
     error : type
         Exception to raise.
 
@@ -187,7 +185,7 @@ def _parse(text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         problem = " ".join((error.problem or error.context or "malformed").split())
         mark = error.problem_mark
-        # The parser in C puts what is missing at the end into the line after the last.
+        # The parser in C reports faults at the end in the line after the last.
         line = 0 if mark is None else min(mark.line + 1, max(1, len(text.splitlines())))
         raise _TextError(f"is not YAML: {problem}", line) from None
     except (yaml.YAMLError, ValueError):
@@ -226,7 +224,7 @@ class _Node:
 
 
 class _Builder:
-    """Make plain values of a parser's events, one after another."""
+    """Builder of plain values from a parser's events."""
 
     def __init__(self) -> None:
         self.content: Any = None
@@ -236,7 +234,7 @@ class _Builder:
         self._n_values = 0
 
     def add(self, event: yaml.Event) -> None:
-        """Take the next event.
+        """Process the next event.
 
         Raises
         ------
@@ -332,7 +330,7 @@ class _Builder:
 
 
 def _scalar(event: yaml.ScalarEvent, line: int) -> Any:
-    """Return the value of a scalar: by its tag, by its looks if it is plain, else its text."""
+    """Return the value of a scalar: by its tag, resolved if it is plain, else its text."""
     text: str = event.value
     tag, plain = event.tag, bool(event.implicit[0])
     if tag in (f"{_TAG}str", "!") or (tag is None and not plain):
@@ -404,15 +402,15 @@ class _Comment(NamedTuple):
 def carry_comments(old: str, new: str) -> str:
     """Return a text with the comments of an older one.
 
-    A comment at the end of a line stays with the key or item of that line, one on a line of its
-    own with what follows it; items of lists are told by their `name`. Where that is gone the
-    comment moves to what held it, or to the top. None is lost, unless `old` has more than 500,000
-    characters, and the values are those of `new`.
+    A comment at the end of a line stays with the key or item of that line, one on a line of its own
+    with the key or item that follows; items of lists are identified by their `name`. Where that is
+    gone the comment moves to the enclosing key, or to the top. No comment is lost, unless `old` has
+    more than 500,000 characters. The values are those of `new`.
 
     Parameters
     ----------
     old, new : str
-        YAML; an `old` that is none has no comments.
+        YAML texts; an `old` that is not YAML has no comments.
     """
     if "#" not in old or len(old) > _MAX_CHARACTERS:
         return new
@@ -446,7 +444,7 @@ def _holds(text: str, comments: list[_Comment]) -> bool:
 
 
 def _comments(text: str) -> list[_Comment]:
-    """Return the comments of a text: what begins with # outside its tokens."""
+    """Return the comments of a text, which begin with # outside its tokens."""
     found, end = [], 0
     for token in yaml.scan(text, Loader=yaml.SafeLoader):
         found += [(m.start(), m[0]) for m in _COMMENT.finditer(text, end, token.start_mark.index)]
@@ -480,7 +478,7 @@ def _below(node: yaml.Node, place: _Place) -> Iterator[tuple[int, int, _Place]]:
     for name, first, value in entries:
         inner = (*place, name)
         yield first.start_mark.line, value.end_mark.line, inner
-        # What an alias stands for has its lines elsewhere.
+        # The lines of an alias's content are elsewhere.
         if value.start_mark.index >= first.start_mark.index:
             yield from _below(value, inner)
 
@@ -522,7 +520,7 @@ def _carried(old: str, new: str, comments: list[_Comment]) -> str:
 
 
 def _broken_lines(text: str) -> set[int]:
-    """Return the lines that end within a value, where # is no comment."""
+    """Return the lines that end within a value, in which # begins no comment."""
     found: set[int] = set()
     for token in yaml.scan(text, Loader=yaml.SafeLoader):
         if isinstance(token, yaml.ScalarToken):
@@ -531,7 +529,7 @@ def _broken_lines(text: str) -> set[int]:
 
 
 def _owner(comment: _Comment, places: list[tuple[int, int, _Place]]) -> _Place | None:
-    """Return what a comment belongs to; None for what follows all else."""
+    """Return the place that a comment belongs to; None after the last one."""
     if comment.alone:
         return next((place for line, _, place in places if line > comment.line), None)
     begun = [place for line, _, place in places if line == comment.line]

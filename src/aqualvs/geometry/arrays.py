@@ -1,4 +1,4 @@
-"""Array types and the checks that public functions make at their border."""
+"""Array types, and checks of the array arguments of public functions."""
 
 from typing import TypeAlias
 

@@ -1,10 +1,7 @@
-"""Positive definite systems of a few unknowns inside compiled kernels, by Cholesky's factor.
+"""Small linear algebra for compiled kernels, where calling LAPACK costs more than the solution.
 
-They are solved in less time than it takes to hand them to LAPACK.
-
-Three-vectors as tuples, for kernels: they stay in registers.
-
-Symmetric 3 x 3 systems inside compiled kernels, where calling LAPACK costs more than the job.
+Three-vectors are tuples, so that they stay in registers. Symmetric 3 x 3 systems are solved by
+cofactors, positive definite systems of a few unknowns by their Cholesky factor.
 """
 
 import math
@@ -92,7 +89,7 @@ _SINGULAR = 1e-13
 def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
     """Invert a positive definite 3 x 3 matrix by its cofactors; only its lower half is read.
 
-    False, and nothing written, where the matrix is singular to rounding or not positive.
+    Return False, and write nothing, where the matrix is singular to rounding or not positive.
     """
     a, b, c = matrix[0, 0], matrix[1, 0], matrix[2, 0]
     d, e, f = matrix[1, 1], matrix[2, 1], matrix[2, 2]
@@ -125,8 +122,8 @@ def solve_symmetric(
 def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArray) -> bool:
     """Write the lower factor of a matrix (N, N), its diagonal times 1 + damping, to `factor`.
 
-    Only the lower half of the matrix is read; `factor` may be the matrix itself. False where a
-    pivot is not above `least` of its diagonal element: it is rounding, not information.
+    Only the lower half of the matrix is read; `factor` may be the matrix itself. Return False where
+    a pivot is not above `least` of its diagonal element: it is rounding, not information.
     """
     n = len(matrix)
     for i in range(n):

@@ -1,7 +1,4 @@
-"""Planes n·X = d.
-
-Rays: where light enters the outer medium, and whither it goes.
-"""
+"""Planes n·X = d, and the rays of a camera in the outer medium that intersect them."""
 
 from dataclasses import dataclass
 
@@ -13,7 +10,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays in one frame.
+    """A batch of rays in one coordinate frame.
 
     Attributes
     ----------
@@ -38,7 +35,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """The plane normal·X = offset in one frame.
+    """The plane normal·X = offset in one coordinate frame.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Quantiles of measures, the same in every kernel."""
+"""Quantiles of arrays, for compiled kernels."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ _N_BINS = 256
 
 @kernel
 def element_at(values: FloatArray, share: float) -> float:
-    """Return the value below which a share of the values lie: one of them; 0 of none.
+    """Return the element below which a share of the values lie; 0 if there are no values.
 
-    NaN counts as highest. The values are counted in bins, of which only one is sorted: a partition
-    takes longer, because its branches cannot be foreseen.
+    NaN counts as highest. The values are counted in bins, and only one bin is sorted; a partition
+    takes longer, because its branches cannot be predicted.
     """
     n = values.shape[0]
     if n == 0:
@@ -26,7 +26,7 @@ def element_at(values: FloatArray, share: float) -> float:
     count, rank = np.zeros(_N_BINS + 1, np.int64), int(share * (n - 1))
     for i in range(n):
         count[_bin_of(values[i], low, per_level)] += 1
-    # The bin that holds it; how many values lie in lower ones.
+    # The bin that holds the element, and the number of values in lower bins.
     which, below = 0, 0
     while below + count[which] <= rank:
         below += count[which]

@@ -22,9 +22,10 @@ def skew(vectors: ArrayLike) -> FloatArray:
 
 
 def rotation_from_rotvec(rotvecs: ArrayLike) -> FloatArray:
-    """Rodrigues' formula: rotation matrices (..., 3, 3) from rotation vectors (..., 3) in radians.
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians.
 
-    Near zero the coefficients come from their Taylor series, so the map is smooth there.
+    Rodrigues' formula. Near zero the coefficients come from their Taylor series, so the map is
+    smooth there.
     """
     v = as_vectors(rotvecs, 3, "rotvecs")
     angle_sq = np.sum(v * v, axis=-1)[..., None, None]
@@ -39,7 +40,7 @@ def rotation_from_rotvec(rotvecs: ArrayLike) -> FloatArray:
 
 
 def rotvec_from_rotation(rotations: ArrayLike) -> FloatArray:
-    """Rotation vectors (..., 3) in radians, |v| <= pi, from rotation matrices (..., 3, 3).
+    """Return rotation vectors (..., 3) in radians, |v| <= pi, of rotation matrices (..., 3, 3).
 
     Goes through the unit quaternion by its largest component (Shepperd 1978,
     doi:10.2514/3.55767b), which stays exact at 0 and at pi.

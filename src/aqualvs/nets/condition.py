@@ -1,7 +1,7 @@
-"""The condition of a net, stretch by stretch: mesh size, twine, solidity, holes.
+"""The condition of a net, by sections of the dive: mesh size, twine, solidity, holes.
 
-Scans go in one by one. A stretch of net is evaluated as a whole when the vehicle has passed it, so
-that what is known of its lattice, its light and its twine serves all of its frames.
+Scans are added one by one. A section of net ("stretch") is evaluated as a whole when the vehicle
+has passed it, so that its lattice, light and twine serve all of its frames.
 """
 
 from collections.abc import Iterable
@@ -29,16 +29,16 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
 
-# Frames before the first lattice that are kept, to look for holes in them once it is known.
+# Limit of the frames kept before the first lattice, to search them for holes once it is known.
 _MOST_WAITING = 1500
-# Ends of a laser's line that stay this much darker than the rest are beyond the laser's fan.
+# Ends of a laser's line that are darker than the rest by this factor are beyond the laser's fan.
 _BIN_LINES, _DIM = 24, 0.25
 _LEAST_LOOKED_AT = 600
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetConditionOptions:
-    """How a dive is divided.
+    """Options of the evaluation: length of a section of net, and the known twine.
 
     Attributes
     ----------
@@ -66,12 +66,12 @@ class NetConditionOptions:
 
 @dataclass(frozen=True, slots=True)
 class NetStretch:
-    """What a stretch of net looks like; what could not be measured is None.
+    """Condition of a section (stretch) of net; None for values that could not be measured.
 
     Attributes
     ----------
     first_frame, last_frame : int
-        Frames that it was seen in.
+        Frames in which it was seen.
     begin_s, end_s : float
         Their times.
     n_frames : int
@@ -79,11 +79,11 @@ class NetStretch:
     range : float
         Mean distance from the vehicle, in metres.
     begin_place, place : array, shape (2,)
-        Where the vehicle's foot on the net (of the perpendicular from the dome's centre) was at its
-        beginning and its end: right and up of the track's start, in metres.
+        The vehicle's foot on the net (of the perpendicular from the dome's centre) at its beginning
+        and its end: right and up of the track's start, in metres.
     piece : int
-        Piece of track that `place` belongs to; where it differs from that of the stretch before,
-        the track was lost in between.
+        Piece of track that `place` belongs to; a change from the stretch before means that the
+        track was lost in between.
     lattice : NetLattice or None
         Shape and size of the mesh, directions of the strands.
     twine : Twine or None
@@ -91,9 +91,9 @@ class NetStretch:
     solidity, sigma_solidity : float or None
         Share of the area that strands and growth cover, 0 to 1.
     n_strands : float
-        Strands that a frame shows, on average.
+        Mean number of strands in a frame.
     seen_length : float
-        Metres of laser line that were looked at.
+        Observed length of laser line, in metres.
     """
 
     first_frame: int
@@ -114,7 +114,7 @@ class NetStretch:
 
     @property
     def clean_solidity(self) -> float | None:
-        """Solidity that the bare twine alone would have; what is more is growth."""
+        """Solidity of the bare twine alone; any excess is growth."""
         if self.lattice is None or self.twine is None:
             return None
         d, bar = self.twine.thickness, self.lattice.bar
@@ -126,7 +126,7 @@ class NetStretch:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What the frames of a stretch show; n of each."""
+    """Observations of the n frames of a stretch."""
 
     views: list[NetView]
     crossings: list[Crossings]
@@ -134,22 +134,22 @@ class _Seen:
 
 
 class NetCondition:
-    """Accumulates the condition of a net over a dive.
+    """Accumulator of the condition of a net over a dive.
 
     Parameters
     ----------
     rig : Rig
-        That the scans were made with.
+        Rig of the scans.
     options : NetConditionOptions, optional
         Defaults if left out.
     camera : Camera, optional
-        In place of `rig.camera()`.
+        Replaces `rig.camera()`.
 
     Attributes
     ----------
     stretches : list of NetStretch
-        Those that are complete. Where the net's lattice shows only later, the places of earlier
-        ones are filled in then, and holes in them are found.
+        Completed stretches. Where the net's lattice is found only later, the places of earlier
+        stretches and the holes in them are filled in then.
     """
 
     def __init__(
@@ -175,18 +175,18 @@ class NetCondition:
 
     @property
     def area(self) -> float:
-        """Area of net that was looked at for holes, in square metres."""
+        """Area of net that was searched for holes, in square metres."""
         return self._map.area
 
     def add(self, scan: Scan, velocity: FloatArray | None = None) -> NetStretch | None:
-        """Add a scan; returns the stretch that it completes, if it does.
+        """Add a scan; return the stretch that it completes, if any.
 
         Parameters
         ----------
         scan : Scan
-            In the order of time. Frames without a posture, or without a net, are passed over.
+            In the order of time. Frames without a posture, or without a net, are skipped.
         velocity : array, shape (2,), optional
-            Of the vehicle along the net, right and up in m/s, if another sensor knows it.
+            Of the vehicle along the net, right and up in m/s, if another sensor measures it.
         """
         finished = None
         if self._signals and scan.time_s - self._signals[0].time_s >= self._length_s():
@@ -198,14 +198,14 @@ class NetCondition:
         return finished
 
     def add_all(self, scans: Iterable[Scan]) -> list[NetStretch]:
-        """Add a dive's scans and finish; returns all stretches."""
+        """Add a dive's scans and finish; return all stretches."""
         for scan in scans:
             self.add(scan)
         self.finish()
         return self.stretches
 
     def finish(self) -> NetStretch | None:
-        """Complete the stretch under way, also when it is short; None where nothing was seen."""
+        """Complete the current stretch, even if it is short; None where nothing was seen."""
         if not self._signals:
             return None
         seen = self._take()
@@ -222,7 +222,7 @@ class NetCondition:
         return stretch
 
     def _take(self) -> _Seen:
-        """Cut the signals of the stretch under way into dashes."""
+        """Cut the signals of the current stretch into dashes."""
         for signal in self._signals:
             self._lit += signal.state == LineState.LIT
             self._looked += signal.state != LineState.HIDDEN
@@ -233,7 +233,7 @@ class NetCondition:
         return seen
 
     def _look_back(self, lattice: NetLattice) -> None:
-        """Follow the net through the stretches in which its lattice was not seen yet."""
+        """Track the net through the stretches in which its lattice was not known yet."""
         for i, seen in self._waiting.items():
             begin = self._track.place
             self._follow(lattice, seen)
@@ -246,7 +246,7 @@ class NetCondition:
         self._waiting.clear()
 
     def _length_s(self) -> float:
-        """Time that the stretch under way takes at the speed of the last one."""
+        """Return the duration of the current stretch at the speed of the last one."""
         speed = float(np.hypot(*self._track.velocity))
         return min(self.options.stretch_s, max(self.options.stretch / max(speed, 1e-6), 1.0))
 
@@ -254,7 +254,7 @@ class NetCondition:
         views, begin = seen.views, self._track.place
         twine, solidity, sigma, strands = None, None, None, 0.0
         if self._lattice is not None:
-            # Where none was found most of it may be a hole: the net beside it is as before.
+            # Without a lattice most of it may be a hole: the net beside it is as before.
             laid = self._follow(self._lattice, seen)
             if lattice is not None and laid:
                 strands = float(np.mean([one.fit.n_strands for one in laid]))
@@ -280,7 +280,7 @@ class NetCondition:
         )
 
     def _follow(self, lattice: NetLattice, seen: _Seen) -> list[LaidView]:
-        """Lay the lattice onto every frame, keep track of the way and look for holes."""
+        """Fit the lattice's place in every frame, update the track, and search for holes."""
         fitter, laid = LatticeFitter(lattice), []
         for i, view in enumerate(seen.views):
             start = self._start(fitter, seen, i) if self._track.begins(view.time_s) else None
@@ -296,7 +296,7 @@ class NetCondition:
         return laid
 
     def _start(self, fitter: LatticeFitter, seen: _Seen, first: int) -> Start | None:
-        """Look ahead where the track begins; not where another sensor tells the velocity."""
+        """Fit the start of a track to the next frames, unless a sensor gives the velocity."""
         if seen.velocities[first] is not None:
             return None
         times = np.array([view.time_s for view in seen.views[first : first + START_FRAMES]])
@@ -304,7 +304,7 @@ class NetCondition:
         return fitter.start(seen.crossings[first : first + len(times)], times)
 
     def _usable(self) -> BoolArray:
-        """Search lines (L, J) that each laser's fan reaches, as the dive shows it so far."""
+        """Return the search lines (L, J) that each laser's fan reaches, from the dive so far."""
         usable = np.ones(self._lit.shape, np.bool_)
         edges = np.arange(0, self._lit.shape[1], _BIN_LINES)
         lit = np.add.reduceat(self._lit, edges, axis=1)

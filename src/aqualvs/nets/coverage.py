@@ -1,24 +1,22 @@
-"""How much of the net its strands cover, and what dashes of one kind look like.
+"""Solidity of a net, and thickness of its twine, from the lit parts of the lasers' lines.
 
-The share of a line that is lit is, in expectation, the share of the area that strands cover
-(Delesse, C. R. Acad. Sci. 25 (1847) 544; Rosiwal, Verh. k. k. geol. Reichsanst. 1898, 143). What
-the detector adds to every dash is taken off, as `net_twine` says it.
+**Solidity.** The share of a line that is lit is, in expectation, the share of the area that strands
+cover (Delesse, C. R. Acad. Sci. 25 (1847) 544; Rosiwal, Verh. k. k. geol. Reichsanst. 1898, 143).
+The amount that the detector adds to every dash is subtracted (`Twine.excess`).
 
-Thickness of twine, from how long and how wide the light is on strands that cross at angles.
-
-The light on a strand is where strand and laser sheet overlap: a parallelogram with rounded corners.
-Search lines meet it over a length that follows in quadrature from strand and sheet, and across the
-line it is as wide as the sheet or as the strand lets it be, whichever is less:
+**Twine.** The light on a strand is where strand and laser sheet overlap: a parallelogram with
+rounded corners. Search lines meet it over a length that follows in quadrature from strand and
+sheet, and across the line it is as wide as the narrower of sheet and strand:
 
     (length / b)² = (l / sin a)² + (w k)²,    width⁻ᵖ = (r w)⁻ᵖ + (k sin a / (d + e))ᵖ,
 
 with the silhouette d, its lit width l, the crossing angle a, the sheet's lit width w and the slant
-k, by which the strand runs away from the search lines on its way across the sheet. Dashes at
-several angles tell strand and sheet apart; r says how the sheet's width at half height compares
-with its lit one. A dash ends where its light falls below a share of its own peak (`net_dashes`), so
-that its length depends on brightness little, as b says: overexposed tops are cut off, and faint
-edges are lost. l is less than d, because round strands are dim at their edges, and more by blur.
-How much was measured in simulation; the uncertainty holds what it varied.
+k, by which the strand runs away from the search lines on its way across the sheet; r is the ratio
+of the sheet's width at half height to its lit width. Dashes at several angles separate strand and
+sheet. A dash ends where its light falls below a share of its own peak (`aqualvs.nets.dashes`), so
+that its length depends only weakly on brightness, by the factor b: overexposed tops are cut off,
+and faint edges are lost. l is less than d, because round strands are dim at their edges, and more
+by blur; the amount was measured in simulation, and the uncertainty covers its variation.
 """
 
 import math
@@ -32,39 +30,39 @@ from aqualvs.nets.dashes import NetView
 from aqualvs.nets.lattice import Fit, NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Lit width of a strand: so much of its silhouette, and so much more in metres and in steps of the
+# Lit width of a strand: a share of its silhouette, plus a length in metres and one in steps of the
 # search lines; and the power of its height over the usual one, in grey levels, with which dashes
-# grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m whose twine was known.
+# grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m with known twine.
 _SEEN, _HALO, _HALO_STEPS, _BRIGHTER = 0.82, 0.43e-3, 0.44, 0.25
 _LEAST_HEIGHT = 25.0
 USUAL_HEIGHT = np.array(100.0)
 """Height of a dash at which `Twine.halo` holds, in grey levels."""
-# What that varies in steps; and as a share of the strand where there is no light at all, less up to
-# a height at which strands are no longer seen in part.
+# Variation of that in steps; and as a share of the strand at zero height, falling to zero at a
+# height from which strands are seen in full.
 _SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.07, 0.12, 90.0
 # The silhouette of twisted twine is on average narrower than its diameter.
 _SILHOUETTE = 0.95
 # Width of a strand at half height less its silhouette, in pixels; and the exponent p (same dives).
 _STRAND_MORE, _CORNER = 0.95, 2.5
-# Before any dash was seen: silhouette of a strand and lit width of the sheet in metres, the sheet's
-# width at half height over its lit one; and their spreads as logarithms.
+# Priors: silhouette of a strand and lit width of the sheet in metres, the sheet's width at half
+# height over its lit one; and their spreads as logarithms.
 _USUAL, _SPREAD = np.log([2.2e-3, 2.8e-3, 0.95]), np.array([1.5, 0.2, 0.1])
 # Errors of a kind's length and width: relative, relative for one dash, and in search lines.
 _LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.06, 0.115, 0.2, 0.2
 # Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
 _SPREAD_ERROR = 0.15
-# The model holds the less the more slanted the strand is.
+# Error of the model, which grows with the slant of the strand.
 _SLANT_ERROR = 0.7
-# Uncertainty of what slant adds to a dash, as a share.
+# Relative uncertainty of the length that slant adds to a dash.
 _SLANT_TOLD = 0.1
-# True errors over those of the fit, which is cautious with single kinds.
+# True errors over those of the fit, which overestimates them with single kinds.
 _TRUE_ERROR = 0.7
 _ROUNDS = 40
 
 
 @dataclass(frozen=True, slots=True)
 class DashKind:
-    """Dashes of one laser on one family of strands, taken together.
+    """Mean dash of one laser on one family of strands.
 
     Attributes
     ----------
@@ -73,19 +71,19 @@ class DashKind:
     across : float
         Sine of the angle between the laser's line and the strands, 0 to 1.
     slant : float
-        How far the strand gets along the line, measured by search lines, per metre across it.
+        Displacement of the strand along the line, measured by search lines, per metre across it.
     length : float
-        Of a usual dash along the line, in metres.
+        Of a typical dash along the line, in metres.
     width : float
         Of its light at half height, square to the line, in metres.
     height : float
         Of its light, in grey levels.
     step : float
-        Length of laser line that a search line stands for, in metres.
+        Length of laser line per search line, in metres.
     pixel : float
         Size of a pixel on the net, in metres.
     spread : float
-        Logarithm of long dashes over short ones: how much growth there is.
+        Logarithm of the ratio of long dashes to short ones: a measure of growth.
     count : int
         Dashes.
     """
@@ -105,7 +103,7 @@ class DashKind:
 
 @dataclass(frozen=True, slots=True)
 class Twine:
-    """Thickness of twine.
+    """Estimated thickness of twine, and the widths that explain its dashes.
 
     Attributes
     ----------
@@ -116,8 +114,8 @@ class Twine:
     sheet : float
         Width within which the light sheet is seen, in metres.
     halo, sigma_halo : float
-        How much wider than its body a strand looks lit where search lines are close, in metres, and
-        how well body and halo are told apart.
+        Lit width of a strand beyond its body where search lines are close, in metres, and the
+        standard deviation of the separation of body and halo.
     """
 
     thickness: float
@@ -130,20 +128,20 @@ class Twine:
     def usual(
         self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> FloatArray:
-        """Length of dashes, in metres, by crossing angle, slant, step, height as in `DashKind`."""
+        """Return the length of dashes (m) by crossing angle, slant, step, height (`DashKind`)."""
         return np.asarray(_bright(height) * np.hypot(self._lit(step) / across, self.sheet * slant))
 
     def excess(
         self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what of `usual` is not twine, in metres, and its standard deviation."""
+        """Return the part of `usual` that is not twine, in metres, and its standard deviation."""
         usual = self.usual(across, slant, step, height)
         straight = _bright(height) * self._lit(step) / across
         sigma = np.hypot(self.sigma_halo / across, _SLANT_TOLD * (usual - straight))
         return usual - self.body / across, np.asarray(sigma)
 
     def _lit(self, step: FloatArray) -> FloatArray:
-        """Lit width at the usual height, in metres."""
+        """Return the lit width at the usual height, in metres."""
         return np.asarray(self.body + self.halo + _HALO_STEPS * step)
 
 
@@ -155,7 +153,7 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
     kinds : sequence of DashKind
         The more different their angles and slants, the better.
     known : float, optional
-        Diameter of the bare twine in metres, where somebody knows it: then the halo is measured.
+        Known diameter of the bare twine in metres: then the halo is measured.
     """
     if not kinds:
         return None
@@ -182,14 +180,14 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
 
 
 def _bright(height: FloatArray) -> FloatArray:
-    """How much longer dashes are than those of the usual height."""
+    """Return the ratio of the length of dashes to that of dashes of the usual height."""
     return np.asarray((np.maximum(height, _LEAST_HEIGHT) / USUAL_HEIGHT) ** _BRIGHTER)
 
 
 def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
-    """Logarithms (3,) of silhouette, sheet and sheet's half-height ratio, and their covariance.
+    """Fit the logarithms (3,) of silhouette, sheet and sheet's half-height ratio.
 
-    Gauss-Newton; lengths and widths far off count less (Huber's weights).
+    Gauss-Newton with Huber's weights of lengths and widths. Return them and their covariance.
     """
     across, slant, length, width, step, pixel, height, count = np.array(
         [[k.across, k.slant, k.length, k.width, k.step, k.pixel, k.height, k.count] for k in kinds],
@@ -221,7 +219,7 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
 def _model(
     at: FloatArray, across: FloatArray, slant: FloatArray, halo: FloatArray, more: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Logarithms (2K,) of lengths, then widths, and their derivatives (2K, 3) by `at`."""
+    """Return logarithms (2K,) of lengths, then widths, and their derivatives (2K, 3) by `at`."""
     strand, sheet, ratio = np.exp(at)
     lit = _SEEN * strand + halo
     one, other = (lit / across) ** 2, (sheet * slant) ** 2
@@ -240,14 +238,14 @@ def _model(
 # Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
 _LEAST_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
 _LEAST_DASHES = 6
-# Growth lengthens dashes, and makes them differ; up to this share of all light on a kind's dashes
-# they are bare still, falling with how much they differ by this scale. They also differ by noise,
-# which is so many grey levels, and where there is none. From simulated dives.
+# Growth lengthens dashes and makes them differ. Share of all light on a kind's dashes up to which
+# they are bare, and the scale of the spread with which it falls; then the spread by noise, in grey
+# levels, and without noise. From simulated dives.
 _BARE_SHARE, _DIFFER, _LEAST_BARE = 0.45, 0.22, 0.08
 _NOISE, _NO_NOISE = 7.0, 0.03
 _SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
 _WIDTH_QUANTILE = 0.4
-# Sines of smaller angles say no more than that a strand runs along the line.
+# At smaller sines of the angle a strand counts as parallel to the line.
 _NEARLY_ALONG = 0.02
 # Dashes of more search lines may be lost (`segments`).
 _MOST_LINES = 20.0
@@ -255,9 +253,9 @@ _BLOCKS = 6
 # Errors of solidity for dashes that run together or are not seen, as shares: of any net, and per
 # pixel in the distance of two strands (simulated dives).
 _SHARE_ERROR, _UNRESOLVED = 0.04, 1.5
-# And as a share of what growth adds: it stands out of the net, and is lit and seen askew.
+# And as a share of the area that growth adds: it stands out of the net, and is lit and seen askew.
 _GROWTH_ERROR = 0.25
-# Growth so far apart along the net, in metres, is independent.
+# Distance along the net beyond which growth is independent, in metres.
 _ALIKE = 0.02
 # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
 # bars long.
@@ -266,16 +264,16 @@ _TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
 
 @dataclass(frozen=True, slots=True)
 class LaidView:
-    """A frame on which the lattice was laid.
+    """A frame with the place of the lattice in it.
 
     Attributes
     ----------
     view : NetView
-        What it shows.
+        Dashes and gaps of the frame.
     fit : Fit
-        How its dashes lie on the lattice.
+        Assignment of its dashes to strands.
     place : array, shape (2,)
-        Where the origin of `net` lies on the net itself, as `NetTrack.place`.
+        Place of the origin of `net` on the net itself, as `NetTrack.place`.
     """
 
     view: NetView
@@ -285,7 +283,7 @@ class LaidView:
 
 @dataclass(frozen=True, slots=True)
 class _Angles:
-    """How a laser's line and search lines lie to strands; shapes alike.
+    """Angles between strands and a laser's line and search lines; arrays of equal shape.
 
     Attributes
     ----------
@@ -311,14 +309,14 @@ class _Angles:
 
 
 def _angles(lattice: NetLattice, one: LaidView) -> _Angles:
-    """Of every dash."""
+    """Return the angles of every dash."""
     laser = one.view.dashes.laser
     normal = lattice.normals[one.fit.family]
     return _Angles.of(one.view.direction[laser], one.view.search[laser], normal)
 
 
 def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind]:
-    """Sort whole dashes that lie clearly on one strand by laser and family."""
+    """Group whole dashes that lie clearly on one strand by laser and family."""
     rows = [_rows(lattice, one) for one in frames]
     table = np.concatenate(rows) if rows else np.empty((0, 9))
     kinds = np.unique(table[:, :2], axis=0)
@@ -335,7 +333,7 @@ def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind
 
 
 def _kind(mine: FloatArray, spread: float) -> DashKind:
-    """Take dashes (rows as `_rows` makes them) together."""
+    """Average dashes, given as rows of `_rows`."""
     across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
     noise = np.hypot(_NOISE / max(height, 1.0), _NO_NOISE)
     grown = np.sqrt(max(spread**2 - noise**2, 0.0))
@@ -356,14 +354,14 @@ def _kind(mine: FloatArray, spread: float) -> DashKind:
 
 
 def _length_at(mine: FloatArray, share: float) -> float:
-    """Length up to which dashes have this share of all light; so fragments count little."""
+    """Return the light-weighted quantile of the lengths of dashes; fragments count less."""
     ordered = np.sort(mine[:, 4])
     light = np.cumsum(ordered)
     return float(ordered[np.searchsorted(light, share * light[-1])])
 
 
 def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
-    """(laser, family, across, slant, length, width, height, step) of a frame's clear dashes."""
+    """Return rows (laser, family, across, slant, length, width, height, step) of clear dashes."""
     pitch, dashes, fit = lattice.pitch, one.view.dashes, one.fit
     angles = _angles(lattice, one)
     clear = dashes.whole & (fit.off < _ON_STRAND * pitch[fit.family])
@@ -371,8 +369,8 @@ def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
     if lattice.mesh is Mesh.FOUR_SIDED:
         clear &= fit.clear > _CLEAR * pitch.min()
     step = one.view.step[dashes.laser]
-    # A search line stands for a whole number of pixels; it tells better than the range does how
-    # large they are on the net.
+    # A search line is a whole number of pixels wide; its step gives their size on the net more
+    # accurately than the range does.
     lines = np.maximum(np.rint(step * angles.square / one.view.pixel), 1.0)
     pixel = step * angles.square / lines
     columns = [
@@ -392,11 +390,11 @@ def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
 def measure_solidity(
     lattice: NetLattice, twine: Twine, frames: Sequence[LaidView]
 ) -> tuple[float, float] | None:
-    """Share of the sound net that strands and growth cover, and its standard deviation.
+    """Return the share of the sound net that strands and growth cover, and its standard deviation.
 
-    Of hexagons, whose strands every laser crosses in three directions, the lasers' lines as a
-    whole. Of meshes with four sides family by family, each from the lasers that cross it at an
-    angle at which no dash is lost.
+    For hexagons, whose strands every laser crosses in three directions, the lasers' lines are
+    evaluated as a whole. For meshes with four sides each family is evaluated from the lasers that
+    cross it at an angle at which no dash is lost.
     """
     counts = np.ones((len(frames[0].view.step), len(lattice.waves)), np.bool_)
     if lattice.mesh is Mesh.FOUR_SIDED:
@@ -409,7 +407,7 @@ def measure_solidity(
         angles = _angles(lattice, one)
         at = angles.across, angles.slant, one.view.step[dashes.laser], dashes.height
         excess, sigma = twine.excess(*at)
-        # A dash that is cut off, or lies along the edge of the light, has its share of the halo.
+        # A dash that is cut off, or lies along the edge of the light, has a share of the halo only.
         share = np.minimum(dashes.length / twine.usual(*at), 1.0)
         share = np.where(dashes.whole, share, 0.5 * share)
         mine = dashes.length - excess * share
@@ -432,9 +430,9 @@ def measure_solidity(
 
 
 def _spread_of_mean(rows: FloatArray) -> float:
-    """How uncertain the mean of dashes (family, length, place) is for their spread, as a share.
+    """Return the relative error of the mean of dashes (family, length, place) by their spread.
 
-    Dashes near to one another show the same growth, in whatever frames.
+    Dashes near to one another show the same growth, even in different frames.
     """
     variance, weight = 0.0, 0.0
     for family in np.unique(rows[:, 0]):
@@ -448,7 +446,7 @@ def _spread_of_mean(rows: FloatArray) -> float:
 
 
 def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
-    """Lines of each family that the lasers' lines cross in a metre, shape (L, F)."""
+    """Return the crossings of the lasers' lines with each family per metre, shape (L, F)."""
     known = np.isfinite(view.direction)
     direction = np.where(known, view.direction, lattice.normals[0])
     return np.asarray(np.abs(direction @ lattice.waves.T))
@@ -463,7 +461,7 @@ def long_gaps(lattice: NetLattice, view: NetView) -> BoolArray:
 
 
 def sound_length(lattice: NetLattice, view: NetView) -> FloatArray:
-    """Metres of each laser's line (L,) that could be seen, without gaps that are too long."""
+    """Return the visible metres of each laser's line (L,), without gaps that are too long."""
     length, long = np.zeros(len(view.step)), long_gaps(lattice, view)
     np.add.at(length, view.span_laser, view.span[:, 1] - view.span[:, 0])
     np.subtract.at(length, view.gaps.laser[long], view.gaps.length[long])
@@ -471,17 +469,17 @@ def sound_length(lattice: NetLattice, view: NetView) -> FloatArray:
 
 
 def _family_sum(body: FloatArray, seen: FloatArray, counts: BoolArray) -> float:
-    """Covered share of the lines, added up over the families: (frames, lasers, families) in."""
+    """Return the covered share of the lines, summed over families; axes: frames, lasers, family."""
     covered = np.sum(body.sum(axis=0) * counts, axis=0)
     looked = np.sum(seen.sum(axis=0)[:, None] * counts, axis=0)
     return float(np.sum(covered / np.maximum(looked, 1e-9)))
 
 
 def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
-    """Which lasers (L) show all crossings of which families (F).
+    """Mark the lasers and families (L, F) without lost crossings.
 
     Light that runs along a strand for many search lines is taken for another laser's stripe. Where
-    no laser crosses a family well, the one that does so best counts.
+    no laser crosses a family at a good angle, the one with the best angle is used.
     """
     line, search = np.nan_to_num(view.direction), np.nan_to_num(view.search)
     angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])

@@ -1,6 +1,7 @@
-"""Dashes: the pieces of a laser's line that strands light, and the dark gaps between them.
+"""Dashes: the lit pieces of a laser's line on strands, and the dark gaps between them.
 
-Cutting the lasers' lines into dashes, gaps and spans.
+`find_dashes` cuts the lines of one frame into dashes, gaps and spans (pieces of line seen without
+interruption).
 """
 
 from dataclasses import dataclass
@@ -12,12 +13,13 @@ from aqualvs.geometry.compiled import kernel
 from aqualvs.nets.lit_intervals import LineState, NetSignal
 from aqualvs.nets.spectrum import Crossings
 
-# A dark gap of one search line does not end a dash: compression and specks make such gaps. Nor does
-# one of a few lines between two that are as bright as it gets on this laser's line, where the dash
-# begins fainter: light fades at the edge of a strand; a white, overexposed core is not laser green.
+# A dark gap of one search line does not end a dash: compression and specks make such gaps. A gap of
+# a few lines does not either, if both its ends are near the greatest brightness on this laser's
+# line and the dash begins fainter: light fades at the edge of a strand, whereas the detector drops
+# a white, overexposed core because it is not laser green.
 _BRIDGED, _WHITE, _UNFADED = 1, 3, 0.85
-# A dash is as long as its light stands above this share of its peak, whatever the exposure; above
-# the greater one it is as wide as it gets.
+# The length of a dash is measured above this share of its peak, regardless of exposure; its width
+# above the greater share.
 _LEVEL, _BRIGHT = 0.4, 0.8
 
 
@@ -34,7 +36,7 @@ def cut_lines(
     span: FloatArray,
     usual: FloatArray,
 ) -> tuple[int, int, int]:
-    """Write what the lines are cut into; the numbers of dashes, gaps and spans.
+    """Cut the lines into dashes, gaps and spans; return their numbers.
 
     Parameters
     ----------
@@ -57,7 +59,7 @@ def cut_lines(
         steps = step[i][step[i] > 0.0]
         usual[i, 0] = np.median(steps) if len(steps) else 0.0
         n_dark, n_beyond = 0, 0
-        # Gaps and dashes ascend along the line, whichever way the search lines run.
+        # Gaps and dashes ascend along the line, regardless of the order of the search lines.
         back = _descends(along[i])
         begin = 0
         while begin < n_lines:
@@ -99,7 +101,7 @@ def _cut_span(
     gap: FloatArray,
     k: int,
 ) -> tuple[int, int]:
-    """Append the dashes and gaps of one span; the new counts."""
+    """Append the dashes and gaps of one span; return the new counts."""
     n_lines = state.shape[1]
     brightest = height[i].max()
     j, dark_from, before = begin, begin, -1
@@ -148,9 +150,9 @@ def _cut_span(
 def _length_above(
     i: int, first: int, last: int, back: bool, level: float, step: FloatArray, height: FloatArray
 ) -> float:
-    """Metres of a run of search lines above a level; heights change evenly, beyond it is dark.
+    """Return the metres of a run of search lines above a level, by linear interpolation.
 
-    Bridged lines are as bright as the one before.
+    Outside the run it is dark; bridged lines are as bright as the one before.
     """
     n_lines = step.shape[1]
     length, before = 0.0, 0.0
@@ -201,7 +203,7 @@ def _put_gap(
 def _ends(
     i: int, first: int, last: int, back: bool, along: FloatArray, step: FloatArray
 ) -> tuple[float, float]:
-    """Both ends of a run of search lines on the laser's line, ascending."""
+    """Return both ends of a run of search lines on the laser's line, ascending."""
     a, b = _turned(first, along.shape[1], back), _turned(last, along.shape[1], back)
     return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
 
@@ -222,8 +224,8 @@ def _descends(along: FloatArray) -> bool:
     return bool(last < first)
 
 
-# Dark pieces so many times longer than most (this quantile) are holes; a lattice is not looked for
-# there.
+# Dark pieces this many times longer than this quantile may be holes, and are left out of the search
+# for a lattice.
 _HOLE, _MOST = 2.5, 0.8
 
 
@@ -244,7 +246,7 @@ class Dashes:
     height, width : array, shape (N,)
         Peak height (grey levels) and, where it is bright, mean width across the search line (m).
     whole : bool array, shape (N,)
-        Whether both ends were seen: what is cut off says nothing about length.
+        Whether both ends were seen: the length of a cut-off dash is not known.
     """
 
     laser: IntArray
@@ -273,7 +275,7 @@ class Gaps:
     middles : array, shape (K, 2)
         Middles of the dashes at both ends; as `ends` where there is none.
     closed : bool array, shape (K, 2)
-        Whether a dash is at that end; else the view ends there.
+        Whether a dash ends the gap there; otherwise the view ends.
     beyond : array, shape (K,)
         Share of its search lines whose light is seen on something behind the net.
     """
@@ -292,14 +294,14 @@ class Gaps:
 
 @dataclass(frozen=True, slots=True)
 class NetView:
-    """What one frame shows of the net, L lasers, without what single search lines said.
+    """Dashes and gaps of the net in one frame, L lasers; a summary of the `NetSignal`.
 
     Attributes
     ----------
     index, time_s, range, origin, direction, search, pixel
         As in the `NetSignal`.
     step : array, shape (L,)
-        Length of laser line that a search line usually stands for, in metres.
+        Typical length of laser line per search line, in metres.
     beyond : array, shape (L,)
         Share of each laser's dark search lines whose light is seen on something behind the net.
     dashes : Dashes
@@ -328,11 +330,11 @@ class NetView:
 
     @property
     def seen_length(self) -> float:
-        """Metres of laser line that could be seen."""
+        """Visible length of laser line, in metres."""
         return float(np.sum(self.span[:, 1] - self.span[:, 0]))
 
     def at(self, laser: IntArray, along: FloatArray) -> FloatArray:
-        """Places in `net`, shape (n, 2), of places on lasers' lines, shape (n,) each."""
+        """Return the places in `net`, shape (n, 2), of places on lasers' lines, shape (n,) each."""
         return np.asarray(self.origin[laser] + along[:, None] * self.direction[laser])
 
 
@@ -344,7 +346,7 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
     signal : NetSignal
         Of one frame.
     usable : bool array, shape (L, J), optional
-        Search lines to look at; the others count as hidden.
+        Search lines to use; the others count as hidden.
     """
     state = signal.state if usable is None else np.where(usable, signal.state, LineState.HIDDEN)
     n_lasers, n_lines = state.shape
@@ -396,7 +398,7 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
 
 
 def crossings_of(view: NetView) -> Crossings:
-    """Return a frame's crossings to find the lattice: no dash cut off, nothing like a hole."""
+    """Return crossings for the lattice search, without cut-off dashes and likely holes."""
     gaps, dashes = view.gaps, view.dashes
     inner = gaps.length[gaps.closed.all(axis=1)]
     longest = _HOLE * float(np.quantile(inner, _MOST)) if len(inner) else np.inf
@@ -419,7 +421,7 @@ def crossings_of(view: NetView) -> Crossings:
 def _without(
     laser: IntArray, span: FloatArray, gap_laser: IntArray, gap: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Cut gaps out of spans; laser (n,) and ends (n, 2) of what remains."""
+    """Cut gaps out of spans; return laser (n,) and ends (n, 2) of the remainder."""
     if not len(gap):
         return laser, span
     kept: list[tuple[int, float, float]] = []

@@ -1,18 +1,16 @@
-"""Strands that the lattice predicts, one by one: seen, missed, or not to be seen.
+"""Candidate holes: evidence from single strands that the lattice predicts, summed over discs.
 
-Where the lattice lies in a frame is known, and so is where each laser's line crosses each strand.
-What is lit there is a strand seen; what is dark, with light enough to either side, one missed.
+**Strands.** The place of the lattice in a frame is known, and so is the point where each laser's
+line crosses each strand. A lit crossing is a strand seen; a dark one, with enough light on either
+side, a strand missed (`predicted_strands`).
 
-Looks at strands that a net should have: what each says for a hole, and what they say together.
+**Looks.** Each crossing is a look: evidence for a hole there or against it. The rate at which
+existing strands are missed is estimated from the dive itself. Looks of one laser at one small cell
+of the net are alike and count as one, however many (`Looks`).
 
-A look finds a strand or misses it. How often strands that are there are missed, the dive itself
-tells. Looks of one laser at one small cell of the net are alike and count as one, however many.
-
-Round patches of the net in which strands are missing, by likelihood.
-
-Every place where a strand was looked for speaks for a hole there or against it. The evidence adds
-up over discs of many sizes around many middles; the discs that explain it, each with its
-likelihood, say where a hole is, how large, and how well that is known where its edge was not seen.
+**Discs.** The log-likelihood adds up over discs of many sizes around many middles; the discs that
+explain it, each with its likelihood, give the place and size of a hole, and their uncertainty where
+its edge was not seen (`find_discs`).
 """
 
 from dataclasses import dataclass, field
@@ -26,19 +24,19 @@ from aqualvs.nets.dashes import NetView
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Pieces of strand that are always dark without a hole, as a share; light where the net has a hole
-# (a fish, a loose end); and how much the looks at one cell say at most against a hole.
+# Share of strand that is always dark without a hole; share of light where the net has a hole (a
+# fish, a loose end); and limit of the evidence of the looks at one cell against a hole.
 _DARK, _FALSE_LIGHT, _MOST_SOUND = 0.03, 0.03, 4.0
-# Of one laser's crossings with one family, so many count as seen beforehand: with few, the share
-# that is missed is not known. The same for a piece of its line.
-# Where this share takes turns, all that is missed there counts; where more is missed than the last
-# share, missing strands tell nothing.
+# Prior number of crossings seen, for one laser and family: with few crossings, the share that is
+# missed is not known. The same for a piece of its line.
+# Where seen and missed alternate at this share, all missed ones count; where a larger share than
+# the last one is missed, missing strands give no evidence.
 _BEFORE, _BEFORE_HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.12, 0.3
-# What hides the net for a while, and shows no light of its own, leaves some of the strands to be
-# seen; so many are in a hole, and it must not be less likely than the other by this logarithm.
+# A dark object that hides the net for a while leaves some strands visible. Share of strands seen in
+# a hole; and largest log-likelihood by which a hidden net may be likelier than a hole.
 _LIT_IN_HOLE, _LEAST_OVER_HIDDEN = 0.05, -3.0
-# A hole that one laser alone tells of must stay so for so many frames: those in which a line sweeps
-# over three bars at the fastest pace at which the net can be followed.
+# Least number of frames of a hole seen by one laser alone: those in which a line sweeps over three
+# bars at the fastest speed at which the net can be tracked.
 _ALONE_FRAMES = 8
 
 HERE = 0.1
@@ -50,16 +48,16 @@ LASERS = 1 << 5
 
 @dataclass(slots=True)
 class Looks:
-    """Looks at cells, each of one laser and one outcome; n of them.
+    """Looks at cells of the net, n of them, each of one laser and one outcome.
 
     Attributes
     ----------
     keys : int array, shape (n,)
         Cell, laser, and whether the strands were missed.
     sums : array, shape (n, 4)
-        Number of looks, sums of their places and of what they say for a hole.
+        Number of looks, sums of their places and of their log-likelihoods for a hole.
     frames : int array, shape (n, 2)
-        The first and the last that they are of.
+        Their first and last frame.
     """
 
     keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
@@ -67,7 +65,7 @@ class Looks:
     frames: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     def added(self, keys: IntArray, rows: FloatArray, frame: IntArray) -> "Looks":
-        """Return these and more of them."""
+        """Return these looks and further ones."""
         every, index = np.unique(np.concatenate([self.keys, keys]), return_inverse=True)
         both = np.concatenate([self.sums, rows])
         sums = [np.bincount(index, column, minlength=len(every)) for column in both.T]
@@ -77,7 +75,7 @@ class Looks:
         return Looks(every, np.stack(sums, axis=1), frames)
 
     def kept(self, mask: BoolArray) -> "Looks":
-        """Return some of them."""
+        """Return the looks selected by a mask."""
         return Looks(self.keys[mask], self.sums[mask], self.frames[mask])
 
     @property
@@ -87,7 +85,7 @@ class Looks:
 
     @property
     def missed(self) -> BoolArray:
-        """Which are of missed strands (n,)."""
+        """Mask of the looks at missed strands (n,)."""
         return np.asarray((self.keys & 1) == 1)
 
     @property
@@ -98,7 +96,7 @@ class Looks:
         return np.asarray(number / np.bincount(index, number)[index])
 
     def weights(self) -> FloatArray:
-        """Say how much each speaks for a hole (n,): as one look, less where both were seen."""
+        """Evidence of each for a hole (n,): as one look, less where both outcomes were seen."""
         number = self.sums[:, 0]
         margin = np.maximum(2.0 * self.shares - 1.0, 0.0)
         mean = self.sums[:, 3] / number
@@ -106,9 +104,9 @@ class Looks:
         return np.asarray(says * margin)
 
     def stays_dark(self, middle: FloatArray, radius: float) -> bool:
-        """Tell whether a round patch is a hole, not hidden for a while by what shows no light.
+        """Return whether a round patch is a hole, not hidden for a while by a dark object.
 
-        A hole is there for every laser and whenever it is looked at. What drifts or swims by hides
+        A hole is there for every laser and at all times. An object that drifts or swims by hides
         strands that are seen before and after, or by another laser from another side.
         """
         inside = np.hypot(*(self.places - middle).T) < radius
@@ -132,7 +130,7 @@ class Looks:
 def looks_say(
     laser: IntArray, family: IntArray, here: FloatArray, missed: BoolArray, run: IntArray
 ) -> FloatArray:
-    """Log-likelihood of a hole over sound net, of every crossing (N,).
+    """Return the log-likelihood of a hole over sound net for every crossing (N,).
 
     Parameters
     ----------
@@ -149,9 +147,9 @@ def looks_say(
 def _missed_share(
     laser: IntArray, family: IntArray, missed: BoolArray, run: IntArray
 ) -> FloatArray:
-    """Share of strands that are missed though they are there, for every crossing (N,).
+    """Return the share of strands that are missed though they are there, for every crossing (N,).
 
-    Told from single ones, between others that are seen, of the same laser and family.
+    Estimated from single missed ones between seen ones, of the same laser and family.
     """
     kind = laser * (int(family.max(initial=0)) + 1) + family
     seen = np.bincount(kind[~missed], minlength=int(kind.max(initial=0)) + 1)
@@ -161,10 +159,10 @@ def _missed_share(
 
 
 def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatArray:
-    """Share of strands that are missed on a piece of a laser's line, for every crossing (N,).
+    """Return the share of strands missed on a piece of a laser's line, for every crossing (N,).
 
-    Where light is scarce, seen and missed take turns as the net passes by; where a hole passes by
-    they do so once or twice.
+    Where light is weak, seen and missed alternate as the net passes by; where a hole passes by they
+    change once or twice.
     """
     _, kind = np.unique(np.stack([laser, here.astype(np.int64)]), axis=1, return_inverse=True)
     order = np.argsort(kind, kind="stable")
@@ -180,10 +178,10 @@ def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatA
 
 
 RIM = 0.8
-"""Evidence so far beyond a disc's edge, in bars, belongs to it still."""
+"""Margin around a disc within which evidence belongs to it, in bars."""
 
-# Middles and radii that are tried, in bars: step of the middles, how far beyond missing strands
-# they lie, and the radii. With double the step a hole has this score at least.
+# Grid of the discs, in bars: step of the middles, their margin beyond missing strands, and the
+# radii. Least score of a hole on the grid with double the step.
 _STEP, _BESIDE, _COARSE_SCORE = 0.4, 2.4, 6.0
 _RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
 # Discs up to this radius are single strands that are cut, larger ones holes.
@@ -192,7 +190,7 @@ _SINGLE = 0.8
 _RARER = 2.0
 # A hole's log-likelihood over sound net, and over a single strand that is cut.
 _LEAST_SCORE, _LEAST_LEAD = 12.0, 5.0
-# What the grid and the places of strands leave of a radius, in bars.
+# Uncertainty of a radius from the grid and from the places of strands, in bars.
 _ROUGH = 0.25
 
 
@@ -222,7 +220,7 @@ def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
     Parameters
     ----------
     place : array, shape (N, 2)
-        Where strands were looked for, in metres.
+        Places of the looks, in metres.
     weight : array, shape (N,)
         Log-likelihood of a hole there over sound net.
     bar : float
@@ -242,7 +240,7 @@ def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
 
 @kernel
 def local_sums(place: FloatArray, weight: FloatArray, radius: float) -> FloatArray:
-    """Sum of the weights (N,) of places (N, 2) within a radius of each of them, shape (N,)."""
+    """Return the sums (N,) of the weights of places (N, 2) within a radius of each of them."""
     total = np.zeros(len(place))
     for m in range(len(place)):
         for k in range(len(place)):
@@ -266,7 +264,7 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
     best = float(score[at, size])
     if best < _LEAST_SCORE or best - max(float(score[:, single].max()), 0.0) < _LEAST_LEAD:
         return None
-    # Discs that have the likeliest one's middle in them tell of the same hole.
+    # Discs that contain the middle of the likeliest one belong to the same hole.
     away = np.hypot(*(middles - middles[at]).T)
     share = np.exp(total - total[at, size]) * (away[:, None] < np.maximum(radii, radii[size]))
     share /= share.sum()
@@ -281,7 +279,7 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
 
 
 def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> FloatArray:
-    """Grid around the places where strands are missing, shape (C, 2)."""
+    """Return a grid around the places where strands are missing, shape (C, 2)."""
     missing, beside = place[weight > 0.0], _BESIDE * bar
     low, high = missing.min(axis=0) - beside, missing.max(axis=0) + beside
     sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
@@ -292,7 +290,7 @@ def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> 
 def _scores(
     place: FloatArray, weight: FloatArray, middles: FloatArray, radii: FloatArray
 ) -> FloatArray:
-    """Sum of the weights within each radius (R,) of each middle (C, 2), shape (C, R)."""
+    """Return the sum of the weights within each radius (R,) of each middle (C, 2), shape (C, R)."""
     score = np.zeros((len(middles), len(radii)))
     first, step = radii[0], radii[1] - radii[0]
     for c in range(len(middles)):
@@ -307,14 +305,14 @@ def _scores(
     return score
 
 
-# A strand lies within this share of its pitch of where it is predicted, and at least within so many
-# steps of the search lines.
+# Tolerance of a strand's predicted place, as a share of its pitch; at least this many steps of the
+# search lines.
 _OFF, _OFF_STEPS = 0.2, 1.5
-# Strands that the line crosses at a smaller sine: where, is uncertain.
+# Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
 _LEAST_ACROSS = 0.3
-# Bars of hexagons: farther from their ends than this share of a bar, there is one, or none.
+# Margin at the ends of hexagon bars, as a share of a bar, within which their presence is uncertain.
 _KNOT = 0.2
-# Through a hole as much light is seen on what is behind the net as elsewhere, but for this share.
+# Least share of light behind the net seen through a hole, relative to elsewhere.
 _LET_THROUGH = 0.5
 
 
@@ -333,7 +331,7 @@ class Strands:
     missed : bool array, shape (N,)
         Whether it is dark there.
     run : int array, shape (N,)
-        Crossings that are missed in the same dark piece; 0 for those seen.
+        Number of crossings missed in the same dark piece; 0 for those seen.
     closed : bool array, shape (N,)
         Whether strands are seen at both ends of that piece; False for those seen.
     """
@@ -348,19 +346,19 @@ class Strands:
 
 
 def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> Strands:
-    """Tell which of the strands that a frame's lines must cross are there.
+    """Return the predicted crossings of a frame's lines with strands, each seen or missed.
 
     Parameters
     ----------
     lattice : NetLattice
         Of the net.
     view : NetView
-        What the frame shows.
+        Dashes and gaps of the frame.
     place : array, shape (2,)
-        Where the lattice lies in `net` (`Shift.place`), in metres.
+        Place of the lattice in `net` (`Shift.place`), in metres.
     """
     gaps = view.gaps
-    # A hole lets light through; what is dark without is hidden by something.
+    # A hole lets light through; a dark piece without light behind it is hidden by something.
     open_ = gaps.beyond >= _LET_THROUGH * view.beyond[gaps.laser]
     turns = np.abs(lattice.waves).sum(axis=0) @ np.ones(2)
     most = int(np.sum(turns * (view.span[:, 1] - view.span[:, 0]) + len(lattice.waves) + 1.0))
@@ -409,7 +407,7 @@ def _predict(
     where: FloatArray,
     row: NDArray[np.int64],
 ) -> int:
-    """Write (place, along) and (laser, family, gap or -1) of every crossing told; their number."""
+    """Write (place, along) and (laser, family, gap or -1) of every crossing; return the number."""
     n = 0
     for m in range(len(span)):
         i = span_laser[m]
@@ -441,7 +439,7 @@ def _predict(
 
 @kernel
 def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArray) -> int:
-    """Row of the dark piece that reaches farther than `off` to both sides of s, or -1."""
+    """Return the row of the gap that reaches farther than `off` to both sides of s, or -1."""
     for k in range(len(gap)):
         if gap_laser[k] == i and gap[k, 0] < s - off and gap[k, 1] > s + off:
             return k
@@ -450,7 +448,7 @@ def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArr
 
 @kernel
 def _on_bar(x: float, y: float, basis: FloatArray, bar: float) -> bool:
-    """Whether a place on a line of bars of hexagons is on a bar, well within.
+    """Return whether a place on a line of hexagon bars is on a bar, well inside its ends.
 
     A bar is as far from the middles of the two openings beside it, and farther from all others.
     """

@@ -1,9 +1,9 @@
 """Holes: places on the net where strands that the lattice predicts are missing.
 
-Every crossing of a laser's line with a strand that should be there is looked at: seen, or missed.
-Looks from many places are put together on a map that is fixed to the net. However often the same
-piece of strand was looked at from much the same place, it counts once; how often strands that are
-there are missed is told by the dive itself.
+Every crossing of a laser's line with a strand that should be there is checked: seen, or missed.
+Looks from many places are combined on a map that is fixed to the net. Repeated looks at one piece
+of strand from much the same place count once; the rate at which existing strands are missed is
+estimated from the dive itself.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ from aqualvs.nets.spectrum import Mesh
 
 # Side of the map's cells, in bars: looks of one laser at one cell are alike.
 _CELL = 0.4
-# Where more than this share is missed between strands that are seen, the lattice is not the net's.
+# Limit of the share missed between strands that are seen; above it the lattice is wrong.
 _MOST_MISSED = 0.3
-# Missing strands so near to each other, in bars, and with so much evidence, may be a hole; so far
-# around, strands tell where it ends.
+# Missing strands may be a hole if this near to each other, in bars, and with this much evidence;
+# strands within the last distance determine its edge.
 _NEAR, _LEAST_NEAR, _AROUND = 1.5, 9.0, 6.5
 # Discs no farther apart than this are one hole, in bars.
 _TOUCH = 1.2
-# A frame's foot is kept for every so many bars that the vehicle moves.
+# Motion of the vehicle, in bars, between the frames whose foot is kept.
 _LOOK = 0.2
 # Cells farther from the vehicle than this are settled, in metres.
 _SETTLED = 2.0
@@ -67,8 +67,8 @@ class Hole:
     frame, time_s : int, float
         Of the look nearest to its middle.
     from_foot : array, shape (2,)
-        Where its middle was then, right and up of the vehicle's foot on the net (of the
-        perpendicular from the dome's centre), in metres.
+        Its middle at that time, right and up of the vehicle's foot on the net (of the perpendicular
+        from the dome's centre), in metres.
     n_looks : int
         Looks through it.
     """
@@ -108,7 +108,7 @@ class HoleMap:
 
     @property
     def area(self) -> float:
-        """Area of the meshes that were looked at, in square metres."""
+        """Area of the meshes that were searched, in square metres."""
         return (self._settled_meshes + len(self._meshes)) * self._mesh**2
 
     def add(
@@ -121,18 +121,18 @@ class HoleMap:
         lattice : NetLattice
             Of the stretch.
         view : NetView
-            What the frame shows.
+            Dashes and gaps of the frame.
         knot : array, shape (2,)
-            Where the lattice lies in `net` (`Shift.place`), in metres.
+            Place of the lattice in `net` (`Shift.place`), in metres.
         place : array, shape (2,)
-            Where the origin of `net` lies on the map, in metres.
+            Place of the origin of `net` on the map, in metres.
         piece : int
             As `NetTrack.piece`: a new piece starts a new map.
         """
         if self._bar == 0.0:
             self._bar, self._mesh = lattice.bar, float(np.sqrt(opening_area(lattice)))
         if piece != self._piece:
-            # What the vehicle lost its way in may be a hole.
+            # The area in which the track was lost may be a hole.
             self.update(lattice)
             self._start_over(piece)
         self._last = place.copy()
@@ -142,14 +142,14 @@ class HoleMap:
         self._feet.setdefault((int(column), int(row)), (view.index, view.time_s, place.copy()))
 
     def update(self, lattice: NetLattice) -> None:
-        """Find the holes in what was added so far; earlier finds are corrected."""
+        """Find the holes in the looks so far; earlier holes are corrected."""
         if not self._waiting:
             return
         self._merge()
         fresh = self._find(lattice)
         live = [hole for hole in self.holes if hole.piece == self._piece and self._near(hole)]
         settled = [hole for hole in self.holes if not any(hole is one for one in live)]
-        # A hole that the vehicle comes back to is the same one.
+        # A hole to which the vehicle comes back is the same one.
         self.holes = [one for one in settled if not any(_same(one, hole) for hole in fresh)] + fresh
         self._settle()
 
@@ -182,7 +182,7 @@ class HoleMap:
         self._meshes = np.unique(np.concatenate([self._meshes, column + _ROW * row]))
 
     def _near(self, hole: Hole) -> bool:
-        """Whether a hole lies where the map is still open."""
+        """Return whether a hole lies in the part of the map that is not settled."""
         if self._last is None:
             return False
         return bool(np.abs(hole.place - self._last).max() < _SETTLED)
@@ -199,10 +199,10 @@ class HoleMap:
             low, high = seeds.min(axis=0) - _AROUND * bar, seeds.max(axis=0) + _AROUND * bar
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
-            # Of a hole that another group is in, a part only may lie in these surroundings.
+            # Only a part of a hole of another group may lie in these surroundings.
             discs = [one for one in discs if _holds_any(one, seeds)]
             for disc in discs:
-                # Another group has this hole in its surroundings as well.
+                # Another group also has this hole in its surroundings.
                 left[np.hypot(*(places - disc.middle).T) < disc.radius + RIM * bar] = 0.0
             discs = [disc for disc in discs if self._looks.stays_dark(disc.middle, disc.radius)]
             found += [
@@ -214,7 +214,7 @@ class HoleMap:
     def _hole(
         self, lattice: NetLattice, discs: list[Disc], places: FloatArray, weights: FloatArray
     ) -> Hole:
-        """Put the discs of a hole together."""
+        """Make a hole from its discs."""
         middle, extent, area = _outline(discs)
         nearest = min(self._feet.values(), key=lambda foot: float(np.hypot(*(foot[2] - middle))))
         diameter = float(np.sqrt(4.0 * area / np.pi))
@@ -237,7 +237,7 @@ class HoleMap:
         )
 
     def _settle(self) -> None:
-        """Forget cells that the vehicle has left behind."""
+        """Drop cells far behind the vehicle."""
         if self._last is None or not len(self._looks.keys):
             return
         close = np.abs(self._looks.places - self._last).max(axis=1) < _SETTLED
@@ -255,7 +255,7 @@ class HoleMap:
 
 
 def opening_area(lattice: NetLattice) -> float:
-    """Area of one opening, from strand to strand, in square metres."""
+    """Return the area of one opening, from strand to strand, in square metres."""
     if lattice.mesh is Mesh.SIX_SIDED:
         return float(1.5 * np.sqrt(3.0) * lattice.bar**2)
     a, b = lattice.waves
@@ -280,12 +280,12 @@ def _groups(places: FloatArray, reach: float) -> list[IntArray]:
 
 
 def _holds_any(disc: Disc, places: FloatArray) -> bool:
-    """Whether some of the places (n, 2) are in a disc."""
+    """Return whether some of the places (n, 2) are in a disc."""
     return bool(np.any(np.hypot(*(places - disc.middle).T) < disc.radius))
 
 
 def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
-    """Put discs that touch together."""
+    """Group discs that touch."""
     groups: list[list[Disc]] = []
     for disc in discs:
         mine = [
@@ -302,7 +302,7 @@ def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
 
 
 def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], float]:
-    """Middle (2,), width and height, and area that discs cover together."""
+    """Return the middle (2,), width and height, and area of the union of discs."""
     middles, radii = np.array([d.middle for d in discs]), np.array([d.radius for d in discs])
     low = (middles - radii[:, None]).min(axis=0)
     high = (middles + radii[:, None]).max(axis=0)
@@ -317,7 +317,7 @@ def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], fl
 
 
 def _same(one: Hole, other: Hole) -> bool:
-    """Whether two holes on one map overlap by half."""
+    """Return whether two holes on one map overlap by half."""
     apart = float(np.hypot(*(one.place - other.place)))
     return one.piece == other.piece and apart < 0.25 * (one.diameter + other.diameter)
 

@@ -1,10 +1,10 @@
-"""The lattice of a net: how far apart its strands are and which way they run.
+"""The lattice of a net: spacing and directions of its strands, and the track along the net.
 
-Where the net's lattice lies in every frame, and so how the vehicle moved along the net.
-
-A lattice fixes the place of the net but for whole meshes; which one is taken follows from how the
-vehicle moved before (a Kalman filter with constant velocity). So the move from frame to frame must
-be foreseen to better than half a mesh: say how fast the vehicle goes where another sensor knows it.
+`find_lattice` fits the lattice to the crossings of some frames. `LatticeFitter` finds its place in
+each frame, and `NetTrack` follows the vehicle's motion along the net from these places. A lattice
+fixes the place of the net only up to whole meshes; the right one is chosen from the motion so far
+(a Kalman filter with constant velocity). So the motion from frame to frame must be predicted to
+better than half a mesh: pass the vehicle's velocity where another sensor measures it.
 """
 
 from collections.abc import Sequence
@@ -28,20 +28,20 @@ from aqualvs.nets.spectrum import (
 )
 from aqualvs.nets.spectrum_kernels import wave_sums
 
-# Frames that a lattice is fitted to, and among them those in which it is searched for.
+# Number of frames for the fit of a lattice, and of those among them for the search.
 _MOST_FRAMES, _SEARCHED_FRAMES = 30, 12
-# Likely lattices that are refined roughly, and the best of them well, before they are compared.
+# Number of likely lattices that are refined roughly, and of the best that are refined well.
 _FOLLOWED, _COMPARED = 12, 4
 _FIRST_ROUNDS, _ROUNDS, _LAST_ROUNDS = 2, 5, 7
-# Fewer crossings in a frame say nothing.
+# Least crossings of a usable frame.
 _LEAST_CROSSINGS = 5
-# Lattices with less log-likelihood per frame may as well be chance.
+# Least log-likelihood per frame of a lattice; less may be chance.
 _LEAST_SCORE = 0.3
-# The best lattice leads by as much before those with another length of bar.
+# Least lead of the best lattice over those with another bar length.
 _LEAST_LEAD, _SAME_BAR = 0.2, 0.06
-# The lattice of the frames before holds on with this share of its score, turned by so many degrees.
+# The previous lattice is kept with this share of its score, turned by up to this many degrees.
 _AS_BEFORE, _TURNS = 0.6, (0.0, -4.0, 4.0)
-# Parts of the frames whose bars are compared, and what the search itself adds, as a share.
+# Number of parts of the frames whose bars are compared, and the relative error of the search.
 _BLOCKS, _SEARCH_ERROR = 4, 0.005
 
 
@@ -62,7 +62,7 @@ class NetLattice:
     score : float
         Log-likelihood per frame over crossings at random.
     density : array, shape (F,)
-        Share of each family's lines that is really there: 1, or 1/3 for the bars of hexagons.
+        Share of each family's lines that exists: 1, or 1/3 for the bars of hexagons.
     """
 
     mesh: Mesh
@@ -96,21 +96,21 @@ class NetLattice:
         return np.mod(np.arctan2(self.waves[:, 1], self.waves[:, 0]) + 0.5 * np.pi, np.pi)
 
     def crossings_per_metre(self, direction: FloatArray) -> float:
-        """Crossings that a line of unit direction (2,) has with strands."""
+        """Return the crossings per metre of a line of unit direction (2,) with strands."""
         return float(np.abs(self.waves @ direction) @ self.density)
 
 
 def find_lattice(
     frames: Sequence[Crossings], before: NetLattice | None = None
 ) -> NetLattice | None:
-    """Find the lattice of the net that some frames show, or None where there is none to be seen.
+    """Find the lattice of the net in some frames, or None where none is visible.
 
     Parameters
     ----------
     frames : sequence of Crossings
         The net may have moved between them in its plane, but not turned.
     before : NetLattice, optional
-        What neighbouring frames showed; looked for first.
+        Lattice of neighbouring frames; tried first.
     """
     chosen = _choose(frames)
     if not chosen:
@@ -120,7 +120,7 @@ def find_lattice(
     if best is None:
         best = _searched(Spectrum.of(_spread(chosen, _SEARCHED_FRAMES)))
         best = best and refine(best, spectrum, _LAST_ROUNDS)
-    # What few frames show by chance all of them do not.
+    # A chance result of a few frames is not confirmed by all of them.
     if best is None or best.score < _LEAST_SCORE:
         return None
     return _lattice(best, _sigma(best, chosen))
@@ -140,7 +140,7 @@ def _searched(spectrum: Spectrum) -> Hypothesis | None:
 
 
 def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
-    """Return the lattice seen before, where it explains these frames nearly as well."""
+    """Return the previous lattice, if it explains these frames nearly as well."""
     enough = max(_LEAST_SCORE, _AS_BEFORE * before.score)
     for angle in np.deg2rad(_TURNS):
         found = refine(Hypothesis(before.mesh, before.basis @ turned(angle).T), spectrum, 3)
@@ -150,13 +150,13 @@ def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
 
 
 def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
-    """Return some frames, evenly spread, of those with enough crossings to tell anything."""
+    """Return some frames, evenly spread, of those with enough crossings."""
     useful = [one for one in frames if len(one.place) >= _LEAST_CROSSINGS]
     return _spread(useful, _MOST_FRAMES)
 
 
 def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
-    """Return so many frames at most, evenly spread."""
+    """Return at most `most` frames, evenly spread."""
     if len(frames) <= most:
         return list(frames)
     index = np.linspace(0, len(frames) - 1, most).round().astype(int)
@@ -164,7 +164,7 @@ def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
 
 
 def _sigma(best: Hypothesis, frames: Sequence[Crossings]) -> float:
-    """Return the standard deviation of the bar: how far the quarters of the frames differ."""
+    """Return the standard deviation of the bar, from the differences of parts of the frames."""
     size = bar_of(best)
     blocks = [b for b in np.array_split(np.arange(len(frames)), _BLOCKS) if len(b)]
     if len(blocks) < 2:
@@ -187,46 +187,46 @@ def _lattice(best: Hypothesis, sigma_bar: float) -> NetLattice:
     )
 
 
-# Harmonics of each family's wave; the strands' spacing leaves this share of each amplitude.
+# Harmonics of each family's wave; irregular spacing reduces each amplitude to this share.
 _HARMONICS, _REGULAR = 3, 0.92
-# Shifts by up to so many cells to each side are tried, in so many steps: the cell around what is
-# expected, whatever its shape.
+# Shifts by up to this many cells to each side are tried, in this many steps: they cover the cell
+# around the expected place, whatever its shape.
 _REACH, _TRIED = 0.75, 18
-# Matched filter: as a share of what perfect crossings would give, and in deviations of random ones.
+# Least match: as a share of that of perfect crossings, and in deviations of random ones.
 _LEAST_SHARE, _LEAST_DEVIATIONS = 0.4, 3.0
 _TRACK_LEAST_CROSSINGS = 4
-# Newton's steps to the best shift, and what holds it where the crossings do not say (1/m²).
+# Newton's steps to the best shift, and its regularisation in undetermined directions (1/m²).
 _TRACK_ROUNDS, _STIFF = 4, 100.0
 # Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and the
-# foot of the perpendicular on the net in one frame (m): the posture trembles.
+# foot of the perpendicular on the net in one frame (m), by noise of the posture.
 _VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
 # Velocities at which a piece of track may begin (m/s): greatest, step, standard deviation before
-# and after it was found; and from so many frames at least.
+# and after it is found; and the least number of frames.
 _FASTEST, _STEP, _USUAL, _FOUND = 0.45, 0.0125, 0.2, 0.04
 _LEAST_FRAMES = 4
-# By a whole mesh in every frame the net may move faster and look the same: the slowest velocity
-# with this share of the best match is taken, and the best one so near to it (m/s).
+# Velocities that differ by a whole mesh per frame look the same: the slowest one with this share of
+# the best match is taken, and then the best one within this distance of it (m/s).
 _AS_GOOD, _SAME_VELOCITY = 0.9, 0.05
-# How well such a beginning knows the place, in metres.
+# Standard deviation of the place at such a start, in metres.
 _PLACE = 2e-3
-# Where the place is not known to this any more, in metres, a new piece of track begins; after so
-# many seconds the velocity counts for nothing either.
+# A new piece of track begins where the standard deviation of the place exceeds this, in metres;
+# after this many seconds the velocity is discarded as well.
 _LOST, _FORGOTTEN = 0.05, 3.0
 
 START_FRAMES, START_S = 8, 0.5
-"""A track begins with so many frames, within so many seconds."""
+"""Number of frames for the start of a track, and the seconds within which they lie."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How a frame's dashes lie on the lattice.
+    """Assignment of a frame's dashes to strands of the lattice.
 
     Attributes
     ----------
     family : int array, shape (N,)
         Family whose strand is nearest to each dash.
     strand : int array, shape (N,)
-        Number of that strand.
+        Index of that strand.
     off : array, shape (N,)
         Distance of the dash from it, in metres.
     clear : array, shape (N,)
@@ -240,19 +240,19 @@ class Fit:
 
     @property
     def n_strands(self) -> int:
-        """Strands that the frame shows."""
+        """Number of strands in the frame."""
         return len(np.unique(np.stack([self.family, self.strand]), axis=1).T)
 
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """Where the lattice lies in one frame.
+    """Place of the lattice in one frame, with its information.
 
     Attributes
     ----------
     place : array, shape (2,)
-        Of a knot (four-sided) or the middle of an opening (six-sided) in `net`, in metres; any
-        other one would serve as well.
+        Of a knot (four-sided) or the middle of an opening (six-sided) in `net`, in metres; all
+        knots or openings are equivalent.
     information : array, shape (2, 2)
         Inverse of its covariance; may be singular.
     """
@@ -263,12 +263,12 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How some frames, one after another, lie on a lattice.
+    """Start of a track: place and velocity common to some consecutive frames.
 
     Attributes
     ----------
     place : array, shape (2,)
-        Where the lattice lies in the first, as `Shift.place`.
+        Place of the lattice in the first frame, as `Shift.place`.
     velocity : array, shape (2,)
         Of the vehicle along the net, in m/s.
     """
@@ -278,7 +278,7 @@ class Start:
 
 
 class LatticeFitter:
-    """Lays a lattice onto frames.
+    """Fitter of the place of a lattice in frames.
 
     Parameters
     ----------
@@ -299,16 +299,16 @@ class LatticeFitter:
         expected: FloatArray | None = None,
         precision: FloatArray | None = None,
     ) -> Shift | None:
-        """Find where the lattice lies in a frame; None where its crossings do not show it.
+        """Find the place of the lattice in a frame; None if its crossings do not determine it.
 
         Parameters
         ----------
         crossings : Crossings
             Of the frame.
         expected : array, shape (2,), optional
-            Where the lattice is expected; one shift of many alike is chosen by it.
+            Expected place of the lattice; it selects one of many equivalent shifts.
         precision : array, shape (2, 2), optional
-            How well that is known: inverse of its covariance.
+            Inverse of the covariance of the expected place.
         """
         if len(crossings.place) < _TRACK_LEAST_CROSSINGS:
             return None
@@ -329,10 +329,10 @@ class LatticeFitter:
         return Shift(place, information)
 
     def start(self, crossings: Sequence[Crossings], times_s: FloatArray) -> Start | None:
-        """Find place and velocity that some frames have in common; None where they are too few.
+        """Find the place and velocity common to some frames; None where they are too few.
 
-        A single frame may lie askew, and from frame to frame the net may move by nearly half a
-        mesh: together they tell the one from the other.
+        A single frame may be off, and from frame to frame the net may move by nearly half a mesh:
+        several frames together separate the two.
 
         Parameters
         ----------
@@ -364,7 +364,7 @@ class LatticeFitter:
     def _about(
         self, sums: NDArray[np.complex128], place: FloatArray
     ) -> tuple[float, FloatArray, FloatArray]:
-        """Match at a shift; slope (2,) and information (2, 2) of the log-likelihood there."""
+        """Return the match at a shift, and slope (2,) and information (2, 2) of its likelihood."""
         swung = sums * np.exp(-2j * np.pi * (self._waves @ place))
         slope = 4.0 * np.pi * (swung.imag @ self._waves)
         bend = np.maximum(swung.real, 0.0)
@@ -372,7 +372,7 @@ class LatticeFitter:
         return float(swung.real.sum()), slope, information
 
     def assign(self, dashes: Dashes, place: FloatArray) -> Fit:
-        """Give each dash to the nearest strand, the lattice lying at a place (2,)."""
+        """Assign each dash to the nearest strand of the lattice at a place (2,)."""
         lattice = self.lattice
         turns = (dashes.place - place) @ lattice.waves.T
         distance = np.abs(turns - np.rint(turns)) * lattice.pitch
@@ -404,7 +404,7 @@ def _sums(crossings: Crossings, waves: FloatArray) -> NDArray[np.complex128]:
 
 
 def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Plane waves that a lattice is made of, about a knot or the middle of a six-sided opening.
+    """Return the plane waves of a lattice, about a knot or the middle of a six-sided opening.
 
     Returns
     -------
@@ -421,11 +421,11 @@ def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
         number = np.arange(1.0, _HARMONICS + 1.0)
         waves = np.concatenate([number[:, None] * basis[0], number[:, None] * basis[1]])
         return waves, 0.5 * np.tile(_REGULAR**number, 2), step
-    # The shells of the reciprocal lattice; of a wave and its mirror one.
+    # The shells of the reciprocal lattice; one of each wave and its mirror.
     first = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
     second = np.array([[1.0, 1.0], [2.0, -1.0], [1.0, -2.0]])
     waves = np.concatenate([first, second, 2.0 * first, 2.0 * second]) @ basis
-    # Bars stand half way between middles, square to the way from one to the other.
+    # Bars lie half way between middles, perpendicular to the line that connects them.
     ways = np.array([step[0], step[1], step[0] + step[1]])
     bars = np.stack([-ways[:, 1], ways[:, 0]], axis=1) / np.sqrt(3.0)
     each = np.cos(np.pi * waves @ ways.T) * np.sinc(waves @ bars.T)
@@ -437,25 +437,24 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _at_first() -> FloatArray:
-    """Covariance of place and velocity where a piece of track begins."""
+    """Return the covariance of place and velocity where a piece of track begins."""
     return np.diag([_FOOT**2, _FOOT**2, _VELOCITY**2, _VELOCITY**2])
 
 
 @dataclass(slots=True)
 class NetTrack:
-    """Keeps count of how far the net has moved past the vehicle.
+    """Tracker of the vehicle's motion along the net.
 
     Attributes
     ----------
     place : array, shape (2,)
-        Where the vehicle's foot on the net is now on the net itself: right and up of where it was
-        at first, in metres.
+        Current place of the vehicle's foot on the net: right and up of the first one, in metres.
     velocity : array, shape (2,)
         Metres a second.
     path : float
-        Metres passed in all.
+        Length of the track, in metres.
     piece : int
-        Counts up whenever the track was lost: places of different pieces have nothing in common.
+        Incremented whenever the track is lost: places of different pieces are not related.
     """
 
     path: float = 0.0
@@ -477,7 +476,7 @@ class NetTrack:
         return self._state[2:].copy()
 
     def begins(self, time_s: float) -> bool:
-        """Whether nothing is known of place and velocity at a time."""
+        """Return whether place and velocity are unknown at a time."""
         return self._origin is None or time_s - self._time_s > _FORGOTTEN
 
     def step(
@@ -488,7 +487,7 @@ class NetTrack:
         velocity: FloatArray | None = None,
         start: Start | None = None,
     ) -> Shift | None:
-        """Take the next frame; None where it does not tell where the net lies.
+        """Add the next frame; return None where it does not determine the place of the net.
 
         Parameters
         ----------
@@ -499,9 +498,9 @@ class NetTrack:
         time_s : float
             Of the frame.
         velocity : array, shape (2,), optional
-            Of the vehicle along the net, right and up, if another sensor knows it.
+            Of the vehicle along the net, right and up, if another sensor measures it.
         start : Start, optional
-            What this frame and the next have in common, where the track begins.
+            Place and velocity common to this frame and the next, where the track begins.
         """
         state, covariance = self._ahead(time_s, velocity)
         if self._origin is None or covariance[:2, :2].trace() > _LOST**2:
@@ -509,7 +508,7 @@ class NetTrack:
         if self._lattice is not fitter.lattice:
             shift = fitter.shift(crossings)
             if shift is not None:
-                # The same net, measured anew: it lies where it is expected.
+                # The same net with a new estimate of its lattice: it lies at the expected place.
                 self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
                 self._take(state, covariance, time_s)
             return shift
@@ -524,7 +523,7 @@ class NetTrack:
         return shift
 
     def _ahead(self, time_s: float, velocity: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """State and covariance at a later time."""
+        """Return the state and covariance at a later time."""
         dt = time_s - self._time_s
         state, covariance = self._state.copy(), self._covariance.copy()
         if velocity is not None:
@@ -544,7 +543,7 @@ class NetTrack:
         state: FloatArray,
         start: Start | None,
     ) -> Shift | None:
-        """Begin a piece of track, at the state to be expected if the one before is not long ago."""
+        """Begin a piece of track, from the predicted state if the last piece ended recently."""
         if start is None:
             shift = fitter.shift(crossings)
         else:

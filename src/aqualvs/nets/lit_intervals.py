@@ -1,8 +1,8 @@
-"""What each laser shows of a net in one frame: where its line across it is lit, and where dark.
+"""Lit intervals: the lit, dark and hidden parts of each laser's line across the net in one frame.
 
 A laser sheet cuts the target plane in a line. Every search line of the detector looks at one place
-of it, so a frame gives one signal per laser: dark, lit (a strand crosses there), or hidden, where
-nobody could tell.
+of it, so a frame gives one signal per laser: dark, lit (a strand crosses there), or hidden (not
+observable).
 """
 
 from dataclasses import dataclass
@@ -23,25 +23,25 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 
-# Light farther off the net's plane than this share of the range is not on the net.
+# Largest distance of light on the net from its plane, as a share of the range.
 _OFF_PLANE = 0.05
 # A line across the net is followed this far to each side, in ranges.
 _REACH = 1.3
 _SAMPLES = 129
-# A sheet whose plane is parallel to the net but for this sine has no line on it.
+# Least sine of the angle between sheet and net for a line on the net.
 _LEAST_SLOPE = 1e-3
-# The detector needs dark flanks: next to the border nothing can stand out.
+# The detector needs dark flanks: no stripe is found next to the border.
 _BORDER_PX = 16.0
-# Near another laser's line the two stripes disturb each other: so many widths and pixels.
+# Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
 _CROSSING_WIDTHS, _CROSSING_PX = 1.5, 4.0
-# Directions on the net are told from places that are so far apart in the picture.
+# Distance in the picture of the places that determine directions on the net.
 _AHEAD_PX = 30.0
 # Width of a stripe where none was measured, in pixels.
 _USUAL_WIDTH_PX = 5.0
 
 
 class LineState(IntEnum):
-    """What one search line says about the net."""
+    """State of the net at one search line."""
 
     HIDDEN = 0
     """Nothing: outside the picture, in a crossing zone, behind something."""
@@ -53,7 +53,7 @@ class LineState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class NetSignal:
-    """What the lasers show of the net in one frame; L lasers, J search lines (padded).
+    """Signals of the net along the lasers' lines in one frame; L lasers, J search lines (padded).
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class NetSignal:
         Place on the laser's line in metres, ascending or descending; NaN where a search line
         does not meet it.
     step : float array, shape (L, J)
-        Length of laser line that a search line stands for, in metres.
+        Length of laser line per search line, in metres.
     state : uint8 array, shape (L, J)
         `LineState` values.
     height : array, shape (L, J)
@@ -81,7 +81,7 @@ class NetSignal:
     width : array, shape (L, J)
         Full width at half height of the stripe, in metres on the net, where lit, else zero.
     beyond : bool array, shape (L, J)
-        Where the light of a search line is seen on something behind the net.
+        Whether the light of a search line is seen on something behind the net.
     """
 
     index: int
@@ -117,14 +117,14 @@ def net_from_dome(normal_in_dome: FloatArray, distance: float) -> SE3:
 
 
 class NetReader:
-    """Reads scans as signals along the lasers' lines.
+    """Reader of scans as signals along the lasers' lines.
 
     Parameters
     ----------
     rig : Rig
-        Camera and lasers that the scans were made with.
+        Camera and lasers of the scans.
     camera : Camera, optional
-        In place of `rig.camera()`.
+        Replaces `rig.camera()`.
     """
 
     def __init__(self, rig: Rig, camera: Camera | None = None) -> None:
@@ -140,7 +140,7 @@ class NetReader:
         self._lowest, self._highest = self._bands()
 
     def _bands(self) -> tuple[FloatArray, FloatArray]:
-        """First and last position (L, J) at which a stripe stands out on each search line."""
+        """Return the first and last position (L, J) of a detectable stripe on each search line."""
         lowest = np.full((len(self._searches), self.n_lines), np.inf)
         highest = np.full(lowest.shape, -np.inf)
         for i, search in enumerate(self._searches):
@@ -210,13 +210,13 @@ class NetReader:
         lit = laser[on_net], row[on_net]
         np.maximum.at(height, lit, points.intensity[on_net])
         np.maximum.at(width, lit, (points.width * px)[on_net])
-        # The lasers stand beside the dome, where their sheets pass its centre.
+        # The lasers are beside the dome, where their sheets are nearest to its centre.
         sources = net.apply(np.array([one.normal * one.offset for one in self._planes]))
         eye = net.apply(self.rig.dome_from_cam.translation)
         hidden = hidden_lines(
             points, in_net, row, position, self._line_px, eye, sources, lines, off
         ) | self._near_crossings(lines, width, distance)
-        # Where the net leaves its plane nothing is known of the plane.
+        # Where the net leaves its plane, the state of the plane is not known.
         hidden[laser[folded], row[folded]] = True
         with np.errstate(invalid="ignore"):
             seen = (lines.position > self._lowest) & (lines.position < self._highest) & ~hidden
@@ -255,7 +255,7 @@ class NetReader:
         return directions
 
     def _near_crossings(self, lines: LaserLines, width: FloatArray, distance: float) -> BoolArray:
-        """Mark what lies near another laser's line."""
+        """Mark the places near another laser's line."""
         px = distance / self.rig.focal_px
         wide = np.array([_typical(row, _USUAL_WIDTH_PX * px) for row in width])
         margin = _CROSSING_WIDTHS * np.maximum(wide[:, None], wide) + _CROSSING_PX * px
@@ -278,7 +278,7 @@ def _line_on(sheet: Plane, net: SE3) -> tuple[FloatArray, FloatArray]:
 
 
 def _onto_sheet(points: FloatArray, sheet: Sheet, dome_from_net: SE3) -> FloatArray:
-    """Slide points in the net's plane onto a bent sheet."""
+    """Move points in the net's plane onto a bent sheet."""
     if sheet.is_plane:
         return points
     normal = dome_from_net.rotation[:, 2]

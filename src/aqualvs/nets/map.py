@@ -1,4 +1,4 @@
-"""A picture of the net wall, unrolled: fouling by colour, holes to scale, the vehicle's way.
+"""A picture of the net wall, unrolled: fouling by colour, holes to scale, the vehicle's track.
 
 Drawn without a display; Matplotlib is loaded only when a map is drawn.
 """
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 _DPI = 160
 _WIDTH_IN, _PANEL_IN = 11.0, 9.0
 _ROW_GAP_IN, _AROUND_IN = 0.5, 1.0
-# A net that was passed up or down makes a narrower picture, not one as long as a towel.
+# Greatest height and least width, in inches: a net passed up or down makes a narrower picture.
 _TALLEST_IN, _NARROWEST_IN = 8.0, 6.5
-# The wall is cut into rows until a row is at least so high for its width, or there are so many.
+# The wall is cut into rows until a row is at least this high for its width, or up to this number.
 _LEAST_RATIO, _MOST_ROWS = 0.13, 8
 _MARGIN = 0.09
-# Runs through all kinds of colour vision alike, from dark blue (clean) to yellow.
+# Looks alike in all kinds of colour vision, from dark blue (clean) to yellow.
 _COLOURS = "cividis"
 _LEAST_SCALE, _SCALE_STEP = 0.1, 0.05
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
 _INK, _SEA = "#1c2a33", "#f4f7f8"
-# A bearing that changes less belongs into the title, in degrees.
+# A bearing that changes less than this, in degrees, is given in the title.
 _ONE_BEARING = 4.0
-# The vehicle's way is drawn thinner where there are more stretches.
+# The vehicle's track is drawn thinner if there are more stretches than this.
 _MANY, _THIN, _THICK = 40, 0.6, 1.2
 # Height of the scale of colours on a small map.
 _BAR_IN = 2.4
@@ -60,14 +60,14 @@ def draw_map(wall: NetWall, paths: Sequence[Path]) -> None:
     Parameters
     ----------
     wall : NetWall
-        What to draw; without a stretch the picture says so.
+        Net to draw; without a stretch the picture says so.
     paths : sequence of Path
-        Files to write; the suffix (`.png`, `.svg`, `.pdf`) tells how.
+        Files to write; the suffix (`.png`, `.svg`, `.pdf`) selects the format.
 
     Raises
     ------
     OSError
-        As the system says it.
+        If a file cannot be written.
     """
     import matplotlib as mpl
 
@@ -114,7 +114,7 @@ def _figure(wall: NetWall) -> "Figure":
 
 
 def _extent(wall: NetWall) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of all that is drawn, with a margin."""
+    """Return the corners of the drawing, with a margin."""
     corners = np.concatenate([*wall.outlines, *wall.path])
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = _MARGIN * (high - low)
@@ -124,7 +124,7 @@ def _extent(wall: NetWall) -> tuple[FloatArray, FloatArray]:
 
 
 def _rows(size: FloatArray) -> int:
-    """Return into how many rows a wall is cut, so that the rows are no thin lines."""
+    """Return the number of rows that a wall is cut into, so that no row is a thin line."""
     return min(max(math.ceil(_LEAST_RATIO * float(size[0] / size[1])), 1), _MOST_ROWS)
 
 
@@ -142,7 +142,7 @@ def _draw(axes: "Axes", wall: NetWall, shades: "ScalarMappable") -> None:
     from matplotlib.patches import Ellipse, Polygon
 
     axes.set_facecolor(_SEA)
-    # Where stretches overlap, the one that rests on more frames is seen.
+    # Where stretches overlap, the one with more frames is on top.
     pairs = zip(wall.stretches, wall.outlines, strict=True)
     for stretch, outline in sorted(pairs, key=lambda pair: pair[0].n_frames):
         fouling = fouling_of(stretch)
@@ -210,7 +210,7 @@ def _label_holes(axes: "Axes", wall: NetWall) -> None:
 
 
 def _to_the_edge(band: FloatArray, middle: FloatArray, sign: float) -> float:
-    """Return how far the edge of a band is above (sign 1) or below (-1) a place in it."""
+    """Return the distance of the edge of a band above (sign 1) or below (-1) a place in it."""
     begin, end = band, np.roll(band, -1, axis=0)
     spans = (begin[:, 0] - middle[0]) * (end[:, 0] - middle[0]) < 0.0
     share = (middle[0] - begin[spans, 0]) / (end[spans, 0] - begin[spans, 0])

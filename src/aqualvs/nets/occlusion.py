@@ -1,7 +1,7 @@
-"""What things before a net hide of it: from the camera, and from the lasers' light.
+"""Occlusion of the net by objects before it: from the camera, and from the lasers' light.
 
-Only the stripes on a thing are seen, not its outline; it is taken to be half as wide as they are
-long. Too much hidden costs looks at the net, too little would make holes of fish.
+Only the stripes on an object are seen, not its outline; it is taken to be half as wide as they are
+long. Too large an occlusion costs looks at the net, too small a one would turn fish into holes.
 """
 
 from dataclasses import dataclass
@@ -12,26 +12,27 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.scan import Label, ScanPoints
 
-# Labels of things, at the net's plane or before it; clutter at the plane may be the net's own. A
-# point that several lasers could have made may be none.
+# Labels of objects, at the net's plane or before it; clutter at the plane may be part of the net.
+# Ambiguous points are left out: they may be wrong.
 _THINGS = (Label.SOLID, Label.FISH, Label.BUBBLE)
-# Light of less quality (the root of its height, as a share of the frame's best, and its likelihood)
-# is too likely no laser's to hide the net: in a hole nothing else lights up, and it would keep the
-# hole from being looked at. Half as high as the best, that is a likelihood of 0.18.
+# Least quality of light (the root of its height, as a share of the frame's best, and its
+# likelihood) that hides the net: weaker light is probably not laser light, and in a hole, where
+# there is no other light, it would prevent looks at the hole. At half the best height, this is a
+# likelihood of 0.18.
 _LEAST_QUALITY = 0.3
-# Pieces of light are on one thing where no more than so many search lines are between them, and
-# no more than so many pixels along these, and as many more for each. One with this much light is no
+# Pieces of light are on one object if at most this many search lines are between them, and at most
+# this many pixels along these, plus as many for each line. An object with this much light is not a
 # bubble or speck.
 _BETWEEN_LINES, _BETWEEN_PX, _SLOPE_PX, _LARGE_LINES = 8, 3.0, 1.0, 40
-# How far a small thing reaches beside its light: pixels, and a share of its length.
+# Extent of a small object beside its light: pixels, and a share of its length.
 _BESIDE_PX, _BESIDE = 8.0, 0.3
-# The same for a large thing, seen on the net: share of its light's length.
+# The same for a large object, projected on the net: share of its light's length.
 _HALF_WIDE = 0.5
-# A shadow is longer than the light on what throws it.
+# A shadow is longer than the light on its object.
 _SHADOW_SHARE, _SHADOW = 0.2, 5e-3
-# So many places along the light on a large thing stand for it.
+# Number of places along the light on a large object that represent it.
 _FEW = 12
-# Search lines to each side of light beyond the net that it stands for.
+# Search lines to each side of light beyond the net that it represents.
 _SPREAD_LINES = 2
 
 
@@ -44,8 +45,8 @@ class LaserLines:
     origin, direction : array, shape (L, 2)
         A place on every line in `net` and its unit direction.
     along, position, step : array, shape (L, J)
-        Where each search line looks: metres along the laser's line, pixels along the search line,
-        and metres of laser line that it stands for.
+        Place of each search line: metres along the laser's line, pixels along the search line, and
+        metres of laser line per search line.
     """
 
     origin: FloatArray
@@ -66,21 +67,21 @@ def hidden_lines(
     lines: LaserLines,
     off: float,
 ) -> BoolArray:
-    """Mark where things before the net hide it from the camera, or from the light.
+    """Mark where objects before the net hide it from the camera, or from the light.
 
-    Bubbles and specks hide what they cover in the picture; larger things what is behind them as
-    the camera sees it, and what they keep their own laser's light from.
+    Bubbles and specks hide the area that they cover in the picture; larger objects hide the net
+    behind them as the camera sees it, and the net in their own laser's shadow.
 
     Parameters
     ----------
     points : ScanPoints
-        N of them; what is labelled as on the net is never before it.
+        N of them; points labelled as on the net are never before it.
     in_net : array, shape (N, 3)
         Their places in `net`; z is the distance before the net.
     row : int array, shape (N,)
         Their search lines.
     position : array, shape (N,)
-        Where they are along their search lines, in pixels.
+        Their positions along their search lines, in pixels.
     line_px : int array, shape (L,)
         Pixels across each laser's search lines.
     eye : array, shape (3,)
@@ -127,7 +128,7 @@ def hidden_lines(
 def light_beyond(
     points: ScanPoints, in_net: FloatArray, sources: FloatArray, lines: LaserLines, off: float
 ) -> BoolArray:
-    """Mark where light went through the net: it is seen on something behind.
+    """Mark where light passed through the net and is seen on something behind it.
 
     Parameters
     ----------
@@ -164,10 +165,10 @@ def light_beyond(
 
 @kernel
 def _chain(laser: IntArray, row: IntArray, position: FloatArray) -> IntArray:
-    """Tell the things apart, by number, that pieces of light sorted by search line are on."""
+    """Return the number of the object that each piece of light is on, sorted by search line."""
     n = len(row)
     thing = np.empty(n, np.int64)
-    # Last piece of every chain that may go on.
+    # Last piece of every chain that may continue.
     ends = np.empty(n, np.int64)
     n_ends, n_things = 0, 0
     for k in range(n):
@@ -210,7 +211,7 @@ def _hide(
     expected: FloatArray,
     hidden: BoolArray,
 ) -> None:
-    """Mark what things hide; their light is sorted by thing and search line."""
+    """Mark the places hidden by objects; their light is sorted by object and search line."""
     first = 0
     n = len(thing)
     for k in range(1, n + 1):
@@ -231,7 +232,7 @@ def _hide(
 def _hide_beside(
     row: IntArray, position: FloatArray, line_px: int, expected: FloatArray, hidden: BoolArray
 ) -> None:
-    """Mark where a laser's line passes, in the picture, beside its light on a small thing."""
+    """Mark where a laser's line passes, in the picture, beside its light on a small object."""
     reach = _BESIDE_PX + _BESIDE * line_px * (row[-1] - row[0])
     beyond = int(reach / line_px)
     at = 0
@@ -249,7 +250,7 @@ def _hide_beside(
 
 @kernel
 def _cast(point: FloatArray, source: FloatArray) -> tuple[float, float]:
-    """Where the ray from a source through a point meets the net."""
+    """Return the intersection of the net with the ray from a source through a point."""
     share = source[2] / max(source[2] - point[2], 1e-3)
     x = source[0] + share * (point[0] - source[0])
     y = source[1] + share * (point[1] - source[1])
@@ -265,7 +266,7 @@ def _hide_behind(
     along: FloatArray,
     hidden: BoolArray,
 ) -> None:
-    """Mark what the camera cannot see for a large thing."""
+    """Mark the places that a large object hides from the camera."""
     n = len(in_net)
     on_net = np.empty((n, 2))
     for k in range(n):
@@ -276,7 +277,7 @@ def _hide_behind(
     for few in range(_FEW):
         x, y = on_net[few * (n - 1) // (_FEW - 1)]
         for i in range(along.shape[0]):
-            # Where the line is that near to the place.
+            # Part of the line within that distance of the place.
             s = (x - origin[i, 0]) * direction[i, 0] + (y - origin[i, 1]) * direction[i, 1]
             beside = (y - origin[i, 1]) * direction[i, 0] - (x - origin[i, 0]) * direction[i, 1]
             if not abs(beside) < radius:
@@ -296,7 +297,7 @@ def _hide_in_shadow(
     along: FloatArray,
     hidden: BoolArray,
 ) -> None:
-    """Mark what a large thing keeps its own laser's light from."""
+    """Mark the places in the shadow of a large object in its own laser's light."""
     low, high = np.inf, -np.inf
     for k in range(len(in_net)):
         x, y = _cast(in_net[k], source)
@@ -334,7 +335,7 @@ def _mark_beyond(
             )
             if at == 0 or at == len(known):
                 continue
-            # What is farther away covers fewer search lines than where its light crossed the net.
+            # Farther objects cover fewer search lines than the place where their light crossed.
             for j in range(known[at] - _SPREAD_LINES, known[at] + _SPREAD_LINES + 1):
                 if 0 <= j < along.shape[1]:
                     beyond[i, j] = True

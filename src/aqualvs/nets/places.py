@@ -1,13 +1,12 @@
-"""Where on the net what a dive saw is: the lattice's track and the vehicle's log put together.
+"""Places on the net: the lattice's track and the vehicle's log combined.
 
-The track knows every step along the net, to a fraction of a mesh, as long as it lasts; where it
-breaks, its pieces have nothing in common. The log knows depth and heading all the time, but
-coarsely. So the track gives the places within a piece, and the log puts the pieces where they
-belong: depth pins their height, the bearing of the net their place along a round cage.
+The track measures every step along the net, to a fraction of a mesh, as long as it lasts; where it
+breaks, its pieces have nothing in common. The log has depth and heading all the time, but coarsely.
+So the track gives the places within a piece, and the log positions the pieces: depth fixes their
+height, the bearing of the net their place along a round cage (`place_net`).
 
-What the vehicle's log says of the net that a dive looked at, moment by moment.
-
-The vehicle's log beside a dive: read it, and lay it on the dive's clock.
+`open_log` and `lay_log` read the log beside a dive and align it with the dive's clock; `Seen` gives
+depth, bearing and heading at the moments of the dive's postures.
 """
 
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ from aqualvs.vehicle_logs import (
     read_vehicle_log,
 )
 
-# What belongs to a moment is averaged over so many seconds before and after it.
+# Values at a moment are averaged over this many seconds before and after it.
 _MOMENT_S = 0.5
 
 
@@ -56,7 +55,7 @@ class DivePostures:
     yaw: FloatArray
 
     def track(self) -> PostureTrack:
-        """Return them as the search for a log's time offset takes them."""
+        """Return the postures in the form for the search for a log's time offset."""
         return PostureTrack(self.time_s, self.yaw, self.pitch, np.isfinite(self.range))
 
     def normals(self) -> FloatArray:
@@ -68,7 +67,7 @@ class DivePostures:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """The net at the moments of a dive's postures; NaN where not known.
+    """Depth and bearing of the net at the times of a dive's postures; NaN where not known.
 
     Attributes
     ----------
@@ -79,8 +78,8 @@ class Seen:
     net, nose : array, shape (N,)
         Bearing of the net and heading of the vehicle, in radians.
     lean : array, shape (N,)
-        Elevation of the net's far normal, in radians; a level vehicle is assumed where the log
-        does not know better.
+        Elevation of the net's far normal, in radians; a level vehicle is assumed where the log has
+        no attitude.
     """
 
     time_s: FloatArray
@@ -125,7 +124,7 @@ class Seen:
         return _or_none(_direction(self._at(self.nose, begin_s, end_s)))
 
     def _at(self, values: FloatArray, begin_s: float, end_s: float | None) -> FloatArray:
-        """Return what is known between two times, or around the first."""
+        """Return the known values between two times, or around the first."""
         last = begin_s if end_s is None else end_s
         found = values[
             slice(*np.searchsorted(self.time_s, (begin_s - _MOMENT_S, last + _MOMENT_S)))
@@ -153,14 +152,14 @@ _DIGITS = 3
 
 @dataclass(frozen=True, slots=True)
 class LaidLog:
-    """A log and how it lies on the dive's clock.
+    """A log and its alignment with the dive's clock.
 
     Attributes
     ----------
     log : VehicleLog
         As it was read.
     offset : TimeOffset or OffsetRefusal
-        Log time minus dive time, or why it is not known.
+        Log time minus dive time, or the reason why it is not known.
     overlap : bool
         Whether the log covers any of the dive.
     """
@@ -171,13 +170,13 @@ class LaidLog:
 
     @property
     def places(self) -> VehiclePlaces | None:
-        """The log's answers for dive times; None where it cannot be used."""
+        """The log's values at dive times; None where it cannot be used."""
         if isinstance(self.offset, OffsetRefusal) or not self.overlap:
             return None
         return VehiclePlaces(self.log, self.offset.offset_s)
 
     def words(self) -> str:
-        """Return how the log lies, in one line."""
+        """Return the alignment of the log as one line of text."""
         if isinstance(self.offset, OffsetRefusal):
             return f"log {self.log.name} is not used: {self.offset.reason} (--log-offset-s)"
         begins, ends = self.log.span_s
@@ -223,7 +222,7 @@ def open_log(path: Path | None, offset_s: float | None) -> VehicleLog | None:
 def lay_log(
     log: VehicleLog, postures: DivePostures, offset_s: float | None, video: Path | None
 ) -> LaidLog:
-    """Lay a log on a dive's clock.
+    """Align a log with a dive's clock.
 
     Parameters
     ----------
@@ -234,12 +233,12 @@ def lay_log(
     offset_s : float or None
         Log time minus dive time, where the user knows it.
     video : Path or None
-        Whose clock may help.
+        Video whose clock may be used.
 
     Notes
     -----
-    Without an offset from the user the motion common to both decides; the clocks of video and log
-    help where it leaves a choice, and stand in where it says nothing.
+    Without an offset from the user it is estimated from the motion common to both; the clocks of
+    video and log help where that is ambiguous, and replace it where there is no motion.
     """
     offset = _given(offset_s) or _found(log, postures, video)
     overlap = False
@@ -262,18 +261,18 @@ def _found(
     return motion if isinstance(motion, TimeOffset) or start is None else start
 
 
-# Depth is averaged over this time before and after before it pins the track, in seconds: waves and
-# the sensor's noise are over by then, the track has hardly drifted.
+# Time before and after over which depth is averaged to correct the track's height, in seconds: it
+# averages out waves and the sensor's noise, and the track hardly drifts in it.
 _PIN_S = 15.0
-# A round cage shows in how its bearing grows along the track: by how much it must change (standard
-# deviation), and how well the two must agree (coefficient of correlation).
+# A round cage is detected by the growth of its bearing along the track: least change (standard
+# deviation), and least coefficient of correlation of the two.
 _LEAST_TURN, _LEAST_AGREEMENT = np.deg2rad(5.0), 0.9
-# Track and log disagree about the height when they differ by so many metres: waves do not.
+# Difference of height, in metres, at which track and log disagree; waves make less.
 _LEAST_SLIP = 0.5
 
 
 class PlacedBy(StrEnum):
-    """What tells how far along the net something is."""
+    """Source of the distance along the net of a place."""
 
     TRACK = "track"
     """The lattice's own track, from the start of the dive on."""
@@ -298,7 +297,7 @@ class NetPlace:
     bearing, heading : float or None
         Compass direction of the net's far normal, and of the vehicle's nose, in [0, 2 pi).
     placed_by : PlacedBy
-        What `along` rests on.
+        Source of `along`.
     """
 
     along: float
@@ -311,7 +310,7 @@ class NetPlace:
 
 @dataclass(frozen=True, slots=True)
 class NetPlaces:
-    """Places of all that a dive saw.
+    """Places of all stretches and holes of a dive.
 
     Attributes
     ----------
@@ -320,9 +319,9 @@ class NetPlaces:
     holes : list of NetPlace
         Of the middle of every hole.
     slip : float
-        Metres up or down that the track claims and the log's depth denies; 0 where they agree, or
-        there is no depth. A track that slipped has counted meshes wrongly: what it says of places
-        along the net and of sizes is wrong as well.
+        Height difference in metres between the track and the log's depth; 0 where they agree, or
+        there is no depth. A track that slipped has counted meshes wrongly: its places along the net
+        and its sizes are wrong as well.
     """
 
     begin: list[NetPlace]
@@ -347,14 +346,14 @@ def place_net(
     postures : DivePostures
         Of the same dive.
     vehicle : VehiclePlaces, optional
-        The vehicle's log, laid on the dive's clock.
+        The vehicle's log, aligned with the dive's clock.
 
     Notes
     -----
     The net's depth at the foot of the perpendicular follows from the vehicle's depth and attitude
     and from the posture; where the log has no attitude the vehicle counts as level. Its mean over
-    15 s before and after pins the track's height, so that neither the log's noise nor the track's
-    drift goes far.
+    15 s before and after corrects the track's height, which limits both the log's noise and the
+    track's drift.
     """
     if not stretches:
         return NetPlaces([], [], [], [], 0.0)
@@ -394,13 +393,13 @@ class _Nodes:
     time_s, along, up : array, shape (n,)
         On the unrolled net, all pieces joined.
     raw : array, shape (n, 2)
-        Places as the track has them: right, and up in the net's plane.
+        Places in the track: right, and up in the net's plane.
     piece, run : int array, shape (n,)
-        Piece of track; and stretch of nodes between which the track tells every step.
+        Piece of track; and run of nodes between which the track gives every step.
     upright : float
         Plumb metres per metre up in the net's plane.
     depth : array, shape (n,)
-        Pinned to the log; NaN where it does not tell.
+        Corrected by the log; NaN where the log has none.
     placed_by : list of PlacedBy
     """
 
@@ -436,7 +435,7 @@ class _Nodes:
         return cls(time_s, along, up, raw, piece, run, upright, depth, placed_by)
 
     def slip(self, seen: Seen) -> float:
-        """Return how far track and log part in height, at most, within a run; see `NetPlaces`."""
+        """Return the largest height difference of track and log within a run (`NetPlaces`)."""
         off = seen.depths(self.time_s) + self.up
         known = np.isfinite(off)
         spread = [np.ptp(off[known & (self.run == r)]) for r in np.unique(self.run[known])]
@@ -455,10 +454,10 @@ class _Nodes:
         )
 
     def place_hole(self, hole: Hole, seen: Seen) -> NetPlace:
-        """Return the place of a hole: off the node of its piece of track that is nearest in time.
+        """Return the place of a hole, relative to the nearest node in time of its piece of track.
 
-        A piece that was lost before its first stretch ended has no node; then the hole is where
-        it was seen from the vehicle.
+        A piece that was lost before its first stretch ended has no node; then the hole is placed
+        relative to the vehicle at the time of the look.
         """
         bearing, heading = seen.bearing(hole.time_s), seen.heading(hole.time_s)
         mine = np.flatnonzero(self.piece == hole.piece)
@@ -489,14 +488,14 @@ def _known(value: float) -> float | None:
 
 
 def _tracked(stretches: Sequence[NetStretch], raw: FloatArray, piece: IntArray) -> BoolArray:
-    """Return for every stretch whether the track tells how far it went."""
+    """Return for every stretch whether the track gives its length."""
     moved = np.any(np.diff(raw, axis=0) != 0.0, axis=1)
     seen = np.array([one.lattice is not None for one in stretches])
     return np.asarray((np.diff(piece) == 0) & (moved | seen), np.bool_)
 
 
 def _steps(steps: FloatArray, elapsed: FloatArray, tracked: BoolArray) -> FloatArray:
-    """Replace steps (n, 2) that the track does not tell by the speed of those beside them."""
+    """Replace steps (n, 2) that are not tracked by the speed of neighbouring steps."""
     found = steps.copy()
     known = np.flatnonzero(tracked & (elapsed > 0.0))
     for i in np.flatnonzero(~tracked):
@@ -522,12 +521,12 @@ def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> Floa
     radius = float(off_turn @ off_along) / float(off_turn @ off_turn)
     lag = np.array([np.mean((radius * turn - along)[mine]) for mine in within])
     numbers = np.array([run[mine][0] for mine in within])
-    # A run without bearings goes with its neighbours.
+    # A run without bearings is placed with its neighbours.
     return np.asarray(along + np.interp(run, numbers, lag) - np.interp(0, numbers, lag))
 
 
 def _pinned(time_s: FloatArray, up: FloatArray, run: IntArray, depth: FloatArray) -> FloatArray:
-    """Return depths that follow the track from node to node, and the log over longer times."""
+    """Return depths that follow the track in the short term, and the log in the long term."""
     found = np.full(len(time_s), np.nan)
     for i in range(len(time_s)):
         near = (run == run[i]) & (np.abs(time_s - time_s[i]) <= _PIN_S) & np.isfinite(depth)

@@ -1,17 +1,15 @@
-"""Power of plane waves in where lasers cross the strands of a net.
+"""Spectrum of the crossings of laser lines with strands, and lattice hypotheses from its peaks.
 
 Strands of one family are parallel and evenly spaced, so their crossings with the lasers' lines all
 have nearly one phase in a plane wave whose crests are the strands. The power of such waves, summed
-over frames, peaks at the families' wave vectors, wherever the net was in each frame. Uneven cover
-(the lasers' lines themselves) would peak as well; it is taken out by comparing with crossings
-spread evenly over what could be seen. Power spectra of point processes: Bartlett, J. R. Stat. Soc.
-B 25 (1963) 264, doi:10.1111/j.2517-6161.1963.tb00508.x.
+over frames, peaks at the families' wave vectors, wherever the net was in each frame. Uneven
+coverage (the lasers' lines themselves) would peak as well; it is removed by comparison with
+crossings spread evenly over the visible parts of the lines. Power spectra of point processes:
+Bartlett, J. R. Stat. Soc. B 25 (1963) 264, doi:10.1111/j.2517-6161.1963.tb00508.x.
 
-Lattices that a net may have, and how likely each is.
-
-Which lattice explains the peaks of a spectrum is decided by likelihood. How many crossings there
-are per metre of line tells a lattice from its multiples and fractions, and that the sides of a mesh
-are equally long tells it from chance.
+The lattice that explains the peaks is chosen by likelihood (`score`). The number of crossings per
+metre of line separates a lattice from its multiples and fractions; equal lengths of the sides of a
+mesh separate it from chance.
 """
 
 from collections.abc import Sequence
@@ -42,7 +40,7 @@ from aqualvs.nets.spectrum_kernels import (
 )
 
 LARGEST_PITCH = 0.09
-"""Distance between parallel strands up to which they are looked for, in metres."""
+"""Largest distance between parallel strands in the search, in metres."""
 N_ANGLES = 180
 """Directions of waves in half a turn."""
 STEP = 0.9
@@ -50,8 +48,8 @@ STEP = 0.9
 
 _ALONG: FloatArray = np.arange(-HIGHEST, HIGHEST + STEP, STEP)
 _UPWARD: FloatArray = np.arange(-2.0 * STEP, HIGHEST + STEP, STEP)
-# On the grid evenly spread crossings are so far apart, in metres: their own period is beyond its
-# end. The grid shows where to look, so some of the frames are enough.
+# On the grid evenly spread crossings are this far apart, in metres: their own period is beyond its
+# end. The grid gives initial guesses only, so this number of frames is enough.
 _APART = 7.5e-3
 _MOST_ON_GRID = 12
 
@@ -61,7 +59,7 @@ Swings: TypeAlias = NDArray[np.complex64]
 
 @dataclass(frozen=True, slots=True)
 class Crossings:
-    """Where one frame's lasers cross strands, and where they would have been seen.
+    """Crossings of one frame's lasers with strands, and the visible pieces of their lines.
 
     Attributes
     ----------
@@ -70,15 +68,15 @@ class Crossings:
     laser : int array, shape (N,)
         Index of the laser.
     begin, end : array, shape (M, 2)
-        Ends of the pieces of line that could be seen, in `net`, metres.
+        Ends of the visible pieces of line, in `net`, metres.
     span_laser : int array, shape (M,)
         Index of the laser of each of them.
     direction : array, shape (L, 2)
         Of the lasers' lines; NaN where there is none.
     length : array, shape (L,)
-        Metres of line that could be seen.
+        Visible metres of line.
     lit : float
-        Share of it that is lit: so many crossings merge with others.
+        Share of it that is lit, which is the share of crossings that merge with others.
     """
 
     place: FloatArray
@@ -100,7 +98,7 @@ class Spectrum:
         Crossings (N, 2), the number of the line that each lies on (N,), counted through all
         frames, and where each frame's begin (F + 1,).
     begin, end, span_line, span_start : array, array, int array, int array
-        The same for pieces of line that could be seen.
+        The same for the visible pieces of line.
     lines : array, shape (n, 3)
         Direction and seen length of every line; zero where there is none.
     laser : int array, shape (n,)
@@ -164,7 +162,7 @@ class Spectrum:
         )
 
     def without(self, wave: FloatArray) -> "Spectrum":
-        """Return the spectrum of what does not lie on the crests of a wave."""
+        """Return the spectrum of the crossings that do not lie on the crests of a wave."""
         phase = crest_phases(self.place, self.start, wave[0], wave[1])
         kept, start, begin, end, origin, span_start = off_crests(
             self.place,
@@ -190,7 +188,7 @@ class Spectrum:
         )
 
     def _on_grid(self, most: int) -> FloatArray:
-        """Power over the upper half plane, some rows more; the rest of the plane is its mirror."""
+        """Return the power over the upper half plane and some rows more; the rest mirrors it."""
         power = np.zeros((len(_ALONG), len(_UPWARD)), np.float32)
         count = 0
         every = max(1, -(-self.n_frames // most))
@@ -206,7 +204,7 @@ class Spectrum:
         return power.astype(np.float64) / max(count, 1)
 
     def _evenly_spread(self, first: int, last: int) -> tuple[FloatArray, FloatArray]:
-        """Places spread over some spans, and how many crossings each of them stands for."""
+        """Return places spread over some spans, and the crossings that each stands for."""
         begin, end = self.begin[first:last], self.end[first:last]
         length = np.hypot(*(end - begin).T)
         pieces = np.maximum(np.ceil(length / _APART), 1.0).astype(np.int64)
@@ -217,7 +215,7 @@ class Spectrum:
         return place, (self.expected[first:last] / pieces)[number]
 
     def at(self, wave: FloatArray, n_harmonics: int = 1) -> FloatArray:
-        """Power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
+        """Return the power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
         power = np.zeros(n_harmonics)
         comb_power(
             self.place,
@@ -233,9 +231,9 @@ class Spectrum:
         return power / max(self.n_crossings, 1)
 
     def polar(self, most: int = _MOST_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Power at sizes (K,) and directions (A,) of waves, the highest nearby, shape (K, A).
+        """Return the local maximum power at sizes (K,) and directions (A,) of waves, shape (K, A).
 
-        So many frames at most are looked at, evenly spread.
+        At most `most` frames are used, evenly spread.
         """
         highest: FloatArray = maximum_filter(self._on_grid(most), 3)
         step = 0.5 * STEP
@@ -249,9 +247,9 @@ class Spectrum:
 
 
 def _swings(place: FloatArray, first: float, n: int) -> Swings:
-    """Waves of frequencies first, first + STEP and so on at places (N,), shape (N, n).
+    """Return the waves of frequencies first, first + STEP and so on at places (N,), shape (N, n).
 
-    Each as a product of a coarse and a fine one, of which few are needed.
+    Each is the product of a coarse and a fine one, of which few have to be computed.
     """
     size = int(np.ceil(np.sqrt(n)))
     turn = 2j * np.pi * place[:, None]
@@ -261,19 +259,19 @@ def _swings(place: FloatArray, first: float, n: int) -> Swings:
     return np.asarray(both.reshape(len(place), -1)[:, :n])
 
 
-# Length of bars down to which lattices are looked for, in metres.
+# Least length of bars in the search for lattices, in metres.
 _SHORTEST_BAR = 0.010
-# Waves looked at, and how many of the best that are not neighbours are followed up; for each of
-# them so many second families.
+# Number of waves, and of the best ones that are not neighbours and are followed up; number of
+# second families for each of them.
 _TRIED, _KEPT, _SECONDS = 1000, 6, 2
-# These are looked for in so many frames.
+# Number of frames in the search for second families.
 _MOST_OF_REST = 6
-# How far apart in frequency two waves are at least.
+# Least distance in frequency of two waves.
 _HYPOTHESES_APART = 2.5
 # Spread of the logarithm of the ratio of the pitches of two families.
 _EVEN = 0.05
 # The strongest waves of a honeycomb look like a diamond whose families lie sixty degrees apart, and
-# few diamonds do so by chance: within this angle they are unlikely by as much.
+# few diamonds do so by chance: penalty within this angle.
 _AS_HONEYCOMB, _RARE = np.deg2rad(2.5), 1.0
 # Families that run more nearly alike than this have no mesh between them.
 _LEAST_ANGLE = np.deg2rad(25.0)
@@ -297,7 +295,7 @@ _COORDINATES = {
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Two wave vectors that span a lattice; of a honeycomb two of its first shell."""
+    """A candidate lattice: two wave vectors that span it; of a honeycomb two of its first shell."""
 
     mesh: Mesh
     basis: FloatArray
@@ -315,12 +313,12 @@ class Hypothesis:
         return np.array([a + b, 2.0 * b - a, 2.0 * a - b])
 
     def density(self) -> FloatArray:
-        """Share of each family's lines that is really there."""
+        """Return the share of each family's lines that exists."""
         return np.ones(2) if self.mesh is Mesh.FOUR_SIDED else np.full(3, 1.0 / 3.0)
 
 
 def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
-    """Log-likelihood per frame over random crossings, less what is unlikely beforehand."""
+    """Return the log-likelihood per frame over random crossings, including the prior."""
     families = np.ascontiguousarray(hypothesis.families())
     gain = families_gain(
         spectrum.place,
@@ -358,13 +356,13 @@ def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
 
 
 def _gain(power: FloatArray, mean: float) -> FloatArray:
-    """`gain_of` for many powers."""
+    """Return `gain_of` for many powers."""
     gain: FloatArray = np.minimum(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean)
     return gain
 
 
 def _uneven(hypothesis: Hypothesis) -> float:
-    """How unlikely two families are for their pitches and angle: sides are equally long."""
+    """Return the penalty of two families by their pitches and angle: sides are equally long."""
     if hypothesis.mesh is Mesh.SIX_SIDED:
         return 0.0
     first, second = hypothesis.basis
@@ -375,7 +373,7 @@ def _uneven(hypothesis: Hypothesis) -> float:
 
 
 def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
-    """Lattices that the power at their peaks speaks for, most of them wrong."""
+    """Return lattices that explain peaks of the spectrum; most of them are wrong."""
     size, angle, power = spectrum.polar()
     return [
         *_four_sided(spectrum, size, angle, power),
@@ -384,7 +382,7 @@ def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
 
 
 def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: float) -> FloatArray:
-    """Gain (K, A) from a family's harmonics, the family's wave at every size and direction."""
+    """Return the gain (K, A) from a family's harmonics, for waves of every size and direction."""
     gain = np.zeros_like(power)
     for h in range(1, MOST_HARMONICS + 1):
         k = np.rint((h * size - size[0]) / (size[1] - size[0])).astype(int)
@@ -396,7 +394,7 @@ def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: f
 def _four_sided(
     spectrum: Spectrum, size: FloatArray, angle: FloatArray, power: FloatArray
 ) -> list[Hypothesis]:
-    """Pairs of families: likely waves of the stronger one, and the best in what each leaves."""
+    """Return pairs of families: likely waves of the stronger one, and the best in the remainder."""
     gain = _family_gain(power, size, spectrum.per_frame, 0.5)
     found = []
     for k, i in _best_waves(gain, size, angle, _KEPT):
@@ -417,7 +415,7 @@ def _four_sided(
 def _best_waves(
     gain: FloatArray, size: FloatArray, angle: FloatArray, n: int
 ) -> list[tuple[int, int]]:
-    """Rows and columns of the best waves that are not neighbours, best first."""
+    """Return the rows and columns of the best waves that are not neighbours, best first."""
     gain = np.where(
         ((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / _SHORTEST_BAR))[:, None], gain, -np.inf
     )
@@ -473,13 +471,13 @@ def _spread_out(ordered: list[Hypothesis]) -> list[Hypothesis]:
 
 
 def _apart(one: Hypothesis, other: Hypothesis) -> float:
-    """How far the farther of the waves of two lattices of one kind is from its like."""
+    """Return the larger distance between corresponding waves of two lattices of one kind."""
     distance = np.array([[_distance(a, b) for b in other.families()] for a in one.families()])
     return float(distance.min(axis=1).max())
 
 
 def _distance(a: FloatArray, b: FloatArray) -> float:
-    """Distance between two waves; a wave and its opposite are the same."""
+    """Return the distance between two waves; a wave and its opposite are the same."""
     return float(min(np.hypot(*(a - b)), np.hypot(*(a + b))))
 
 
@@ -490,7 +488,7 @@ def turned(angle: float) -> FloatArray:
 
 
 def refine(start: Hypothesis, spectrum: Spectrum, rounds: int) -> Hypothesis:
-    """Climb to the highest score near a hypothesis: pattern search with shrinking steps.
+    """Maximise the score near a hypothesis by pattern search with shrinking steps.
 
     In each round every coordinate is tried to either side.
     """
@@ -520,7 +518,7 @@ def _moved(at: Hypothesis, wave: int, axis: int, shift: float) -> Hypothesis:
 
 
 def bar_of(hypothesis: Hypothesis) -> float:
-    """Length of a side of the openings, in metres."""
+    """Return the length of a side of the openings, in metres."""
     a, b = hypothesis.basis
     size_a, size_b = np.hypot(*a), np.hypot(*b)
     if hypothesis.mesh is Mesh.SIX_SIDED:

@@ -1,12 +1,11 @@
-"""Kernels of `net_spectrum`: sums of plane waves over places and over pieces of line.
+"""Compiled kernels of `aqualvs.nets.spectrum`: sums of plane waves, and log-likelihood gains.
 
 A piece of line of length l with ends b and e adds l sinc(q·(e - b)) exp(2 pi i q·(b + e)/2), times
 the crossings per metre that are expected on it.
 
-How much likelier a lattice makes the crossings that were seen: kernels of `net_hypotheses`.
-
-Powers of plane waves (`net_spectrum`) are exponentially distributed about their mean: 1 where
-crossings lie at random, more on the waves that a lattice is made of.
+Powers are exponentially distributed about their mean: 1 where crossings lie at random, more on the
+waves that a lattice is made of. The gain is the log-likelihood of the crossings with the lattice
+over that of random ones.
 """
 
 import numpy as np
@@ -14,10 +13,10 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 
-# So near to a crest, in periods, a crossing belongs to the wave's family.
+# Largest distance of a crossing of the wave's family from a crest, in periods.
 _ON_CREST = 0.12
 _TURN = 2.0 * np.pi
-# Lengths that differ by no more, in metres, and half a span's phase that counts as none.
+# Difference of lengths that count as equal, in metres, and half a span's phase that counts as zero.
 _SAME, _SHORT = 1e-10, 1e-6
 
 
@@ -79,10 +78,9 @@ def _add_spans(
     imaginary: FloatArray,
     share: FloatArray,
 ) -> None:
-    """Take what is expected on some spans off the sums of a wave's harmonics.
+    """Subtract the expected crossings on some spans from the sums of a wave's harmonics.
 
-    Pieces of one line that follow one another evenly turn by the same angle: that saves most of
-    the sines.
+    Evenly spaced pieces of one line turn by the same angle, which saves most of the sines.
     """
     n = real.shape[0]
     c, s, turn_c, turn_s, ch, sh = 1.0, 0.0, 1.0, 0.0, 1.0, 0.0
@@ -116,7 +114,7 @@ def _add_spans(
 
 @kernel
 def crest_phases(place: FloatArray, start: IntArray, qx: float, qy: float) -> FloatArray:
-    """Where each frame's crossings have their crests in a wave, in periods, shape (F,)."""
+    """Return the phase of the crests in each frame's crossings, in periods, shape (F,)."""
     phase = np.zeros(start.shape[0] - 1)
     for g in range(len(phase)):
         real, imaginary = 0.0, 0.0
@@ -130,7 +128,7 @@ def crest_phases(place: FloatArray, start: IntArray, qx: float, qy: float) -> Fl
 
 @inline_kernel
 def _off(turns: float) -> float:
-    """Distance from the nearest whole number."""
+    """Return the distance from the nearest whole number."""
     return float(abs(turns - np.rint(turns)))
 
 
@@ -145,7 +143,7 @@ def off_crests(
     qx: float,
     qy: float,
 ) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, IntArray, IntArray]:
-    """Leave out what lies on the crests of a wave.
+    """Remove the crossings and the pieces of spans on the crests of a wave.
 
     Parameters
     ----------
@@ -229,7 +227,7 @@ def _between(
 def expected_on(
     line: IntArray, begin: FloatArray, end: FloatArray, span_line: IntArray, n_lines: int
 ) -> FloatArray:
-    """Crossings (M,) on every span if those of its line were spread evenly over what is seen."""
+    """Return the crossings (M,) on every span if those of its line were spread evenly."""
     length, total, seen = np.empty(len(span_line)), np.zeros(n_lines), np.zeros(n_lines)
     for i in range(len(span_line)):
         length[i] = np.hypot(end[i, 0] - begin[i, 0], end[i, 1] - begin[i, 1])
@@ -245,14 +243,14 @@ def expected_on(
 def wave_sums(
     place: FloatArray, begin: FloatArray, end: FloatArray, expected: FloatArray, waves: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the sums of waves over places, less what is expected over spans.
+    """Return the sums of waves over places, less those expected over spans.
 
     Parameters
     ----------
     place : array, shape (N, 2)
         Crossings of one frame.
     begin, end : array, shape (M, 2)
-        Of pieces of line that could be seen.
+        Ends of the visible pieces of line.
     expected : array, shape (M,)
         Crossings expected on each.
     waves : array, shape (Q, 2)
@@ -280,18 +278,18 @@ def wave_sums(
 
 
 HIGHEST = 125.0
-"""Waves are looked at up to so many periods a metre."""
+"""Largest frequency of waves, in periods a metre."""
 MOST_HARMONICS, REGULAR = 6, 0.92
-"""Harmonics of a family's wave that are looked at; each is this much weaker than the one before."""
+"""Harmonics of a family's wave that are used; each is weaker than the one before by the factor."""
 SHELL_1 = 0.37
 """Amplitude of the waves in the first shell of a honeycomb's reciprocal lattice."""
 SHARE_OF_REST = 0.8
-"""Of what the crossings on a family's crests leave, the other family has this share."""
-# No crossings left at all is worth this much.
+"""Share of the other family in the crossings that are not on a family's crests."""
+# Gain if no crossings are left.
 _NOTHING_LEFT = 5.0
-# The double of a first shell's wave may be strong or weak, as the lines cut the net: worth its
-# likelihood, less this. Where a frame has few crossings, about as many as this, strong ones are not
-# to be expected: less is due.
+# The double of a first shell's wave may be strong or weak, depending on how the lines cut the net:
+# its gain is its likelihood, less this. Where a frame has few crossings, about as many as this,
+# strong waves are not expected, and the deduction is smaller.
 _FREEDOM, _FEW_CROSSINGS = 0.7, 15.0
 # Crossings seen over crossings that a lattice must have, less those that merge: spread of its
 # logarithm among lasers, variance of a frame's count of one, and spread of the mean towards fewer
@@ -301,23 +299,23 @@ _SEEN_SPREAD, _COUNT_NOISE, _FEW_SEEN, _MANY_SEEN = 0.2, 0.3, 0.2, 0.12
 
 @inline_kernel
 def gain_of(power: float, mean: float) -> float:
-    """Log-likelihood of a power over random crossings, where a peak of a given mean should be.
+    """Return the log-likelihood of a power over random crossings, at an expected peak.
 
-    A peak much higher than the model's proves no more than one twice as high.
+    `mean` is the expected power. A peak much higher than the model's counts as one twice as high.
     """
     return float(min(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean))
 
 
 @inline_kernel
 def free_gain_of(power: float, per_frame: float) -> float:
-    """Return the same where the mean is not known; freedom has its price."""
+    """Return the gain where the mean is not known, less a penalty for the free parameter."""
     mean = max(power, 1.0)
     price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
     return float(mean - 1.0 - np.log(mean) - price)
 
 
 def free_gains(power: FloatArray, per_frame: float) -> FloatArray:
-    """`free_gain_of` for many powers."""
+    """Return `free_gain_of` for many powers."""
     mean = np.maximum(power, 1.0)
     price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
     gain: FloatArray = mean - 1.0 - np.log(mean) - price
@@ -334,12 +332,12 @@ def shell_gain(
     span_start: IntArray,
     basis: FloatArray,
 ) -> float:
-    """Gain from the waves of a honeycomb that are longer than those of its bars' lines.
+    """Return the gain from the waves of a honeycomb that are longer than those of its bars' lines.
 
     Parameters
     ----------
     place, start, begin, end, expected, span_start
-        As for `net_waves.comb_power`.
+        As for `comb_power`.
     basis : array, shape (2, 2)
         Two waves of the first shell.
     """
@@ -369,12 +367,12 @@ def families_gain(
     n_lines: int,
     families: FloatArray,
 ) -> float:
-    """Gain from the strongest family, from the next among what that leaves, and so on.
+    """Return the gain from the strongest family, the next in the remainder, and so on.
 
     Parameters
     ----------
     place, start, begin, end, expected, span_start
-        As for `net_waves.comb_power`.
+        As for `comb_power`.
     line, span_line : int array, shape (N,) and (M,)
         Lines that crossings and spans lie on.
     n_lines : int
@@ -398,7 +396,7 @@ def families_gain(
         )
         place, line, span_line = place[kept], line[kept], span_line[origin]
         expected = expected_on(line, begin, end, span_line, n_lines)
-        # Crossings of the families that remain, less those that lie on a crest by chance.
+        # Crossings of the remaining families, less those on a crest by chance.
         share = SHARE_OF_REST / (n - k)
         gain += _comb_gain(
             place, start, begin, end, expected, span_start, families[order[k]], share
@@ -417,7 +415,7 @@ def _comb_gain(
     wave: FloatArray,
     share: float,
 ) -> float:
-    """Gain from a family's harmonics that holds a share of the crossings."""
+    """Return the gain from a family's harmonics that holds a share of the crossings."""
     if place.shape[0] == 0:
         return -_NOTHING_LEFT
     per_frame = place.shape[0] / (start.shape[0] - 1)
@@ -441,7 +439,7 @@ def miscount(
     families: FloatArray,
     density: float,
 ) -> float:
-    """How unlikely the numbers of crossings are that the lasers have seen.
+    """Return the penalty for the numbers of crossings that the lasers have seen.
 
     Parameters
     ----------
@@ -450,7 +448,7 @@ def miscount(
     families : array, shape (F, 2)
         Waves of the strands.
     density : float
-        Share of each family's lines that is really there.
+        Share of each family's lines that exists.
     """
     expected = np.zeros(len(seen))
     for i in range(len(lines)):

@@ -1,12 +1,8 @@
-"""`net.csv`, `holes.csv` and `net.geojson`: the state of a net as tables.
+"""Tables and texts of a net's condition: `net.csv`, `holes.csv`, `net.geojson`, the summary.
 
-The net wall unrolled into a plane: what the map and `net.geojson` are drawn in.
-
-x is metres along the net to the right, as seen from the vehicle, from where the dive began; y is
-minus the depth in metres, or, without a log, metres above the start. Where there is no track, x is
-the bearing of the net in degrees.
-
-The state of a net in a few words and numbers.
+The map and `net.geojson` use coordinates of the unrolled net (`NetWall`): x is metres along the net
+to the right, as seen from the vehicle, from where the dive began; y is minus the depth in metres,
+or, without a log, metres above the start. Without a track, x is the bearing of the net in degrees.
 """
 
 import csv
@@ -44,15 +40,15 @@ class NetWall:
     Attributes
     ----------
     stretches, holes : sequence
-        What was found.
+        Stretches and holes that were found.
     places : NetPlaces
-        Where.
+        Their places.
     by_bearing : bool
-        Whether x is a bearing in degrees, for want of a track.
+        Whether x is a bearing in degrees, because there is no track.
     by_depth : bool
         Whether y is minus a depth, or metres above the start.
     outlines : list of array, shape (4, 2)
-        Of what the picture passed over in every stretch: x and y, counter-clockwise.
+        Of the area that the picture passed over in every stretch: x and y, counter-clockwise.
     path : list of array, shape (n, 2)
         Of the vehicle's foot on the net: one line for every piece in which the track holds.
     holes_xy : array, shape (H, 2)
@@ -72,7 +68,7 @@ class NetWall:
 def unroll(
     stretches: Sequence[NetStretch], holes: Sequence[Hole], places: NetPlaces, rig: Rig
 ) -> NetWall:
-    """Lay what was found into the plane of the unrolled net.
+    """Project stretches and holes to the plane of the unrolled net.
 
     Parameters
     ----------
@@ -112,7 +108,7 @@ def unroll(
 
 
 def _heights(places: Sequence[NetPlace], by_depth: bool) -> FloatArray:
-    """Return minus the depth; where the log has a gap the track carries it on."""
+    """Return minus the depth; gaps of the log are bridged by the track."""
     up = np.array([one.up for one in places])
     if not by_depth:
         return up
@@ -137,7 +133,7 @@ def _path(nodes: FloatArray, stretches: Sequence[NetStretch]) -> list[FloatArray
 
 
 def bands(nodes: FloatArray, half: FloatArray) -> list[FloatArray]:
-    """Return the outlines of what a picture passes over from node to node.
+    """Return the outlines of the areas that a picture passes over from node to node.
 
     Parameters
     ----------

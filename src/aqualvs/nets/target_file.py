@@ -1,4 +1,4 @@
-"""What the lasers hit, as a word or a short file (`net.yaml`).
+"""The target that a user expects: a word or a short file (`net.yaml`), and the check against it.
 
 ::
 
@@ -13,17 +13,13 @@
       r_min_mm: 15
       r_max_mm: 35
 
-The adaptive filter needs none of this. Where the net is given, the paper's filter takes what
-`mesh_filter` leaves out from it.
+The adaptive filter needs none of this. Where the net is given, the paper's filter derives from it
+what `mesh_filter` leaves out. `NetRequest` holds the options of a run's net condition.
 
-What a user wants to know of a net.
-
-Whether the net that is seen is the one that the target file describes.
-
-Along a laser's line strands follow one another at distances that depend on the way the mesh is
-turned; over three lasers and a dive their mean tells the bar. For parallel lines thrown at random
-on a net with a length L of twine on every square metre it is pi / (2 L) (Crofton); L is 2 / bar for
-square and diamond meshes and 2 / (sqrt(3) bar) for hexagons.
+`NetCheck` compares the net in view with the file. Along a laser's line the distances between
+strands depend on the roll of the mesh; over three lasers and a dive their mean gives the bar. For
+parallel lines thrown at random on a net with a length L of twine on every square metre it is
+pi / (2 L) (Crofton); L is 2 / bar for square and diamond meshes and 2 / (sqrt(3) bar) for hexagons.
 """
 
 import math
@@ -52,7 +48,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetRequest:
-    """What to find out about a net.
+    """Request for the condition of a net, with its options.
 
     Attributes
     ----------
@@ -87,19 +83,19 @@ class NetRequest:
         return NetConditionOptions(stretch=self.stretch_m, twine=twine)
 
     def facts(self) -> dict[str, Any]:
-        """Return them for the files that are written."""
+        """Return the options for the files that are written."""
         return {"twine_mm": self.twine_mm, "stretch_m": self.stretch_m}
 
 
 def net_request(
     *, wanted: bool, twine_mm: float | None, stretch_m: float | None
 ) -> NetRequest | None:
-    """Return what a user wants to know, None if nothing.
+    """Return the request for the condition of a net, None if it is not wanted.
 
     Raises
     ------
     OptionError
-        If something is said about it all the same, or a value cannot be.
+        If an option is given although the condition is not wanted, or a value is not valid.
     """
     given = {"twine_mm": twine_mm, "stretch_m": stretch_m}
     known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -133,7 +129,7 @@ _REFLECTION = 5.0
 
 @dataclass(frozen=True, slots=True)
 class NetFacts:
-    """What the net is said to be.
+    """The net as described by the target file.
 
     Attributes
     ----------
@@ -164,7 +160,7 @@ class NetFacts:
 
 @dataclass(frozen=True, slots=True)
 class TargetFacts:
-    """What is known of the target beforehand.
+    """Prior information on the target.
 
     Attributes
     ----------
@@ -252,21 +248,21 @@ def _refuse_unknown(
 # A frame now and then is enough, and costs the run nothing.
 _EVERY = 5
 _ENOUGH_FRAMES = 5
-# Light is one strand's up to gaps of this width; a strand has so many points, a stripe so many
-# strands, a frame so many stripes.
+# Largest gap in the light of one strand, in metres; least number of points of a strand, of strands
+# of a stripe, and of stripes of a frame.
 _GAP = 3e-3
 _MIN_POINTS, _MIN_STRANDS, _MIN_LASERS = 3, 4, 2
-# Wider than so many usual distances is a hole, or what stands before the net.
+# Gaps wider than this many usual distances are holes, or objects before the net.
 _HOLE = 2.5
 # Strands that meet at a knot count once and dim ones are missed: found on random simulated nets.
 _MISSED = 1.2
-# On those nets the bar comes out at 0.67 to 1.45 of what it is, frame by frame.
+# On those nets the bar of single frames is estimated at 0.67 to 1.45 of its true length.
 _TOO_SHORT, _TOO_LONG = 0.62, 1.6
 
 
 @dataclass(slots=True)
 class NetCheck:
-    """Compares the distances between strands with those of the net that was announced.
+    """Comparison of the distances between strands with those of the described net.
 
     Attributes
     ----------
@@ -277,7 +273,7 @@ class NetCheck:
     planes : sequence of Plane
         Of the lasers, in `dome`.
     bars : array of float
-        Bar of the frames that were looked at, in metres.
+        Bar of the frames that were evaluated, in metres.
     """
 
     said: NetFacts
@@ -287,7 +283,7 @@ class NetCheck:
     _n_seen: int = 0
 
     def add(self, scan: Scan) -> None:
-        """Look at a frame, if its turn has come and it shows a net."""
+        """Evaluate a frame, if it is one of the sampled ones and shows a net."""
         self._n_seen += 1
         if (self._n_seen - 1) % _EVERY == 0:
             bar = bar_of(scan, self.planes, self.said)
@@ -295,11 +291,11 @@ class NetCheck:
                 self.bars.append(bar)
 
     def bar(self) -> float | None:
-        """Return the bar as it looks over the dive, in metres; None where too little was seen."""
+        """Return the estimated bar over the dive, in metres; None where too little was seen."""
         return float(np.median(self.bars)) if len(self.bars) >= _ENOUGH_FRAMES else None
 
     def sentence(self) -> str:
-        """Return what is wrong with the file in one line, "" where nothing can be told."""
+        """Return the contradiction to the file in one line, "" if there is none."""
         bar = self.bar()
         if bar is None or _TOO_SHORT <= bar / self.said.bar <= _TOO_LONG:
             return ""
@@ -309,7 +305,7 @@ class NetCheck:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return what `run.yaml` holds of it."""
+        """Return the result for `run.yaml`."""
         bar = self.bar()
         found: dict[str, Any] = {"bar_said_mm": round(1e3 * self.said.bar, 2)}
         if bar is not None:
@@ -342,12 +338,12 @@ def net_check(target: str, rig: Rig) -> NetCheck | None:
 
 
 def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
-    """Return the bar that the distances between strands in one frame make likely, in metres.
+    """Return the likely bar from the distances between strands in one frame, in metres.
 
     Parameters
     ----------
     scan : Scan
-        Its points labelled net are looked at.
+        Its points labelled net are used.
     planes : sequence of Plane
         Of the lasers, in `dome`.
     said : NetFacts

@@ -1,9 +1,9 @@
 """The camera: pixels to rays in the outer medium, points to pixels, and every derivative.
 
-For kernels of other modules: `trace_pixel(camera.params, u, v)` and
+`BareCamera` and `DomeCamera` share one set of numbers: `parameter_names` gives their order in every
+parameter Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs
+them for kernels. For kernels of other modules `trace_pixel(camera.params, u, v)` and
 `project_point(camera.params, x, y, z)` are scalar compiled functions to call inside a `@kernel`.
-
-The numbers of a camera: their names, small changes to them, and the form that kernels take.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ DOME_PARAMETERS = ("inner_radius", "thickness", "n_air", "n_acrylic", "n_water")
 
 
 class HasParameters(Protocol):
-    """What names the parameters of a camera."""
+    """A camera's lens and packed numbers, which determine the names of its parameters."""
 
     @property
     def lens(self) -> Lens:
@@ -46,7 +46,7 @@ class HasParameters(Protocol):
 
     @property
     def params(self) -> CameraParams:
-        """What compiled kernels take."""
+        """Packed numbers for compiled kernels."""
 
 
 def parameter_names(camera: HasParameters) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ def camera_params(
     Raises
     ------
     RigError
-        If the lens lies outside the inner sphere, an index or the size cannot be, or the pose is
+        If the lens lies outside the inner sphere, an index or the size is not valid, or the pose is
         not one finite rigid transform.
     """
     _check_size(size_px)
@@ -180,7 +180,7 @@ __all__ = [
 
 
 class Camera(Protocol):
-    """What the rest of the project asks of a camera. Frames: `image` and `dome`."""
+    """Interface of a camera. Frames: `image` and `dome`."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -196,7 +196,7 @@ class Camera(Protocol):
 
     @property
     def params(self) -> CameraParams:
-        """What compiled kernels take."""
+        """Packed numbers for compiled kernels."""
 
     def rays(self, pixels: ArrayLike) -> Rays:
         """Return the rays in `dome` that pixels (..., 2) see."""
@@ -240,7 +240,7 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CompiledCamera:
-    """A camera whose arithmetic is all in compiled kernels, told by `params`.
+    """A camera computed by compiled kernels from the numbers in `params`.
 
     Attributes
     ----------
@@ -256,7 +256,7 @@ class _CompiledCamera:
     lens: Lens
     dome_from_cam: SE3
     params: CameraParams = field(init=False, repr=False, compare=False)
-    """What compiled kernels take."""
+    """Packed numbers for compiled kernels."""
 
     def rays(self, pixels: ArrayLike) -> Rays:
         """Trace pixels into the outer medium.
@@ -470,7 +470,7 @@ class DomeCamera(_CompiledCamera):
     Raises
     ------
     RigError
-        If the lens lies outside the inner sphere, an index or the size cannot be, or the pose is
+        If the lens lies outside the inner sphere, an index or the size is not valid, or the pose is
         not one finite rigid transform.
     """
 

@@ -1,17 +1,7 @@
-"""Batch kernels of the camera, backward: rows of points to rows of pixels.
+"""Batch kernels of the camera: pixels to rays, points to pixels, and the Jacobians of both.
 
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`. See
-`lens_batch` for how the blocks work.
-
-Batch kernels of the camera, forward: rows of pixels to rows of rays.
-
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`. See
-`lens_batch` for how the blocks work.
-
-Batch kernels of the camera, backward with derivatives: points to pixels and their Jacobians.
-
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`. See
-`lens_batch` for how the blocks work.
+Every kernel writes into arrays that it is given, and NaN wherever it writes False into `valid`. The
+block layout of the scratch array is that of `aqualvs.optics.lens`.
 """
 
 import numpy as np
@@ -182,9 +172,9 @@ N_POINT_ROWS = 12
 
 @inline_kernel
 def project_point(camera: CameraParams, x: float, y: float, z: float) -> tuple[bool, float, float]:
-    """Project a point (metres, in `dome`); returns (valid, u, v).
+    """Project a point (metres, in `dome`); return (valid, u, v).
 
-    Where `valid` is False the numbers mean nothing.
+    Where `valid` is False the numbers are meaningless.
     """
     if camera.has_dome:
         reached, dx, dy, dz = direction_to_point(camera, x, y, z)
@@ -229,7 +219,7 @@ def polar_block(camera: CameraParams, w: FloatArray) -> None:
 
 @inline_kernel
 def solve_block(camera: CameraParams, count: int, w: FloatArray) -> None:
-    """Solve for the ray's angle at the lens, all lanes of a block; a zero becomes a sign.
+    """Solve for the ray's angle at the lens, all lanes of a block; set the signs of validity.
 
     Lanes that no round of steps solves are searched one by one.
     """
@@ -329,7 +319,7 @@ def _see_lane(
     j: int,
     seen: tuple[bool, float, float, Vector, Vector],
 ) -> None:
-    """Write what a lens sees into lane j."""
+    """Write the pixel and its gradients into lane j."""
     ok, w[U + j], w[V + j], u_d, v_d = seen
     w[GUX + j], w[GUY + j], w[GUZ + j] = dome_from_cam(camera, u_d[0], u_d[1], u_d[2])
     w[GVX + j], w[GVY + j], w[GVZ + j] = dome_from_cam(camera, v_d[0], v_d[1], v_d[2])

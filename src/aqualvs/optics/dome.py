@@ -1,8 +1,7 @@
-"""The dome: two concentric spheres with acrylic or glass between them.
+"""Refraction by the dome: two concentric spheres with acrylic or glass between them.
 
-Forward through the dome: from a pixel to the ray that it sees in the outer medium.
-
-Back through the dome: from a point in the outer medium to the direction at the lens.
+Unprojection (`trace_pixel`) follows a pixel's ray from the lens into the outer medium. Projection
+(`direction_to_point`) finds the direction at the lens whose ray meets a point in the outer medium.
 
 In concentric spheres n * rho * sin(incidence) is constant along a ray (Bouguer; Born and Wolf,
 Principles of Optics, 3.2.1). With the lens at distance l from the centre and alpha the ray's angle
@@ -14,20 +13,19 @@ polar angle
 
 Solving theta(alpha) = angle of the point takes a few Newton steps. No angle is ever formed: each
 asin is the unit complex number (sqrt(1 - s^2), s), sums are products, and the residual is the sine
-of theta - target. Sines are carried divided by b, so that nothing breaks when the lens sits in the
+of theta - target. Sines are carried divided by b, so that nothing breaks when the lens is in the
 centre, where b vanishes.
 
-Derivatives of the direction at the lens, by the implicit function theorem.
-
+The derivatives of the projection follow from the implicit function theorem (`back_derivative`).
 With u the unit vector along which the direction turns as alpha grows, m the normal of the plane of
-refraction, and theta(alpha; rho, r, R, n) of `dome_back`, the derivative of the direction is
+refraction, and D = theta - alpha, the derivative of the direction is
 
     by the point   u (u_target / rho - theta_rho p)^T / theta_alpha + (k / rho) m m^T
     by the lens    (n_air dD/db / theta_alpha) u u^T + n_air (sin D / b) k m m^T
     by any other   -u theta_x / theta_alpha
 
-where k = sin alpha / sin theta, which becomes 1 / theta_alpha on the axis. None of it divides by
-the decentring.
+where k = sin alpha / sin theta, which becomes 1 / theta_alpha on the axis. No term divides by the
+decentring.
 """
 
 import math
@@ -130,13 +128,13 @@ def trace_direction(
 def trace_pixel(
     camera: CameraParams, u: float, v: float
 ) -> tuple[bool, float, float, float, float, float, float]:
-    """Trace the pixel (u, v) into the outer medium; for use inside other kernels.
+    """Trace the pixel (u, v) into the outer medium; callable from other kernels.
 
     Returns
     -------
     valid, ox, oy, oz, dx, dy, dz
-        Origin (metres) and unit direction in `dome`, as `Rays` has them. Where `valid` is False
-        the numbers mean nothing.
+        Origin (metres) and unit direction in `dome`, as in `Rays`. Where `valid` is False the
+        numbers are meaningless.
     """
     seen, cx, cy, cz = lens_direction(camera.lens, u, v)
     dx, dy, dz = dome_from_cam(camera, cx, cy, cz)
@@ -175,7 +173,7 @@ def trace_tangent(
 # A last Newton step below this leaves an error of its square times a factor of order one.
 STEP_SOLVED = 3e-8
 # Rounds of three steps: one is enough for a lens that looks outwards, two for one at 95 % of the
-# inner radius that looks sideways; what is left is searched for.
+# inner radius that looks sideways; the remaining cases are searched (`solve_guarded`).
 ROUNDS = 3
 # Points this much (relative) inside the outer surface are still on it: rounding, not geometry.
 SURFACE_SLACK = 1e-9
@@ -296,11 +294,11 @@ def three_steps(
 def solve_guarded(
     s: Surfaces, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[bool, float, float]:
-    """Solve theta(alpha) = target slowly and surely; returns (found, cos alpha, sin alpha).
+    """Solve theta(alpha) = target by bracketing; return (found, cos alpha, sin alpha).
 
-    Where total reflection is possible, theta may turn back near the critical angle and several
-    rays may reach a point. The one nearest to the forward axis is found; a point within a hair of
-    the caustic, where two of them merge, may be refused.
+    Slow, but safe. Where total reflection is possible, theta may turn back near the critical angle
+    and several rays may reach a point. The one nearest to the forward axis is found; a point very
+    close to the caustic, where two of them merge, may be refused.
     """
     target = math.atan2(sin_target, cos_target)
     sine = min(1.0 / max(n_l * steepest(s), _TINY), 1.0)
@@ -338,7 +336,7 @@ def _theta(s: Surfaces, n_l: float, alpha: float) -> float:
 def solve_alpha(
     s: Surfaces, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[bool, float, float]:
-    """Solve theta(alpha) = target; returns (found, cos alpha, sin alpha)."""
+    """Solve theta(alpha) = target; return (found, cos alpha, sin alpha)."""
     c, k = paraxial_start(s, n_l, cos_target, sin_target)
     for _ in range(ROUNDS):
         c, k, solved = three_steps(s, n_l, cos_target, sin_target, c, k)
@@ -398,7 +396,7 @@ _ON_AXIS = 1e-5
 
 
 class BackDerivative(NamedTuple):
-    """What the derivatives of a solved back projection are made of.
+    """Terms of the derivatives of a solved projection.
 
     Attributes
     ----------
@@ -459,10 +457,10 @@ def blend(p: float, a: Vector, q: float, b: Vector) -> Vector:
 
 @inline_kernel
 def across_axis(axis: Vector, e: Vector, spare: Vector) -> Vector:
-    """Return e made exactly perpendicular to the axis, or `spare` where nothing of it remains.
+    """Return e made exactly perpendicular to the axis, or `spare` where e is parallel to it.
 
-    Near the axis e is the quotient of two roundings. Any perpendicular vector will do there: the
-    derivatives do not depend on the azimuth.
+    Near the axis e is the quotient of two rounding errors. Any perpendicular vector serves there:
+    the derivatives do not depend on the azimuth.
     """
     along = dot(e, axis)
     e = blend(1.0, e, -along, axis)

@@ -1,11 +1,10 @@
-"""What a rig can measure: errors of the posture to a wall, from its calibration and from noise.
+"""Expected error of the posture to a wall, from a rig's calibration and from pixel noise.
 
-The plane m·X = 1 is fitted by least squares (paper, Eq. 23-26) at a wall square ahead,
-m = (0, 1/range, 0), each point weighed by what its pixel error makes of m·X. Errors of the pixels
-differ from point to point and from frame to frame; those of the calibration are the same in all
-frames of a dive, and no averaging removes them.
-
-Where a rig's stripes fall in the picture on a wall ahead, and what a pixel on them is worth.
+The plane m·X = 1 is fitted by least squares (paper, Eq. 23-26) to a wall square ahead,
+m = (0, 1/range, 0), each point weighted by the effect of its pixel error on m·X. The points are
+those of the stripes that the camera sees on the wall (`StripeView`). Pixel errors differ from point
+to point and from frame to frame; calibration errors are the same in all frames of a dive, and
+averaging does not reduce them.
 """
 
 from collections.abc import Sequence
@@ -52,7 +51,7 @@ class StripeView:
 
     @property
     def visible(self) -> bool:
-        """Whether there is a stripe in the picture that has a length."""
+        """Whether a stripe of nonzero length lies in the picture."""
         return len(self.pixels) > 1
 
     def thinned(self, n_points: int) -> "StripeView":
@@ -84,7 +83,7 @@ def point_per_pixel(camera: Camera, stripe: StripeView) -> FloatArray:
 
 
 def _stripe_on_wall(sheet: Sheet, wall_range: float) -> FloatArray:
-    """Points (N, 3) where a sheet cuts the wall y = `wall_range`; none if it is parallel."""
+    """Return points (N, 3) where a sheet cuts the wall y = `wall_range`; none if parallel."""
     line = _line_on_wall(sheet.plane, wall_range)
     if sheet.is_plane or not len(line):
         return line
@@ -114,7 +113,7 @@ SIGMA_PX = 0.1
 N_POINTS = 100
 """Points on every stripe that is long enough in the picture."""
 USUAL_RANGES = (0.3, 0.6, 1.0)
-"""Where errors are told, in metres."""
+"""Ranges at which errors are reported, in metres."""
 
 # Points on one line leave one direction of m·X = 1 to rounding.
 _SINGULAR = 1e-10
@@ -122,7 +121,7 @@ _SINGULAR = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class ExpectedError:
-    """What to expect on a wall square to the forward axis.
+    """Expected error of the posture to a wall square to the forward axis.
 
     Attributes
     ----------
@@ -191,7 +190,7 @@ def expected_posture_errors(
 
 @dataclass(frozen=True, slots=True)
 class WallView:
-    """The stripes that a rig sees on a wall square ahead, and what they say about it.
+    """The stripes that a rig sees on a wall square ahead, and the posture error they give.
 
     Attributes
     ----------
@@ -234,7 +233,7 @@ class WallView:
         return tuple(float(np.nanmedian(np.abs(s))) if len(s) else np.nan for s in self.slopes)
 
     def read_by(self, rig: Rig) -> FloatArray:
-        """Return range, pitch and yaw (3,) that a rig makes of the same pixels; NaN where none.
+        """Return range, pitch and yaw (3,) that a rig computes from the same pixels; NaN if none.
 
         The rig has the same lasers in the same order.
         """
@@ -292,13 +291,13 @@ class WallView:
         return points[good] * weights[:, None], weights
 
     def _sigma(self) -> FloatArray:
-        """Return what `SIGMA_PX` makes of m·X, for every point (N,)."""
+        """Return the standard deviation of m·X from `SIGMA_PX`, for every point (N,)."""
         # With m = (0, 1/range, 0) an error of a point changes m·X by its y part over the range.
         sigma: FloatArray = np.abs(np.concatenate([np.empty(0), *self.slopes]))
         return sigma * SIGMA_PX / self.wall_range
 
 
 def _sigmas(covariance: FloatArray) -> FloatArray:
-    # What cancels leaves rounding, which may be negative.
+    # Cancellation leaves rounding errors, which may be negative.
     sigmas: FloatArray = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return sigmas

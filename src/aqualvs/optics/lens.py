@@ -1,13 +1,10 @@
 """The lens: pixels to directions in `cam` and back, with OpenCV's two distortion models.
 
-Batch kernels of the lens: rows of pixels to rows of directions and back.
-
-Every kernel writes into arrays it is given, and NaN wherever it writes False into `valid`.
-
-The hot kernels work in blocks: rows of coordinates are copied into one flat scratch array, each
-quantity in a row of its own, and loops of constant length without branches run over it. One array
-and constant offsets let LLVM prove that nothing overlaps and use vector instructions; whatever
-needs a branch is done lane by lane in between.
+The batch kernels behind `Lens` write into arrays that they are given, and NaN wherever they write
+False into `valid`. The hot kernels work in blocks: rows of coordinates are copied into one flat
+scratch array, each quantity in a row of its own, and loops of constant length without branches run
+over it. One array and constant offsets let LLVM prove that nothing overlaps and use vector
+instructions; operations that need a branch are done lane by lane in between.
 """
 
 import math
@@ -237,7 +234,7 @@ _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 class LensModel(StrEnum):
-    """How a lens bends directions."""
+    """Distortion model of a lens."""
 
     OPENCV = "opencv"
     """Brown-Conrady and its rational extension, as `cv2.projectPoints`."""
@@ -271,9 +268,9 @@ class Lens:
 
     Notes
     -----
-    The distortion is believed only where it is monotone. Valid are directions inside the largest
-    disc round the image centre in which the Jacobian determinant of the distortion is positive,
-    and the pixels they map to: outside, two directions share a pixel.
+    The distortion is valid only where it is monotone: for directions inside the largest disc round
+    the image centre in which the Jacobian determinant of the distortion is positive, and for the
+    pixels they map to. Outside, two directions share a pixel.
     """
 
     model: LensModel = LensModel.OPENCV
@@ -283,7 +280,7 @@ class Lens:
     cy: float
     distortion: tuple[float, ...] = ()
     params: LensParams = field(init=False, repr=False, compare=False)
-    """What compiled kernels take."""
+    """Packed numbers for compiled kernels."""
 
     def __post_init__(self) -> None:
         _check(self)

@@ -1,13 +1,8 @@
-"""Scalar kernels of a lens of either model, with exact Jacobians.
+"""Scalar kernels of a lens: both distortion models of OpenCV, their inverses and exact Jacobians.
 
-A lens as compiled kernels take it.
-
-The distortion of OpenCV's fisheye model (Kannala and Brandt 2006) and its inverse.
-
-The distortion of OpenCV's pinhole model, its exact Jacobian and its inverse.
-
-"Normalised" coordinates are x/z and y/z of a direction in `cam`, "distorted" ones are those after
-the distortion: (u - cx)/fx and (v - cy)/fy.
+`LensParams` holds a lens as compiled kernels take it: the rational pinhole model (`opencv`) or the
+fisheye model (`fisheye`; Kannala and Brandt 2006). "Normalised" coordinates are x/z and y/z of a
+direction in `cam`, "distorted" ones are those after the distortion: (u - cx)/fx and (v - cy)/fy.
 """
 
 import math
@@ -72,7 +67,7 @@ def fisheye_distort(lens: LensParams, theta: float) -> tuple[float, float]:
 
 @inline_kernel
 def fisheye_undistort(lens: LensParams, radius: float) -> tuple[bool, float, float]:
-    """Solve fisheye_distort(theta) = radius; returns (valid, theta, slope there).
+    """Solve fisheye_distort(theta) = radius; return (valid, theta, slope there).
 
     Newton's method kept inside a bracket: the map is monotone up to `limit`.
     """
@@ -217,10 +212,10 @@ def opencv_undistort_round(
 
 @kernel
 def opencv_undistort_guarded(lens: LensParams, xd: float, yd: float) -> tuple[bool, float, float]:
-    """Solve distort(x, y) = (xd, yd) inside the limit, slowly and surely.
+    """Solve distort(x, y) = (xd, yd) inside the limit by damped steps; return (found, x, y).
 
     Newton's method from the image centre; every step that leaves the limit or does not lower the
-    residual is halved. Returns (found, x, y).
+    residual is halved. Slow, but safe.
     """
     x, y = 0.0, 0.0
     residual = math.hypot(xd, yd)
@@ -250,7 +245,7 @@ def opencv_undistort_guarded(lens: LensParams, xd: float, yd: float) -> tuple[bo
 
 @inline_kernel
 def opencv_undistort(lens: LensParams, xd: float, yd: float) -> tuple[bool, float, float]:
-    """Solve distort(x, y) = (xd, yd) to machine precision; returns (valid, x, y)."""
+    """Solve distort(x, y) = (xd, yd) to machine precision; return (valid, x, y)."""
     x, y = opencv_undistort_start(lens, xd, yd)
     for _ in range(ROUNDS):
         x, y, solved = opencv_undistort_round(lens, xd, yd, x, y)

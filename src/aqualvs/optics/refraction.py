@@ -14,7 +14,7 @@ def snell_weight(cos_in: float, ratio: float) -> tuple[float, float]:
     """Return (k, radicand) with refracted = ratio * direction + k * normal.
 
     `ratio` is n_in / n_out and the normal points into the incoming medium. A negative radicand
-    means total reflection; k is then finite and meaningless.
+    means total reflection; k is then finite but meaningless.
     """
     radicand = 1.0 - ratio * ratio * (1.0 - cos_in * cos_in)
     return ratio * cos_in - math.sqrt(max(radicand, 0.0)), radicand

@@ -1,6 +1,7 @@
 """The rig: one camera, its housing, the water and the lasers, in SI units.
 
-How well a rig is known: the joint covariance of its numbers, and how a rig moves by them.
+`RigUncertainty` is the joint covariance of a rig's numbers; `rig_moved_by` adds a small step to
+them. Planes of lasers are perturbed by rotations towards `tangent_basis` and by their offset.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,8 +44,8 @@ class Window:
         one shifts the light as a source would that is nearer to the outer face by a third of the
         pane (glass of index 1.5), to 0.12 mm for 6 mm tilted by 25 degrees.
     source : array, shape (3,)
-        Point in `dome` that the light fans out from, in metres. It lies in the laser's plane; what
-        it is off is projected away.
+        Point in `dome` that the light fans out from, in metres. It is projected onto the laser's
+        plane.
     """
 
     face: Plane
@@ -58,14 +59,14 @@ class Laser:
     Attributes
     ----------
     name : str
-        How reports call it.
+        Name in reports.
     plane : Plane
         The sheet in `dome`: in the water, or, behind a window, in the air of the laser's housing.
     window : Window or None
-        What bends the sheet; `aqualvs.optics.sheet` says where the light is then. None where the
-        sheet in the water is the plane.
+        Window that bends the sheet, see `aqualvs.optics.sheet`. None where the sheet in the water
+        is the plane.
     wavelength_nm : float or None
-        Of the light, in nanometres; None where nobody has said: green, 520 to 532.
+        Of the light, in nanometres; None if not stated: green, 520 to 532.
     """
 
     name: str
@@ -76,12 +77,12 @@ class Laser:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rig:
-    """Everything that turns a pixel on a stripe into a point.
+    """Camera, housing, water and lasers: the data needed to turn a stripe pixel into a point.
 
     Attributes
     ----------
     name : str
-        How reports call it.
+        Name in reports.
     size_px : (int, int)
         Image width and height.
     lens : Lens
@@ -95,9 +96,10 @@ class Rig:
     lasers : tuple of Laser
         In the order in which `points.parquet` numbers them.
     working_range : (float, float)
-        Nearest and farthest target range at which stripes are believed, in metres.
+        Nearest and farthest target range at which stripes are accepted, in metres.
     solved_from : mapping
-        What a calibration solved the rig from; kept and written back, never interpreted here.
+        Records of calibrations (`aqualvs.optics.solved`); kept and written back, not interpreted
+        here.
     """
 
     name: str
@@ -125,7 +127,7 @@ class Rig:
         )
 
     def bare_camera(self) -> BareCamera:
-        """Return the same camera without the dome: what ignoring refraction means."""
+        """Return the same camera without the dome, which ignores refraction."""
         return BareCamera(size_px=self.size_px, lens=self.lens, dome_from_cam=self.dome_from_cam)
 
     @property
@@ -148,8 +150,8 @@ LASER_WINDOW_PARAMETERS = (
     "source_1",
     "source_2",
 )
-"""The same of a laser's window, and shifts (metres) of the source along the `tangent_basis` of the
-laser plane's normal."""
+"""The same changes of a laser's window, and shifts (metres) of the source along the `tangent_basis`
+of the laser plane's normal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +184,7 @@ class RigUncertainty:
 
     @classmethod
     def independent(cls, sigmas: Mapping[str, float]) -> "RigUncertainty":
-        """Return the uncertainty of numbers that are known one by one, such as tolerances."""
+        """Return the uncertainty of independent numbers, such as tolerances."""
         return cls(tuple(sigmas), np.diag(np.array([*sigmas.values()], np.float64) ** 2))
 
     @property
@@ -206,23 +208,23 @@ class RigUncertainty:
 
 
 def merged(old: RigUncertainty, new: RigUncertainty) -> RigUncertainty:
-    """Return what is known of a rig after a calibration has solved some of its numbers anew.
+    """Return the uncertainty of a rig after a calibration has solved some of its numbers anew.
 
     The numbers of `new` replace those of `old`; the others keep their covariance with each other.
-    Between the two there is none: the new numbers come from new pictures, and whatever else they
-    were solved from must be among `new.names` itself. A solve that rests on numbers known before
-    (planes of lasers on a dome, say) therefore has to return the joint covariance of both; numbers
-    that it took as they are, and whose errors it passed on, would else look independent of them.
+    The covariance between the two groups is zero: the new numbers come from new pictures, and any
+    others that they were solved from must be in `new.names`. A solve that depends on numbers known
+    before (laser planes on the dome, say) therefore has to return the joint covariance of both;
+    otherwise its results would look independent of the inputs whose errors they carry.
     """
     kept = old.only([name for name in old.names if name not in new.names])
     return combined(new, kept)
 
 
 def combined(one: RigUncertainty, other: RigUncertainty) -> RigUncertainty:
-    """Return what two independent sources say together, such as a prior and a tolerance.
+    """Return the fusion of two independent uncertainties, such as a prior and a tolerance.
 
-    Numbers that only one of them knows are taken over with their covariance; numbers that both
-    know are known better, and so is what is correlated with them. The names of `one` come first.
+    Numbers that only one source knows are taken over with their covariance; numbers that both know
+    become more certain, and so do those correlated with them. The names of `one` come first.
     """
     shared = [name for name in one.names if name in other.names]
     n = len(one.names)
@@ -271,7 +273,7 @@ def laser_parameter_names(laser: Laser) -> tuple[str, ...]:
 def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
     """Return the names of all numbers of a rig that a `RigUncertainty` may hold.
 
-    The dome's are among them whether or not the rig has one: the same rig may be used without.
+    The dome's are included whether or not the rig has one: the same rig may be used without it.
     """
     lasers = (name for laser in rig.lasers for name in laser_parameter_names(laser))
     return (*POSE_PARAMETERS, *DOME_PARAMETERS, *rig.lens.parameter_names, *lasers)
@@ -283,7 +285,7 @@ def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     Raises
     ------
     RigError
-        If the moved rig cannot exist.
+        If the moved rig is not valid.
     """
     values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
     pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}

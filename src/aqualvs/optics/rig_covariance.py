@@ -1,15 +1,16 @@
-"""What a rig's own uncertainty makes of a posture: the part of its error that all frames share.
+"""Covariance of a posture from the uncertainty of the rig: the error that all frames share.
 
 A surface is fitted by weighted least squares to points on the lasers' sheets. An error of a rig's
-parameter moves the ray of a pixel, or the sheet that it meets, and so the point: by dX, of which
+parameter moves the ray of a pixel, or the sheet that it meets, and so the point: by dX, whose
+component off the surface is
 
     s·dX = q·(dp + t dv) - (s·v)/(g·v) df,    q = s - (s·v)/(g·v) g,
 
-leads off the surface, where s is the surface's normal, p + t v the ray, f the signed distance from
-the sheet and g its gradient. The fit answers with dc = (sum w a a^T)^-1 sum w a (s·dX), a being the
-terms of its coefficients c (for the plane m·X = 1: X itself), and range, pitch and yaw follow
-(paper, Eq. 23-26). Errors of a rig are smooth over the picture: derivatives of rays are taken once
-per rig on a lattice of pixels, and a few pixels stand for each stripe.
+where s is the surface's normal, p + t v the ray, f the signed distance from the sheet and g its
+gradient. The fit responds with dc = (sum w a a^T)^-1 sum w a (s·dX), a being the terms of its
+coefficients c (for the plane m·X = 1: X itself); range, pitch and yaw follow (paper, Eq. 23-26).
+Errors of a rig are smooth over the picture: derivatives of rays are taken once per rig on a lattice
+of pixels, and a few pixels represent each stripe.
 """
 
 from typing import NamedTuple
@@ -25,9 +26,9 @@ from aqualvs.optics.sheet import packed_sheets, sheet_distance, sheet_tangent, s
 
 # Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
 _LATTICE = (33, 25)
-# Stretches of stripe that stand for all of it: in all, and of each laser at least.
+# Segments of stripe that represent all of it: in total, and per laser at least.
 _BINS, _LEAST_BINS = 24, 3
-# Points that are summed at least, where there are as many.
+# Least number of points that are summed, where there are as many.
 _ENOUGH = 384
 # A pivot below this share of its diagonal is rounding, not information.
 _LEAST_PIVOT = 1e-12
@@ -41,11 +42,11 @@ class FittedSurface(NamedTuple):
     Attributes
     ----------
     terms : array, shape (N, K)
-        What the coefficients are multiplied by at each point.
+        Factors of the coefficients at each point.
     prior : array, shape (K,)
-        Information on each coefficient that is not the points'.
+        Prior information on each coefficient.
     normal : array, shape (3,), bend : array, shape (3, 3)
-        The gradient at X of what is fitted to zero is `normal + bend @ X`.
+        The gradient at X of the residual is `normal + bend @ X`.
     posture : array, shape (3, K)
         Derivatives of range, pitch and yaw by the coefficients.
     """
@@ -66,7 +67,7 @@ def fitted_plane(m: FloatArray, points: FloatArray) -> FittedSurface:
 
 
 class StripeSums(NamedTuple):
-    """Stripes on a surface with K coefficients, summed over short stretches, B of them.
+    """Sums over B short segments of the stripes on a surface with K coefficients.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class StripeSums(NamedTuple):
 
 
 class _SheetMoves(NamedTuple):
-    """Sheets, and where an uncertain parameter moves them; those of laser i are a range of rows."""
+    """Sheets, and their changes by the uncertain parameters; those of laser i are a row range."""
 
     sheets: FloatArray
     first: IntArray
@@ -99,7 +100,7 @@ class _SheetMoves(NamedTuple):
 
 
 class _Lattice(NamedTuple):
-    """Rays and their derivatives on a lattice.
+    """Rays and their derivatives on a lattice of pixels.
 
     `table`, shape (H, W, 1 + C, 6), holds origin and direction of a ray, then their derivatives by
     the camera's uncertain parameters; `scale`, shape (2,), leads from pixels to places on it.
@@ -110,7 +111,7 @@ class _Lattice(NamedTuple):
 
 
 class PostureErrors:
-    """Propagates the uncertainty of one rig to range, pitch and yaw.
+    """Propagation of the uncertainty of one rig to range, pitch and yaw.
 
     Parameters
     ----------
@@ -152,15 +153,15 @@ class PostureErrors:
         points: FloatArray,
         weights: FloatArray,
     ) -> FloatArray:
-        """Return what the rig makes of a posture, shape (3, 3): (range, pitch, yaw) in m and rad.
+        """Return the covariance (3, 3) of (range, pitch, yaw) by the rig, in m and rad.
 
         Parameters
         ----------
         surface : FittedSurface
-            That the posture is of.
+            Surface of the posture.
         pixels, laser, points, weights : array, shape (N, 2), (N,), (N, 3), (N,)
-            What it was fitted to, ordered along the stripes; weights are 1 over the variance of
-            what is fitted to zero, or 0.
+            Points that it was fitted to, ordered along the stripes; weights are 1 over the variance
+            of the residual, or 0.
         """
         found = np.zeros((3, 3))
         if len(self.names):
@@ -177,9 +178,9 @@ class PostureErrors:
         weights: FloatArray,
         each: int | None = None,
     ) -> StripeSums:
-        """Return a few stretches that stand for stripes; parameters as in `covariance_of`.
+        """Return a few segments that represent the stripes; parameters as in `covariance_of`.
 
-        `each` is how many of them a laser gets at most.
+        `each` is the largest number of them per laser.
         """
         each = each or max(_LEAST_BINS, -(-_BINS // max(self._n_lasers, 1)))
         room, k = each * self._n_lasers, len(surface.prior)
@@ -240,7 +241,7 @@ class PostureErrors:
 
 
 def _fill_blind(table: FloatArray, pixels: FloatArray) -> None:
-    """Give nodes that see nothing the values of the nearest one that does."""
+    """Give nodes without a ray the values of the nearest one that has a ray."""
     seen = np.isfinite(table).all(axis=(1, 2))
     if not seen.any():
         table[:] = 0.0
@@ -293,9 +294,9 @@ def _sum_up(
     pulls: FloatArray,
     matrix: FloatArray,
 ) -> int:
-    """Write sums over runs of equally many points, `each` runs of a laser at most; their count.
+    """Write sums over runs of equally many points, at most `each` runs per laser; return the count.
 
-    Of many points every second or third speaks for its neighbours.
+    If there are many points, only every second or third is summed, for its neighbours too.
     """
     chosen, n_chosen = np.empty(laser.shape[0], np.int64), 0
     for i in range(laser.shape[0]):

@@ -1,9 +1,9 @@
 """The rig file: `rig.yaml` to `Rig` and back.
 
-Files speak millimetres and degrees, `Rig` metres and radians. Whatever was loaded from a file is
-written back bit for bit; a rotation is written to 1e-12 degrees. docs/rig.md explains every key.
-
-Dated copies of files that are about to be replaced: `rig.2026-11-23T141503.yaml`, in UTC.
+Files use millimetres and degrees, `Rig` metres and radians. A value that was loaded from a file is
+written back bit for bit; a rotation is written to 1e-12 degrees. Before a file is replaced, a copy
+is kept under its date in UTC, such as `rig.2026-11-23T141503.yaml` (`keep_dated`). docs/rig.md
+explains every key.
 """
 
 import math
@@ -97,7 +97,7 @@ _MM = 1e3
 _ROTATION_DECIMALS = 12
 # Normals this close to unit length are kept as they are, so that loading and saving settle.
 _UNIT = 1e-14
-# A source measured with a ruler is as near as this to its laser's plane, in metres.
+# A source measured with a ruler lies at most this far off its laser's plane, in metres.
 _OFF_SHEET = 5e-3
 _LEAST_BEHIND = 1e-4
 # Cosine between the normals of sheet and window; nearer ones mean that no light could cross.
@@ -126,8 +126,8 @@ def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
 def save_rig(rig: Rig, path: str | Path, *, comments_of: str | Path | None = None) -> Path | None:
     """Write a rig file that `load_rig` turns into the same rig; an old file is replaced at once.
 
-    A rig file that is there is kept under a dated name, such as `rig.2026-11-23T141503.yaml` (UTC),
-    unless it holds the same already. Its comments go over to the new one.
+    An existing rig file is kept under a dated name, such as `rig.2026-11-23T141503.yaml` (UTC),
+    unless its content is the same. Its comments are carried over to the new file.
 
     Parameters
     ----------
@@ -139,14 +139,14 @@ def save_rig(rig: Rig, path: str | Path, *, comments_of: str | Path | None = Non
     Returns
     -------
     copy : Path or None
-        Under which the old file is kept.
+        Path under which the old file is kept.
 
     Raises
     ------
     OutputError
         If the file cannot be written, or `path` is a file but no rig.
     RigError
-        If `solved_from` holds what YAML cannot.
+        If `solved_from` holds a value that YAML cannot represent.
     """
     target, copy = Path(path), None
     text = rig_text(rig_to_mapping(rig))
@@ -189,7 +189,7 @@ def _old_rig(path: Path) -> str:
     Raises
     ------
     OutputError
-        If it is none: whoever wrote it did not mean it to become a rig.
+        If the file is no rig file, and so must not be replaced by one.
     """
     try:
         text = read_text(path, "a rig file", OutputError)
@@ -234,7 +234,7 @@ def rig_from_mapping(
     mapping : mapping
         As `rig_to_mapping` gives it, or as YAML reads it.
     source_name : str
-        How messages call the file.
+        Name of the file in messages.
     need_lasers : bool
         As in `load_rig`.
 
@@ -247,7 +247,7 @@ def rig_from_mapping(
     try:
         rig = _rig(file)
         _check_whole(file, need_lasers)
-        # Whatever measures with the rig asks for it.
+        # Every measurement with the rig reads the uncertainty.
         rig_uncertainty(rig)
     except AqualvsError as error:
         raise RigError(f"{source_name}: {error}") from None
@@ -293,7 +293,7 @@ def _distortion(file: RigFile) -> tuple[float, ...]:
 
 
 def _water_index(water: WaterPart, n_air: float) -> float:
-    """Index of the water relative to vacuum, as given or from Quan & Fry (1995)."""
+    """Return the water's index relative to vacuum, as given or from Quan & Fry (1995)."""
     measured = (water.temperature_c, water.salinity_permille, water.wavelength_nm)
     if water.n is not None:
         if any(value is not None for value in measured):
@@ -330,7 +330,7 @@ def _laser(place: str, part: LaserPart) -> Laser:
 
 
 def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Window) -> None:
-    """Refuse a source off its sheet or not behind the window, and a window no light crosses."""
+    """Refuse a source off its sheet or not behind the window, and a window without any light."""
     off = float(sheet.signed_distance(window.source))
     if abs(off) > _OFF_SHEET:
         raise RigError(
@@ -347,7 +347,7 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
     source = window.source - off * sheet.normal
     ahead = np.array([0.0, 1.0, 0.0]) - sheet.normal[1] * sheet.normal
     behind = -float(window.face.signed_distance(source))
-    # Light that goes forward must meet the face after it has left the source.
+    # Light that goes forward must meet the face after leaving the source.
     if abs(behind) < _LEAST_BEHIND or behind * float(window.face.normal @ ahead) < 0.0:
         raise RigError(
             f"{place}.source_mm is {source_mm}, which is not behind the window as a target ahead "
@@ -356,7 +356,7 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
 
 
 def _plane(place: str, normal: Sequence[float], offset_mm: float) -> Plane:
-    """Plane with the direction of `normal`; the offset belongs to the unit normal."""
+    """Return the plane with the direction of `normal`; the offset belongs to the unit normal."""
     vector: FloatArray = np.array(normal, dtype=np.float64)
     length = math.hypot(*normal)
     if length == 0.0:
@@ -435,10 +435,10 @@ def _all_to_mm(values: FloatArray | Sequence[float]) -> list[float]:
 
 
 def _to_mm(metres: float) -> float:
-    """Millimetres, as few digits as lead back to the same number of metres when loaded.
+    """Return millimetres with the fewest digits that load as the same number of metres.
 
-    A few numbers of metres are the thousandth of no float; they come back one unit in the last
-    place away.
+    A few numbers of metres are not a thousandth of any float; they come back off by one unit in the
+    last place.
     """
     value = float(metres) * _MM
     for digits in (15, 16, 17):
@@ -450,7 +450,7 @@ def _to_mm(metres: float) -> float:
 
 
 def _plain(value: object, place: str) -> Any:
-    """Turn NumPy values, tuples and paths into what YAML knows."""
+    """Convert NumPy values, tuples and paths to types that YAML can represent."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):

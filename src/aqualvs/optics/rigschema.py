@@ -1,7 +1,7 @@
-"""What a rig file may contain, and one line about what is wrong with it.
+"""Schema of the rig file: allowed keys and types, with one-line error messages.
 
-`parse_rig` checks the shape of the file alone: keys, types, limits of single values. What a rig
-must fulfil as a whole (the lens inside the dome, say) is checked in `rigfile`.
+`parse_rig` checks the shape of the file alone: keys, types, limits of single values. Conditions on
+the rig as a whole (the lens inside the dome, say) are checked in `aqualvs.optics.rigfile`.
 """
 
 import difflib
@@ -55,7 +55,7 @@ class CameraPart(_Part):
 
 
 class DomePart(_Part):
-    """`dome`: two concentric spheres and what is between them."""
+    """`dome`: two concentric spheres and the material between them."""
 
     inner_radius_mm: Positive
     thickness_mm: NotNegative
@@ -63,7 +63,7 @@ class DomePart(_Part):
 
 
 class WaterPart(_Part):
-    """`water`: its index, or what the index follows from."""
+    """`water`: its index, or the temperature and salinity that determine it."""
 
     n: Index | None = None
     temperature_c: Number | None = None
@@ -72,7 +72,7 @@ class WaterPart(_Part):
 
 
 class WindowPart(_Part):
-    """`window` of a laser: its outer face in `dome`, and where the light comes from."""
+    """`window` of a laser: its outer face in `dome`, and the light source."""
 
     normal: Triple
     offset_mm: Number
@@ -110,9 +110,9 @@ def parse_rig(content: object, source_name: str) -> RigFile:
     Parameters
     ----------
     content : object
-        What YAML made of the file.
+        Content of the file as read from YAML.
     source_name : str
-        How the message calls the file.
+        Name of the file in messages.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
 
 
 def _first_fault(error: ValidationError) -> str:
-    """One line on the fault to mend first; a misspelt key explains the one that is missing."""
+    """Return one line on the fault to mend first; a misspelt key explains the missing one."""
     faults = error.errors(include_url=False)
     unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
     return _sentence((unknown or faults)[0])

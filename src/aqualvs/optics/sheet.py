@@ -1,10 +1,8 @@
-"""Sheets of laser light as they are in the water: planes, or bent at a flat window.
+"""Sheets of laser light in the water: planes, or curved behind a flat window.
 
-A laser behind a window that is tilted to its beam lights no plane: the sheet leaves the window as
-another plane would, then strays from it by millimetres within the working range, and moves with the
-water's index. A `Sheet` answers for both kinds; `aqualvs.optics.sheet` has the mathematics.
-
-The sheet of a line laser behind a flat window: its implicit form, in compiled kernels.
+A laser behind a window that is tilted to its beam does not light a plane: the sheet leaves the
+window as another plane would, then deviates from it by millimetres within the working range, and
+moves with the water's index. A `Sheet` covers both cases.
 
 In air the sheet is the plane n·X = d, fanned out from a source S in it. The window's outer face
 w·X = c lies s in front of S; a point X in the water lies h in front of the face and, seen along w,
@@ -46,7 +44,7 @@ from aqualvs.optics.rig import (
 )
 
 START = 0
-"""A plane near the sheet, normal and offset: where searches along rays begin. The sheet itself
+"""A plane near the sheet, normal and offset, at which searches along rays begin. The sheet itself
 where there is no window."""
 NORMAL, OFFSET, FACE, SOURCE, DEPTH, RATIO, SLANT, WINDOWED = 4, 7, 8, 11, 14, 15, 16, 17
 """n, d, w (from the source to the water), S, s, k, n·w, and 1 where there is a window."""
@@ -58,7 +56,7 @@ _LAST_STEP = 1e-9
 # Along a ray: sheets bend with radii of metres, so the error after such a step (m) is below 1e-12.
 _LAST_STEP_ALONG = 1e-6
 _MAX_STEPS_ALONG = 20
-# Where the plane near the sheet gives no sensible place on the ray, the search begins here.
+# Start of the search where the plane near the sheet gives no usable place on the ray.
 _FARTHEST_START = 10.0
 
 
@@ -84,9 +82,9 @@ def _steepness(s: float, h: float, k: float, rho: float) -> float:
 def crossing(
     row: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, float, float, float]:
-    """Return f, the way from the source to where light to a point leaves the window, and h.
+    """Return f, the vector from the source to the point where light leaves the window, and h.
 
-    The way (three numbers) is meaningless unless h, the point's height above the face, is positive.
+    The vector (three numbers) is valid only if h, the point's height above the face, is positive.
     """
     vx, vy, vz = x - row[SOURCE], y - row[SOURCE + 1], z - row[SOURCE + 2]
     height = row[FACE] * vx + row[FACE + 1] * vy + row[FACE + 2] * vz
@@ -129,8 +127,8 @@ def differential(
 ) -> tuple[float, float, float, float, float, float, float, float, float, float, float, float]:
     """Return f, and f's derivatives by the seven numbers that it depends on, then height, L.
 
-    The derivatives are those by n·(X - S), by n·w, by w·(X - S), h, s, L² and k: whatever moves,
-    point or parameter, moves these.
+    The derivatives are those by n·(X - S), by n·w, by w·(X - S), h, s, L² and k: a change of the
+    point or of any parameter acts through these.
     """
     vx, vy, vz = x - row[SOURCE], y - row[SOURCE + 1], z - row[SOURCE + 2]
     height = row[FACE] * vx + row[FACE + 1] * vy + row[FACE + 2] * vz
@@ -201,10 +199,10 @@ def meet_sheet(
     dz: float,
     near: float,
 ) -> tuple[float, float, float, float]:
-    """Return where a ray meets a windowed sheet's part in the water, and f's gradient there.
+    """Return the distance along a ray to a windowed sheet in the water, and f's gradient there.
 
-    `near` is a guess of the distance along the ray. The distance found is NaN where Newton's
-    method finds none ahead.
+    `near` is an initial guess of the distance, which is NaN where Newton's method finds no
+    intersection ahead.
     """
     t = near if 0.0 < near < _FARTHEST_START else 1.0
     gx, gy, gz = 0.0, 0.0, 0.0
@@ -278,7 +276,7 @@ Only the ratio of the indices matters: the derivative by `n_air` is that by `n_w
 -n_water / n_air.
 """
 
-# How far beyond the window the sheet's tangent plane stands for all of it, in metres.
+# Distance beyond the window at which the tangent plane represents the sheet, in metres.
 _USUAL_REACH = 0.6
 # Rays to each side on which a plane is fitted to a sheet.
 _GRID = (33, 25)
@@ -314,12 +312,12 @@ class Sheet:
 
     @property
     def source(self) -> FloatArray:
-        """Where the light fans out from, exactly in the plane, shape (3,).
+        """Point that the light fans out from, exactly in the plane, shape (3,).
 
         Raises
         ------
         ValueError
-            If there is no window: then nobody needs to know.
+            If there is no window: the source is then not known, and not needed.
         """
         if self.window is None:
             raise ValueError("a sheet without a window has no source")
@@ -328,11 +326,11 @@ class Sheet:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """What `signed_distance_with_parameter_jacobian` and `moved_by` call parameters."""
+        """Parameters of `signed_distance_with_parameter_jacobian` and `moved_by`, in order."""
         return LASER_PARAMETERS + (() if self.window is None else WINDOW_PARAMETERS)
 
     def laser(self, like: Laser) -> Laser:
-        """Return a laser with this sheet, for a rig; the rest is another's."""
+        """Return a laser with this sheet, and the other attributes of `like`."""
         return replace(like, plane=self.plane, window=self.window)
 
     def signed_distance(self, points: ArrayLike) -> FloatArray:
@@ -341,8 +339,8 @@ class Sheet:
         Exact for planes. Behind a window it is exactly zero on the sheet and grows by a metre a
         metre to 1 %, half a metre from a source that is 20 mm behind a window tilted by 25 degrees
         to the sheet (5 % if it is tilted along the sheet by as much again); less tilt, a nearer
-        source or more distance make it better. What lies behind the window's face is measured from
-        the plane in air. The sign is that of `plane`.
+        source or more distance reduce the error. The distance of points behind the window's face is
+        that from the plane in air. The sign is that of `plane`.
         """
         p = as_vectors(points, 3, "points")
         if self.window is None:
@@ -392,7 +390,7 @@ class Sheet:
     def best_plane(self, camera: Camera, working_range: tuple[float, float]) -> Plane:
         """Return the plane that fits the sheet best where the camera sees it.
 
-        For whatever needs no more than roughly a plane: frames of drawings, the mesh filter, first
+        For uses that need only an approximate plane: frames of drawings, the mesh filter, initial
         guesses. Without a window it is `plane`.
 
         Parameters
@@ -415,7 +413,7 @@ class Sheet:
         return self._fitted(points[(distance >= near) & (distance <= far)])
 
     def shine(self, directions: ArrayLike) -> tuple[Rays, FloatArray]:
-        """Send light from the source through the window.
+        """Trace light from the source through the window.
 
         Parameters
         ----------
@@ -535,7 +533,7 @@ class Sheet:
         row = np.zeros(COLUMNS)
         for first in (START, NORMAL):
             row[first : first + 3], row[first + 3] = self.plane.normal, self.plane.offset
-        # Any point of the plane is as good a source as another where nothing bends the light.
+        # Without a window any point of the plane serves as the source.
         row[SOURCE:DEPTH], row[RATIO] = self.plane.normal * self.plane.offset, 1.0
         if self.window is None:
             return row
@@ -550,7 +548,7 @@ class Sheet:
         return row
 
     def _plane_beyond(self, row: FloatArray, source: FloatArray, face: FloatArray) -> Plane:
-        """Tangent plane where the light that is squarest to the window is `_USUAL_REACH` away."""
+        """Return the tangent plane `_USUAL_REACH` along the light squarest to the window."""
         inward = face - row[SLANT] * self.plane.normal
         length = float(np.linalg.norm(inward))
         if length < 1e-6:
@@ -564,7 +562,7 @@ class Sheet:
         return Plane.from_normal(gradient, float(gradient @ at - tangent[0, 0]))
 
     def _fitted(self, points: FloatArray) -> Plane:
-        """Plane through points on the sheet, by least squares; the tangent plane if too few."""
+        """Return the least-squares plane of points on the sheet; the tangent plane if too few."""
         start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
         if len(points) < 3:
             return start
@@ -592,7 +590,7 @@ def packed_sheets(rig: Rig, camera: Camera) -> FloatArray:
     rig : Rig
         Lasers, indices and working range.
     camera : Camera
-        Searches along its rays begin at the planes that fit best where it sees the sheets.
+        Searches along its rays begin at the planes that best fit the sheets in its view.
     """
     rows = [s.packed(s.best_plane(camera, rig.working_range)) for s in sheets_of(rig)]
     return np.array(rows).reshape(-1, COLUMNS)

@@ -1,6 +1,7 @@
-"""What calibrations note down in a rig: when and from what it was solved, and how well.
+"""Calibration records of a rig: date, data and residuals of each step, and the uncertainty.
 
-It stands in `Rig.solved_from`, and so in the rig file, in millimetres and degrees (docs/rig.md)::
+They are kept in `Rig.solved_from`, and so in the rig file, in millimetres and degrees
+(docs/rig.md)::
 
     solved_from:
       dome: {date: '2026-05-04T09:30:00Z', pictures: 14, points: 3040, rms_px: 0.09}
@@ -11,9 +12,9 @@ It stands in `Rig.solved_from`, and so in the rig file, in millimetres and degre
         - [0.93]
         - [-0.2, 0.1]
 
-Of a rig whose numbers are the truth because something was rendered with it: `uncertainty: exact`.
-
-Uncertainty of what nobody has calibrated: stated defaults for numbers written by hand.
+`uncertainty: exact` marks a rig whose numbers are the truth because pictures were rendered with it.
+Numbers that were never calibrated, such as those written by hand, get stated default uncertainties
+(`assumptions`, `completed_uncertainty`).
 """
 
 import difflib
@@ -58,7 +59,7 @@ STEPS = ("camera", "dome", "lasers", "water")
 ASSUMED = "assumed"
 """Extra of a `SolvedStep`: numbers that it took with a default uncertainty, by their file names."""
 EXACT = "exact"
-"""What stands in place of an uncertainty where a rig's numbers are exact."""
+"""Value in place of an uncertainty where a rig's numbers are exact."""
 
 _UNCERTAINTY = "uncertainty"
 _PLACE = f"solved_from.{_UNCERTAINTY}"
@@ -81,18 +82,18 @@ _NOT_NEGATIVE = -1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedStep:
-    """From what a calibration solved its part of a rig.
+    """Record of a calibration step: its date, data and residuals.
 
     Attributes
     ----------
     date : datetime
         With a time zone.
     pictures, points : int
-        That were used; points are corners or stripe points.
+        Number used; points are corners or stripe points.
     rms_px : float
         Root mean square residual of a coordinate, in pixels.
     extras : mapping
-        Anything else worth keeping: numbers, words, lists of them.
+        Other values to keep: numbers, strings, lists of them.
     """
 
     date: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -109,7 +110,7 @@ class SolvedStep:
             raise ValueError(f"extras hold {sorted(taken)}, which have fields of their own")
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the step as it stands in a rig file; the date to the second, in UTC."""
+        """Return the step as written in a rig file; the date to the second, in UTC."""
         utc = self.date.astimezone(UTC)
         return {
             "date": utc.strftime("%Y-%m-%dT%H:%M:%SZ"),
@@ -139,21 +140,21 @@ class SolvedStep:
 
 
 def with_step(rig: Rig, name: str, step: SolvedStep) -> Rig:
-    """Return the rig with a note of what one of `STEPS` was solved from; an older one goes."""
+    """Return the rig with the record of one of `STEPS` added; an older one is replaced."""
     if name not in STEPS:
         raise ValueError(f"{name!r} is none of {STEPS}")
     return _noting(rig, {name: step.to_mapping()})
 
 
 def solved_steps(rig: Rig) -> dict[str, SolvedStep]:
-    """Return what calibrations have noted down, by the names in `STEPS`, in that order.
+    """Return the records of calibrations, by the names in `STEPS`, in that order.
 
-    A note of the user under one of these names that carries no date is none of theirs.
+    An entry under one of these names without a date is a note of the user and is left out.
 
     Raises
     ------
     RigError
-        One line, if a note cannot be understood.
+        One line, if a record is malformed.
     """
     notes = ((name, rig.solved_from.get(name)) for name in STEPS)
     return {
@@ -166,14 +167,14 @@ def solved_steps(rig: Rig) -> dict[str, SolvedStep]:
 def with_uncertainty(rig: Rig, uncertainty: RigUncertainty) -> Rig:
     """Return the rig with its uncertainty written down in place of any older one.
 
-    Numbers that the rig does not have, such as those of a laser that was taken off, are left out.
+    Numbers that the rig does not have, such as those of a removed laser, are left out.
     """
     kept = uncertainty.only(rig_parameter_names(rig))
     return _noting(rig, {_UNCERTAINTY: _to_mapping(kept) if kept.names else None})
 
 
 def with_exact_numbers(rig: Rig) -> Rig:
-    """Return the rig with the note that its numbers are exact, as of what simulations see."""
+    """Return the rig with the note that its numbers are exact, as in simulations."""
     return _noting(rig, {_UNCERTAINTY: EXACT})
 
 
@@ -183,12 +184,12 @@ def is_exact(rig: Rig) -> bool:
 
 
 def rig_uncertainty(rig: Rig) -> RigUncertainty:
-    """Return the uncertainty that is written down in a rig, or none; zero for one that is exact.
+    """Return the uncertainty written down in a rig; zero for one that is exact or has none.
 
     Raises
     ------
     RigError
-        One line, if it is malformed, no covariance, or of numbers that the rig does not have.
+        One line, if it is malformed, not a covariance, or of numbers that the rig does not have.
     """
     content = rig.solved_from.get(_UNCERTAINTY)
     if content is None:
@@ -216,13 +217,13 @@ def _noting(rig: Rig, notes: Mapping[str, Any]) -> Rig:
 
 
 def file_parameter_name(name: str) -> str:
-    """Return how a rig file calls a number of the rig: with its unit."""
+    """Return the name of a number of the rig in a rig file, with its unit."""
     unit, _ = _unit(name)
     return f"{name}_{unit}" if unit else name
 
 
 def _unit(name: str) -> tuple[str, float]:
-    """Return the unit of a number in a file, and how many of it make up one in SI and radians."""
+    """Return the unit of a number in a file, and its ratio to the unit in SI and radians."""
     return _UNIT_OF.get(name.rpartition(":")[2], ("", 1.0))
 
 
@@ -346,9 +347,9 @@ class Assumption:
     Attributes
     ----------
     what : str
-        In words.
+        Name of the group of numbers.
     words : str
-        The standard deviations in words.
+        The standard deviations as text.
     uncertainty : RigUncertainty
     """
 
@@ -358,12 +359,12 @@ class Assumption:
 
 
 def assumptions(rig: Rig) -> tuple[Assumption, ...]:
-    """Return the defaults for what a rig does not say the uncertainty of.
+    """Return the default uncertainties of the numbers that have none in the rig.
 
     A group of numbers (intrinsics, place of the lens, dome, water, each laser) of which
-    `solved_from.uncertainty` names one was calibrated; what it does not name of the group was held
-    there, and counts as exact. Exact by definition are the origin and the axes of the frame `dome`
-    as far as nothing physical fixes them: the camera's rotation, and a bare lens's place.
+    `solved_from.uncertainty` names one was calibrated; the others of the group were held fixed and
+    count as exact. The origin and the axes of the frame `dome` are exact by definition where
+    nothing physical fixes them: the camera's rotation, and a bare lens's place.
 
     Raises
     ------
@@ -375,7 +376,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
 
 
 def completed_uncertainty(rig: Rig) -> RigUncertainty:
-    """Return the uncertainty written down in a rig, with the defaults for what it leaves out.
+    """Return the uncertainty written down in a rig, with the defaults for the other numbers.
 
     Raises
     ------
@@ -394,9 +395,9 @@ def completed_uncertainty(rig: Rig) -> RigUncertainty:
 
 
 def _settled_by(one: Assumption) -> tuple[str, ...]:
-    """Return the numbers any of which tells that a calibration has dealt with the group."""
+    """Return the numbers any of which shows that the group was calibrated."""
     names = one.uncertainty.names
-    # The dome's calibration decides which of its sizes are uncertain.
+    # The calibration of the dome decides which of its sizes are uncertain.
     return (*names, *_LENS) if names[0] in _SHELL else names
 
 
@@ -429,7 +430,7 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
 
 
 def _intrinsics(rig: Rig) -> Assumption:
-    """Return that of the lens: fx and fy err together but for the pixels' aspect."""
+    """Return that of the lens: the errors of fx and fy are equal but for the pixels' aspect."""
     lens = rig.lens
     centre = CENTRE_SHARE * rig.size_px[0]
     sigmas = {"fx": FOCAL_SHARE * lens.fx, "fy": FOCAL_SHARE * lens.fy, "cx": centre, "cy": centre}

@@ -55,7 +55,7 @@ def seawater_index(
     Returns
     -------
     array
-        The three broadcast together.
+        Of the broadcast shape of the three.
 
     Raises
     ------

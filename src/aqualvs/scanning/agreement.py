@@ -1,22 +1,17 @@
-"""Whether the lasers agree with each other on flat targets, and which one has drifted if not.
+"""Agreement of the lasers over a dive: detection of a laser whose sheet has moved.
 
-Two lines on a flat target share a plane, three more so: a laser whose sheet is no longer where the
-rig says leaves it. What one frame shows of that is little (of three lines, each with a shift and a
+Two lines on a flat target share a plane, and so do three: a laser whose sheet is no longer where
+the rig says leaves it. One frame shows little of that (of three lines, each with a shift and a
 turn, the target's own plane takes three numbers), but a sheet that has moved has done so by the
-same three numbers in all frames, at every range and angle of the target, and no bulge of a net or
-fish in front of it follows that pattern. So each laser in turn is taken for the one that has moved,
-and it is named if that explains all frames, and no other does.
+same three numbers in all frames, at every range and angle of the target; no bulge of a net or fish
+in front of it follows that pattern. So each laser in turn is assumed to have moved, and it is named
+if that explains all frames and no other laser does.
 
-Where each laser's stripe runs in one frame, in a few robust numbers, whatever its label.
-
-A laser that has drifted leaves the target's plane, and its points are then labelled as clutter or
-as another surface; here they count all the same.
-
-The fit behind `LaserAgreement`: flat targets of many frames, and one laser that may have moved.
-
-Every frame has a target plane m·X = 1 of its own. One laser's sheet, the same in all frames, may
-have turned and shifted by a small step of three numbers; the planes are eliminated from the normal
-equations (Schur complement), and weights are Tukey's.
+`bin_stripes` summarises each stripe of a frame by the middle of its light in a few bins, whatever
+its label: the points of a laser that has drifted are labelled as clutter or as another surface.
+`explain` fits a plane m·X = 1 to each frame and one step of three numbers (turns and shift) to one
+laser's sheet in all frames; the planes are eliminated from the normal equations (Schur complement),
+and weights are Tukey's. `LaserAgreement` collects the frames and gives the verdict.
 """
 
 import math
@@ -39,13 +34,13 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.scan import Scan, ScanPoints
 
 N_BINS = 12
-"""Pieces of a stripe, from one border of the picture to the other."""
+"""Bins of a stripe, from one border of the picture to the other."""
 
 # Points farther from the target's plane than this share of the range belong to something else: two
 # degrees of a laser are a quarter of the range at worst.
 _GATE = 0.4
-# In a piece, points within three times the typical scatter of the median are the stripe, but no
-# fewer than those within the first of these shares of the range and no more than the second.
+# In a bin, points within three times the typical scatter of the median are the stripe; the limit is
+# at least the first of these shares of the range and at most the second.
 _NEAR, _FAR = 0.003, 0.02
 _SCATTER = 4.4  # three sigmas in median absolute deviations
 _MIN_POINTS = 4
@@ -55,7 +50,7 @@ _MIN_SHARE = 0.6
 def bin_stripes(
     points: ScanPoints, m: FloatArray, along_x: IntArray, size_px: tuple[int, int]
 ) -> FloatArray:
-    """Return the middle of the light in each piece of each laser's stripe.
+    """Return the middle of the light in each bin of each laser's stripe.
 
     Parameters
     ----------
@@ -71,7 +66,7 @@ def bin_stripes(
     Returns
     -------
     array, shape (L, N_BINS, 2)
-        In `image`; NaN where a piece shows no stripe, or too much beside it.
+        In `image`; NaN where a bin shows no stripe, or too much beside it.
     """
     middle = np.full((len(along_x), N_BINS, 2), np.nan)
     _bin_stripes(
@@ -136,7 +131,7 @@ def _middle(
     width: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write the middle of the light of those points that lie together."""
+    """Write the middle of the light of the points that lie together."""
     values = off[rows]
     median = np.median(values)
     near_by = min(max(_SCATTER * np.median(np.abs(values - median)), _NEAR), _FAR)
@@ -154,14 +149,14 @@ def _middle(
 
 
 CUT = 4.0
-"""Residuals beyond so many sigmas cost as much as this and no more."""
+"""Cost limit of residuals, in sigmas: larger residuals count as this."""
 
-# Error of a piece of stripe that stays from frame to frame: texture, strands, the glow beside the
-# sheet, in pixels; and what a target may be uneven, as a share of the range.
+# Error of a bin of stripe that stays from frame to frame: texture, strands, the glow beside the
+# sheet, in pixels; and the unevenness that a target may have, as a share of the range.
 _SIGMA_PX, _UNEVEN = 0.25, 7e-4
-# A laser that was knocked has turned rather than shifted; and hardly by more.
+# Prior of a step: a laser that was knocked has turned rather than shifted, and hardly by more.
 _PRIOR = np.array([np.deg2rad(1.5), np.deg2rad(1.5), 0.005])
-# Steps are not followed beyond this; no laser of which anything is seen is so far off.
+# Limit of the steps; a laser so far off would not be seen at all.
 _FARTHEST = np.array([0.2, 0.2, 0.05])
 _STEP_PX = 0.25
 _TUKEY = 4.685  # 95 % efficiency for normal errors
@@ -172,7 +167,7 @@ _LEAST, _RIDGE = 1e-6, 1e-12
 
 @dataclass(frozen=True, slots=True)
 class SeenStripes:
-    """What was seen of flat-looking targets, as rays; F frames, L lasers, K pieces.
+    """Stripes on flat-looking targets, as rays; F frames, L lasers, K bins.
 
     Attributes
     ----------
@@ -205,7 +200,7 @@ class SeenStripes:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """How well the frames are explained, by one laser that has moved or by none.
+    """Fit of the frames under the hypothesis that one laser, or none, has moved.
 
     Attributes
     ----------
@@ -220,8 +215,8 @@ class Explanation:
     effect : float
         Root mean square distance of that laser's stripe from the targets, as a share of range.
     information : array, shape (3 L, 3 L)
-        Of the steps of all lasers, from a typical frame: what is wrong with a stripe is so in all
-        frames, so more of them do not tell more.
+        Of the steps of all lasers, from a typical frame: errors of a stripe are the same in all
+        frames, so more frames add no information.
     """
 
     laser: int | None
@@ -232,13 +227,13 @@ class Explanation:
     information: FloatArray
 
     def covariance(self) -> FloatArray:
-        """Return the covariance (3, 3) of `step`, with what is known of it beforehand."""
+        """Return the covariance (3, 3) of `step`, including its prior."""
         own = self._own()
         total = self.information[own, own] + np.diag(_PRIOR**-2.0)
         return np.asarray(np.linalg.inv(total), dtype=np.float64)
 
     def spill(self) -> FloatArray:
-        """Return what a step of any laser (3 L) does to `step`, shape (3, 3 L)."""
+        """Return the derivative (3, 3 L) of `step` by the steps of all lasers (3 L)."""
         spill: FloatArray = self.covariance() @ self.information[self._own()]
         return spill
 
@@ -284,7 +279,7 @@ def explain(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) ->
 
 
 def _toward(fit: "_Fit", view: "_View", laser: int, step: FloatArray) -> FloatArray:
-    """Newton's step, to be subtracted, for the step of one laser."""
+    """Return Newton's correction, to be subtracted, of the step of one laser."""
     slope = np.zeros((*view.seen.shape, 3))
     mine = _pieces(laser)
     slope[:, mine] = fit.slopes(view)[:, mine]
@@ -305,7 +300,7 @@ def _moved(sheet: Sheet, step: FloatArray) -> Sheet:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """Points of stripes on the sheets as they are assumed; frames first, lasers' pieces in one.
+    """Points of stripes on the assumed sheets; frames first, the bins of all lasers in one axis.
 
     Attributes
     ----------
@@ -355,7 +350,7 @@ def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
     normal, by_parameter = normal.reshape(*shape, 3), by_parameter[:, :3].reshape(*shape, 3)
     approach = np.einsum("fki,fki->fk", normal, directions)
     by_step = -directions[..., None] * (by_parameter / approach[..., None])[..., None, :]
-    # The ray beside meets the sheet's tangent plane.
+    # The neighbouring ray meets the sheet's tangent plane.
     origin, direction = stripes.beside[laser, ..., 0], stripes.beside[laser, ..., 1]
     reach = np.einsum("fki,fki->fk", normal, points - origin)
     reach /= np.einsum("fki,fki->fk", normal, direction)
@@ -365,7 +360,7 @@ def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Planes of all frames, and residuals.
+    """Planes fitted to all frames, and their residuals.
 
     Attributes
     ----------
@@ -386,7 +381,7 @@ class _Fit:
     def of(cls, view: _View, weight: FloatArray) -> "_Fit":
         """Fit a plane to each frame; `weight` tells outliers from the rest."""
         x = view.points
-        # A frame all of whose pieces are outliers keeps some plane, which says nothing.
+        # A frame with outliers only keeps some plane, which has no influence.
         least = _LEAST * view.seen
         m, _ = _planes(x, weight + least)
         per_px = np.abs(np.einsum("fbi,fi->fb", view.per_px, m))
@@ -415,20 +410,20 @@ class _Fit:
         return matrix.mean(axis=0), right.mean(axis=0)
 
     def tukey(self, seen: BoolArray) -> FloatArray:
-        """Return the weights that the residuals deserve."""
+        """Return Tukey's weights of the residuals."""
         scale = max(1.0, 1.4826 * float(np.median(np.abs(self.z[seen]))))
         weight: FloatArray = np.maximum(1.0 - (self.z / (_TUKEY * scale)) ** 2, 0.0) ** 2 * seen
         return weight
 
     def effect(self, view: _View, laser: int, step: FloatArray) -> float:
-        """Share of the range by which a step takes its laser's stripe off the targets."""
+        """Return the shift of its laser's stripe off the targets by a step, over the range."""
         mine = _pieces(laser)
         off = self.slopes(view)[:, mine] @ step
         return float(np.sqrt(np.mean(off[view.seen[:, mine]] ** 2)))
 
 
 def _planes(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fit m·X = 1, shape (F, 3), to weighted points; the inverse normal matrices come along."""
+    """Fit m·X = 1, shape (F, 3), to weighted points; return the inverse normal matrices too."""
     weighed = w[..., None] * x
     normal = np.swapaxes(x, 1, 2) @ weighed
     # Points of one laser alone would leave the plane to turn about their line.
@@ -447,27 +442,27 @@ def _spread(slope: FloatArray) -> FloatArray:
     return spread.reshape(n_frames, n, 3 * n_lasers)
 
 
-# Frames judged; when there are twice as many, every other one goes.
+# Frames in the fit; when there are twice as many, every other one is dropped.
 _MAX_FRAMES = 24
 _MIN_FRAMES = 5
-# At first one frame in so many is looked at: neighbours say the same.
+# At first one frame in this many is used: neighbouring frames show the same.
 _EVERY = 3
-# Pieces of stripe that every laser must show for a frame to count.
+# Bins of stripe that every laser must show for a frame to count.
 _MIN_PIECES = 4
-# An alarm needs a step this clear, and one that matters: to the angle, or to the range.
+# An alarm needs a step of this significance, and of this size in angle or range.
 _SIGNIFICANT = 5.0
 _ANGLE, _EFFECT = math.radians(0.15), 0.005
-# Beyond this it is the target that is bent: a laser so far off shows next to nothing.
+# Beyond this the target is bent: a laser so far off shows next to nothing.
 _UNLIKELY = math.radians(5.0)
-# A target is flat, and a laser the one that has moved, if so much of the stripes is explained.
+# Least share of the stripes that must be explained: by a flat target, or by the laser that moved.
 _EXPLAINED = 0.6
-# Another laser is out of the question if its mean square is worse by this and by this share; one
-# has moved at all if that none has is worse by as much and by the second share.
+# Another laser is excluded if its mean square is worse by this value and by the first share; a
+# laser has moved at all if the hypothesis of none is worse by this value and by the second share.
 _WORSE, _WORSE_SHARE, _WORSE_SHARE_OF_NONE = 0.1, 0.1, 0.3
 
 
 class AgreementState(StrEnum):
-    """How the lasers stand to each other; the value is what `run.yaml` says."""
+    """Agreement of the lasers; the value is written to `run.yaml`."""
 
     AGREE = "agree"
     DRIFTED = "drifted"
@@ -482,15 +477,15 @@ class AgreementState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AgreementVerdict:
-    """Whether the lasers agree, and what is wrong if not.
+    """The verdict on the lasers: their agreement, and the suspects if they disagree.
 
     Attributes
     ----------
     state : AgreementState
     n_frames : int
-        That the verdict rests on.
+        Frames that the verdict is based on.
     suspects : tuple of int
-        Lasers one of which has moved, by their number from 0, the likeliest first.
+        Lasers of which one has moved, numbered from 0, the likeliest first.
     names : tuple of str
         Of the suspects.
     angle, sigma_angle : float
@@ -508,7 +503,7 @@ class AgreementVerdict:
     effect: float = math.nan
 
     def facts(self) -> dict[str, Any]:
-        """Return the verdict as `run.yaml` holds it."""
+        """Return the verdict as written to `run.yaml`."""
         found: dict[str, Any] = {"state": self.state.value, "n_frames": self.n_frames}
         if self.suspects:
             found["suspects"] = list(self.names)
@@ -519,7 +514,7 @@ class AgreementVerdict:
         return found
 
     def sentence(self) -> str:
-        """Say what is wrong and what to do; empty if nothing is."""
+        """Return the fault and its remedy as text; empty if there is none."""
         if not self.suspects:
             return ""
         named = [
@@ -534,13 +529,13 @@ class AgreementVerdict:
 
 
 class LaserAgreement:
-    """Watches the lasers of a rig over a dive.
+    """Monitor of the agreement of a rig's lasers over a dive.
 
     Parameters
     ----------
     rig : Rig
-        The one that the scans were made with. What it says about how well its lasers are known
-        counts: a disagreement that the calibration leaves open is none.
+        The rig of the scans. Its uncertainty counts: a disagreement within the uncertainty of the
+        calibration is no fault.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -554,7 +549,7 @@ class LaserAgreement:
         self._verdict: AgreementVerdict | None = None
 
     def add(self, scan: Scan) -> None:
-        """Take note of one frame; frames without a posture say nothing."""
+        """Add a frame; frames without a posture are skipped."""
         self._n_scans += 1
         if not scan.posture or self._n_scans % self._every or len(self._along_x) < 2:
             return
@@ -569,7 +564,7 @@ class LaserAgreement:
             self._every *= 2
 
     def verdict(self) -> AgreementVerdict:
-        """Return what the frames so far say."""
+        """Return the verdict on the frames so far."""
         if self._verdict is None:
             self._verdict = self._judged()
         return self._verdict
@@ -595,7 +590,7 @@ class LaserAgreement:
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
         suspects = [one for one in found if one is best or not _is_worse(one, best)]
         if len(suspects) == len(found) > 2:
-            # What any of three lasers could have done, none has: the target is no plane.
+            # If any of three lasers could explain it, none has moved: the target is no plane.
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
         return self._told(suspects, n_frames)
 
@@ -617,14 +612,14 @@ class LaserAgreement:
         )
 
     def _is_off(self, found: Explanation) -> bool:
-        """Whether a laser has moved clearly, and enough to matter."""
+        """Return whether the step of a laser is significant, and large enough to matter."""
         step = found.step
         sigmas = math.sqrt(float(step @ np.linalg.solve(self._covariance(found), step)))
         matters = found.effect > _EFFECT or float(np.linalg.norm(step[:2])) > _ANGLE
         return sigmas > _SIGNIFICANT and matters
 
     def _covariance(self, found: Explanation) -> FloatArray:
-        """Covariance of a step, by the stripes' errors and by what the calibration leaves open."""
+        """Return the covariance of a step, by errors of the stripes and of the calibration."""
         names = [f"{laser.name}:{name}" for laser in self._rig.lasers for name in LASER_PARAMETERS]
         spill = found.spill()
         total: FloatArray = found.covariance() + spill @ self._known.of(names) @ spill.T
@@ -632,7 +627,7 @@ class LaserAgreement:
 
 
 def _no_alarm(found: Explanation, n_frames: int) -> AgreementVerdict:
-    """All is well, if flat targets and no step worth speaking of explain what was seen."""
+    """Return that the lasers agree, if flat targets without a relevant step explain the frames."""
     flat = found.inliers >= _EXPLAINED
     return AgreementVerdict(AgreementState.AGREE if flat else AgreementState.NOT_FLAT, n_frames)
 

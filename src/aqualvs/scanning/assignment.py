@@ -1,13 +1,13 @@
-"""The test of a surface against rival assignments of the same peaks to lasers.
+"""Laser assignment test: a surface against rival assignments of the same peaks to lasers.
 
 Where lasers are nearly parallel, a picture in which every stripe is read as its neighbour's may
 show a plane as well: shifted and tilted, with small residuals. The rivals of a surface are found by
 reading the peaks of two of its stripes as other lasers', which gives a plane, and refining that
 plane on all peaks. Each hypothesis is then judged by
 
-- the light that it explains: peaks of the same looks that are left over count against it;
-- the light that it misses: a laser whose stripe would lie in the picture, beside others that are
-  seen, and shows nothing. It may be switched off or hidden, so this is a cost and no gate;
+- the light that it explains: peaks of the same appearance that are left over count against it;
+- the light that it lacks: a laser whose stripe would lie in the picture, beside others that are
+  seen, and shows nothing. It may be switched off or hidden, so this is a cost, not a gate;
 - the residuals of each laser's stripe as a whole: the log-likelihood ratio of two fits with unknown
   noise is half the degrees of freedom times the logarithm of the ratio of the variances.
 
@@ -49,17 +49,17 @@ from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 
-# Log-odds: a laser that shows nothing though it should is that unlikely (7 %), so is a stripe as
-# good as the others that is none (5 %); odds of 20 to 1 decide.
+# Log-odds of a laser that shows nothing though it should (7 %), and of a false stripe as good as
+# the others (5 %); odds of 20 to 1 decide.
 _DARK_LASER, _FOREIGN_STRIPE, _DECIDED = 2.6, 3.0, 3.0
-# Residuals of half stripes count as at most so many independent ones, because errors of the rig are
-# no noise. Then what residuals may say at most.
+# Residuals of half stripes count as at most this many independent ones, because errors of the rig
+# are not noise. Then the limit of the evidence from residuals.
 _MOST_FREEDOM, _MOST_BY_RESIDUALS = 10.0, 12.0
-# Hypotheses that are nearer than this are joined by a greater sigma instead of a refusal.
+# Hypotheses nearer to each other than this are covered by a larger sigma instead of a refusal.
 _NEAR_RANGE, _NEAR_ANGLE = 0.02, math.radians(2.0)
-# So many rivals are refined.
+# Number of rivals that are refined.
 _N_RIVALS = 6
-# Samples across a laser's band, where its stripe on a plane is looked up.
+# Samples across a laser's band, in which its stripe on a plane is looked up.
 _N_SAMPLES = 16
 # A surface with less than this share of the light that no other explains, or a solid one whose
 # stripes are nowhere seen over this share of their way through the picture, must be seen evenly:
@@ -70,7 +70,7 @@ _LITTLE_LIGHT, _SHORT_WAY, _MAY_BE_FAINT = 0.12, 0.15, 0.25
 
 
 class Verdict(Enum):
-    """What the test says of a surface."""
+    """Result of the test of a surface."""
 
     CLEAR = "clear"
     """No rival comes near it."""
@@ -91,7 +91,7 @@ class Outcome(NamedTuple):
 
 
 UNTESTED = Outcome(Verdict.CLEAR)
-"""Where there is nothing to test, or nothing against it."""
+"""The outcome if there is nothing to test, or no evidence against the surface."""
 
 
 class AssignmentTest:
@@ -125,7 +125,7 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
-        """Tell whether a surface is so small, and seen so unevenly, that it may be no surface.
+        """Return whether a surface is so small, and seen so unevenly, that it may be chance.
 
         Parameters
         ----------
@@ -142,7 +142,7 @@ class AssignmentTest:
                 others |= one.members
         plane = np.append(target.plane.normal, target.plane.offset)
         light = light_left(readings.source, readings.trust, chunk_index, target.members, others)
-        # A plane rests on two lasers: what one has beyond that does not speak for it.
+        # A plane needs two lasers: the surplus of one is no evidence for it.
         light *= target.support / chunks.light[target.members].sum()
         most, faint = seen_of(plane, target.members, chunks.n_lines, chunks.laser, self._bands)
         small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not target.is_mesh)
@@ -151,11 +151,11 @@ class AssignmentTest:
     def outweighed(
         self, chunks: Chunks, surfaces: Sequence[Surface], target: Surface
     ) -> Surface | None:
-        """Return a nearer net with as much light as a net that lacks a laser; None mostly.
+        """Return a nearer net with as much light as a net that lacks a laser, if there is one.
 
-        Two stripes test a plane by one number. Of a folded net's many pieces two may pass that and
-        be no plane, while the third laser, which should be seen there, lights the net elsewhere.
-        Behind a net other light is no wonder; nearer, the net would have to be twice there.
+        Two stripes test a plane by one number. Of the many pieces of a folded net two may pass that
+        test without being a plane, while the third laser, which should be seen there, lights the
+        net elsewhere. Other light behind a net is normal; light nearer than the net is not.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ def widened(found: Measurement, outcome: Outcome) -> Measurement:
     found : Measurement
         Of the surface that was tested.
     outcome : Outcome
-        What the test said of it.
+        Of the test.
     """
     posture, other = found.posture, outcome.other
     if outcome.verdict is not Verdict.NEAR or other is None or isinstance(posture, Refusal):

@@ -1,4 +1,4 @@
-"""The arithmetic of `AssignmentTest`: rivals of a plane, and what speaks for each of them."""
+"""Compiled kernels of `AssignmentTest`: rivals of a plane, and the evidence for each of them."""
 
 import math
 
@@ -20,28 +20,28 @@ from aqualvs.scanning.plane_search import (
 )
 
 LIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
-"""What is found of a hypothesis: light that it explains, the same for each laser, dark lasers,
-variance of half stripes (px²) and its degrees of freedom."""
+"""Measures of a hypothesis: light that it explains, the same for each laser, dark lasers, variance
+of half stripes (px²) and its degrees of freedom."""
 N_FACTS = 5
 CELL_LINES = 16
-"""Search lines to a cell along a stripe."""
+"""Search lines per cell along a stripe."""
 SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
-"""Hypotheses that are so near each other (share of the range, radians) are one."""
+"""Largest difference of equal hypotheses (share of the range, radians)."""
 
-# Rivals that explain less of the light, as a share of the surface's, are none.
+# Least light that a rival must explain, as a share of the surface's.
 _RIVAL_SHARE = 0.5
-# Stripes of so many lasers start rivals.
+# Number of lasers whose stripes start rivals.
 _N_SEEDS = 4
 # The noise (px) that half a stripe has at least.
 _HALF_STRIPE_PX = 0.1
-# What lies within this many gates of a plane is on it: lasers that a calibration knows less well
-# than a peak is measured must not count as dark, nor their light as foreign.
+# Light within this many gates of a plane is on it: lasers whose calibration is less accurate than
+# the peaks must not count as dark, nor their light as foreign.
 _WIDE = 2.5
-# Fewer cells say nothing of a laser; with a smaller share of the typical one's light it is dark.
+# Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
 _LEAST_CELLS, _DARK_SHARE = 3, 0.25
 # A cell is lit if this share of the other lasers that can be there is seen there.
 _LIT_SHARE = 0.15
-# Half a stripe with fewer search lines says nothing.
+# Least number of search lines of half a stripe.
 _LEAST_LINES = 8
 # A laser is faint with this share of the best one's way through the picture.
 _FAINT = 0.4
@@ -64,7 +64,7 @@ def find_rivals(
     n_lasers: int,
     planes: FloatArray,
 ) -> int:
-    """Write planes on which a surface's peaks are other lasers'; returns how many.
+    """Write planes on which a surface's peaks are other lasers'; return their number.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def find_rivals(
     table : array, shape (7, C)
         As in `Chunks`.
     nearest, farthest : float
-        Planes beyond are not considered, in metres.
+        Limits of the planes that are considered, in metres.
     n_lasers : int
         Lasers of the rig.
     planes : array, shape (1 + n, 4)
@@ -186,7 +186,7 @@ def _try_pair(
     score: FloatArray,
     n: int,
 ) -> int:
-    """Read two stripes as those of any two lasers, and keep the planes that explain most light."""
+    """Read two stripes as those of any two lasers; keep the planes that explain most light."""
     n_lasers = sums.shape[0]
     plane = np.empty(4)
     normal, scratch, right, m = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -242,9 +242,9 @@ def _fit_two(
 
 @borrowing_kernel
 def _explained(sums: FloatArray, plane: FloatArray) -> float:
-    """Return the light of the stripes that lie on a plane, each read as the laser that fits best.
+    """Return the light of the stripes on a plane, each read as the laser that fits best.
 
-    A stripe counts less the farther it is off, by the root mean square over its length.
+    A stripe counts less the farther it is off the plane, by the root mean square over its length.
     """
     x, y, z, d = plane[0], plane[1], plane[2], plane[3]
     total = 0.0
@@ -269,7 +269,7 @@ def _explained(sums: FloatArray, plane: FloatArray) -> float:
 def _keep_best(
     plane: FloatArray, value: float, planes: FloatArray, score: FloatArray, n: int
 ) -> int:
-    """Keep a plane from the second row on, unless one like it is better; the best come first."""
+    """Insert a plane from the second row on, unless a similar one is better; best first."""
     if _same(plane, planes[0], 2.0):
         return n
     for k in range(1, n + 1):
@@ -302,7 +302,7 @@ def _same(one: FloatArray, other: FloatArray, times: float) -> bool:
 def _refine_rivals(
     table: FloatArray, nearest: float, farthest: float, planes: FloatArray, n: int
 ) -> int:
-    """Refine the planes from the second row on; drop those that become another; count the rest."""
+    """Refine the planes from the second row on; drop duplicates; return the number left."""
     normal, scratch, lanes = np.empty((3, 3)), np.empty((5, 3)), np.empty(table.shape[1])
     kept = 0
     for _ in range(2):
@@ -336,7 +336,7 @@ def judge_planes(
     bands: FloatArray,
     facts: FloatArray,
 ) -> None:
-    """Write what speaks for every plane.
+    """Write the evidence for every plane.
 
     Parameters
     ----------
@@ -351,7 +351,7 @@ def judge_planes(
     along_x : bool array, shape (n_lasers,)
         Whether each laser's search lines run along x.
     bands : array, shape (n_lasers, cells, samples, 4)
-        What each laser's band sees: (P, 1) / |P| for points P, NaN where nothing.
+        Points P that each laser's band sees, as (P, 1) / |P|; NaN where nothing is seen.
     facts : array, shape (P, 5)
         Written, see `LIGHT`.
     """
@@ -407,7 +407,7 @@ def _light_on(
     chunk_index: IntArray,
     seen: IntArray,
 ) -> float:
-    """Sum the trust of the peaks on a plane, each once, by how near it is."""
+    """Sum the confidence of the peaks on a plane, each counted once, weighted by its distance."""
     total = 0.0
     for i in range(source.shape[0]):
         share = near[chunk_index[i]]
@@ -427,7 +427,7 @@ def _variance(
     near: FloatArray,
     n_lasers: int,
 ) -> tuple[float, float, int]:
-    """Variance (px²) of half stripes about a plane, its degrees of freedom, and lasers seen."""
+    """Return variance (px²) of half stripes about a plane, degrees of freedom, lasers seen."""
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     square, n, n_lit = 0.0, 0, 0
     begin = 0
@@ -485,7 +485,7 @@ def light_left(
     members: BoolArray,
     others: BoolArray,
 ) -> float:
-    """Return the share of the light on a surface, that on others left out.
+    """Return the share of the light on a surface, without light on other surfaces.
 
     Parameters
     ----------
@@ -519,7 +519,7 @@ def seen_of(
     laser: IntArray,
     bands: FloatArray,
 ) -> tuple[float, float]:
-    """Return how much of its best stripe's way a surface shows, and the share of faint lasers.
+    """Return the share of its best stripe that a surface shows, and the share of faint lasers.
 
     Parameters
     ----------
@@ -553,7 +553,7 @@ def seen_of(
 
 @borrowing_kernel
 def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> float:
-    """Count the lasers that show nothing where they should and others do; in part if dim."""
+    """Count the lasers that show nothing where others do; a dim one counts in part."""
     n_lasers, n_cells = lit.shape
     dark = 0.0
     for i in range(n_lasers):

@@ -1,10 +1,9 @@
-"""Readings: every return, read as a point of each laser that could have made it.
+"""Candidates: every stripe peak, triangulated as a point of each laser that could have made it.
 
-The arithmetic of `read_returns`: what a laser makes of the returns of its search direction.
-
-The arithmetic of `Readings`: chunks of stripe, and averages over groups of readings.
-
-Chunks: pieces of stripe, the units that agree with a surface or do not.
+`read_returns` links each laser's peaks (`Returns`) to segments and triangulates them; the result,
+`Readings`, holds the candidate correspondences of peaks and lasers. `Chunks` summarises them by
+subsegments, the units that agree with a surface or do not; `Readings.observations` averages any
+groups of them, weighted by intensity.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +33,7 @@ HEIGHT, WIDTH, SIGMA_PX, TRUST = range(4)
 """Rows of a table of readings' measures."""
 N_MEASURES = 4
 
-# Position noise of a return: a floor (texture, compression), and what grey-level noise makes of
+# Position noise of a return: a floor (texture, compression), and the effect of grey-level noise on
 # the two flanks of a stripe of given width and height.
 _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
@@ -60,7 +59,7 @@ def read_laser(
     measures: FloatArray,
     pixels: FloatArray,
 ) -> int:
-    """Append one laser's readings to the tables from column `begin` on; returns where they end.
+    """Append one laser's candidates to the tables from column `begin` on; return their end.
 
     Parameters
     ----------
@@ -75,7 +74,7 @@ def read_laser(
     best_height : float
         Of the frame's best returns.
     begin : int
-        How many readings other lasers have.
+        Number of candidates of other lasers.
     numbers : int array, shape (6, N), measures : array, shape (4, N)
         Written, see `SOURCE` and `HEIGHT`.
     pixels : array, shape (N, 2)
@@ -83,7 +82,7 @@ def read_laser(
     """
     found = np.empty((3, line.shape[0]), np.int64)
     n = segment_returns(line, position, lowest, highest, slope_low, slope_high, found)
-    # Stretches and chunks of different lasers must differ.
+    # Stretches and chunks of different lasers must have different numbers.
     first_stretch, first_chunk = 0, 0
     for i in range(begin):
         first_stretch = max(first_stretch, numbers[STRETCH, i] + 1)
@@ -115,13 +114,13 @@ def read_laser(
 # share of the spread, because a strand's light may be cut off on one side by a knot or the border.
 _CHUNK_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
-# A stretch has at most this many times the typical voice when surfaces are sought, but a voice of
-# at least so many search lines.
+# Limit of a stretch's sampling weight (`voice`) in the search for surfaces: this many times the
+# typical one, but at least that of this many search lines.
 _LOUDEST_SHARE = 2.0
 _LOUD_ENOUGH = 16.0
-# What is left of the voice of a curved stretch: a fish is no plane, though it has tangent ones.
+# Factor on the sampling weight of a curved stretch: a fish has tangent planes, but is not a plane.
 _CURVED_VOICE = 0.2
-# Shorter stretches are specks; they do not say what is typical.
+# Shorter stretches are specks, and are left out of the typical weight.
 _SPECK_LINES = 3.0
 
 
@@ -150,7 +149,7 @@ def chunk_readings(
     light: FloatArray,
     facts: IntArray,
 ) -> FloatArray:
-    """Summarise N readings in C chunks, whose numbers ascend.
+    """Summarise N candidates in C chunks, whose numbers ascend.
 
     Parameters
     ----------
@@ -166,7 +165,7 @@ def chunk_readings(
     Returns
     -------
     array, shape (6, S)
-        The stretches as `describe_stretches` tells them.
+        The stretches as described by `describe_stretches`.
     """
     begin = 0
     for c in range(light.shape[0]):
@@ -217,7 +216,7 @@ def _write_centroid(
 def _write_voices(
     n_lines: IntArray, stretch: IntArray, light: FloatArray, table: FloatArray, voice: FloatArray
 ) -> None:
-    """Write the voice of each chunk: its light, less where its stretch is long or curved."""
+    """Write the sampling weight of each chunk: its light, reduced in long or curved stretches."""
     shapes = StretchShapes(table[0], table[1], table[2], table[3], table[4], table[5])
     strands = shapes.n_lines[shapes.n_lines >= _SPECK_LINES]
     typical = np.median(strands) if strands.shape[0] else 0.0
@@ -292,20 +291,20 @@ def summarise(
 
 @dataclass(frozen=True, slots=True)
 class Chunks:
-    """Pieces of stripe, C of them, ordered by laser.
+    """Subsegments of stripes (chunks), C of them, ordered by laser.
 
     Attributes
     ----------
     table : array, shape (7, C)
         Rows as `plane_search` names them: centroid in `dome` (m), mean derivative of the points by
-        the stripe's position (m/px), and voice: its light, but a long stretch has no more
-        voice than a few strands, because all of it may follow one strand off the sheet's middle.
+        the stripe's position (m/px), and sampling weight (voice): its light, but a long stretch
+        weighs no more than a few strands, because it may follow one strand off the sheet's middle.
     light : array, shape (C,)
-        Search lines in it, each as far as its return looks like laser light.
+        Search lines in it, each weighted by the confidence that its peak is laser light.
     n_lines : int array, shape (C,)
         Search lines in it.
     first_line, last_line : int array, shape (C,)
-        Its extent in search lines; tells lit from dark stretches.
+        Its extent in search lines; separates lit from dark stretches.
     laser : int array, shape (C,)
         Index of the laser; ascending.
     """
@@ -334,18 +333,18 @@ FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Triangulated readings, N of them, ordered by laser, segment and chunk.
+    """Triangulated candidates (readings), N of them, ordered by laser, segment and chunk.
 
     Attributes
     ----------
     source : int array, shape (N,)
-        Number of the return; equal for several readings of one return.
+        Number of the peak; equal for all candidates of one peak.
     laser : int array, shape (N,)
-        Index of the laser that the return is read as.
+        Index of the laser that the peak is read as.
     line : int array, shape (N,)
         Search line.
     stretch, chunk : int array, shape (N,)
-        Numbers of the stretch and the chunk of stripe; those of the chunks ascend.
+        Numbers of the stretch (linked segments) and the chunk; those of the chunks ascend.
     pixels : array, shape (N, 2)
         In `image`.
     height, width : array, shape (N,)
@@ -353,7 +352,7 @@ class Readings:
     sigma_px : array, shape (N,)
         Standard deviation of the position along the search line.
     trust : array, shape (N,)
-        How much the return looks like laser light: its height as a share of the frame's best, and
+        Confidence that the peak is laser light, from its height as a share of the frame's best and
         its likelihood; 0 to 1.
     points : array, shape (N, 3)
         In `dome`, metres.
@@ -373,15 +372,15 @@ class Readings:
     trust: FloatArray
     points: FloatArray
     sensitivity: FloatArray
-    # Asked for by the search for surfaces and by the labels.
+    # Cached: used by the search for surfaces and by the labels.
     _shapes: StretchShapes | None = field(default=None, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
-        """Return the number of readings."""
+        """Return the number of candidates."""
         return len(self.source)
 
     def where(self, mask: BoolArray) -> "Readings":
-        """Return the readings that a mask of shape (N,) selects."""
+        """Return the candidates that a mask of shape (N,) selects."""
         return Readings(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
 
     def chunks(self) -> tuple[Chunks, IntArray]:
@@ -426,10 +425,10 @@ class Readings:
         return self._shapes
 
     def observations(self, index: IntArray, n: int, normal: FloatArray) -> "Observations":
-        """Average groups of readings, weighted by the light in each return.
+        """Average groups of candidates, weighted by intensity.
 
         A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the
-        centroid of that light lies on the sheet whatever the strand's direction.
+        centroid of that light lies on the sheet, regardless of the strand's direction.
 
         Parameters
         ----------
@@ -438,7 +437,7 @@ class Readings:
         n : int
             Number of groups.
         normal : array, shape (3,)
-            Normal of the surface as far as it is known; spread is measured along it.
+            Approximate normal of the surface; spread is measured along it.
         """
         seen = Observations(
             points=np.zeros((n, 3)),
@@ -468,7 +467,7 @@ class Readings:
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Independent observations of a surface: centroids of pieces of stripe, M of them.
+    """Independent observations of a surface: centroids of M pieces of stripe.
 
     Attributes
     ----------
@@ -494,7 +493,7 @@ def read_returns(
     searches: Sequence[StripeSearch],
     triangulator: Triangulator,
 ) -> Readings:
-    """Link each laser's candidates to segments and triangulate them.
+    """Link each laser's peaks to segments and triangulate them.
 
     Parameters
     ----------

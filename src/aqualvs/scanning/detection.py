@@ -1,6 +1,7 @@
-"""Detection in a whole frame: one search for each direction that the lasers need.
+"""Stripe detection in a whole frame: one search for each direction that the lasers need.
 
-Search images: a picture as each search direction sees it, with search lines as rows.
+`SearchLines` makes the search images, in which search lines are rows; `FrameDetector` finds the
+peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,11 +39,12 @@ from aqualvs.scanning.stripe import (
 
 
 class SearchLines:
-    """Makes the search lines of pictures of one size, as rows; allocates once.
+    """Search lines of pictures of one size, as rows; buffers are allocated once.
 
     In wide pictures a search line is the mean of two rows or columns, smoothed along itself by
-    (1, 2, 1) / 4: a stripe can be a pixel or two thin there, its centre then locked to the pixels.
-    All means are of two bytes and rounded up, for which processors have an instruction.
+    (1, 2, 1) / 4: a stripe can be only a pixel or two wide there, which would lock its centre to
+    the pixel grid. All means are of two bytes and rounded up, for which processors have an
+    instruction.
 
     Parameters
     ----------
@@ -126,10 +128,10 @@ def _pair_pixels(row: U8Array, mean: U8Array) -> None:
 
 DetectorOptions = StripeOptions | ThresholdOptions
 
-# One search line of so many is looked at first. So many times as many peaks as the lasers can make
-# are looked at, if they are not high.
+# One search line of this many is sampled first. Low peaks are used up to this many times the number
+# that the lasers can make.
 _SAMPLE_EVERY, _MOST_PEAKS = 48, 2.0
-# What the frame's bright returns are as high as.
+# Quantile of the height of a frame's bright peaks.
 _BRIGHT_QUANTILE = 0.9
 _CACHE_LINE = 8  # numbers of 64 bits
 # An overexposed line is no wider than this share of the picture.
@@ -138,7 +140,7 @@ _NO_CHROMA = np.empty((0, 0), np.uint8)
 
 
 class FrameDetector:
-    """Detects stripes in frames of one size, within the bands of all lasers.
+    """Detector of stripes in frames of one size, within the bands of all lasers.
 
     Parameters
     ----------
@@ -147,7 +149,7 @@ class FrameDetector:
     searches : sequence of StripeSearch
         One for each laser.
     options : StripeOptions or ThresholdOptions
-        Which detector, and how.
+        Kind of detector, and its options.
     """
 
     def __init__(
@@ -174,8 +176,8 @@ class FrameDetector:
             else {}
         )
         self._room = options.max_returns
-        # Peaks of all directions, one after the other. Were rows as long as a power of two, all
-        # would fall on the same few places of the processor's cache.
+        # Peaks of all directions, one after the other. Rows whose length is a power of two would
+        # all map to the same few lines of the processor's cache.
         self._line = np.empty(len(self._finders) * self._room, np.int64)
         self._table = np.empty((N_MEASURES, len(self._line) + _CACHE_LINE))
         self._threshold = (
@@ -241,7 +243,7 @@ class FrameDetector:
             axis: SearchImage(lines.of(luma), u, v, self._line_px, axis is SearchAxis.ALONG_X)
             for axis, lines in self._lines.items()
         }
-        # A sample of the search lines tells from which height on it pays to look.
+        # A sample of the search lines gives the least useful height of peaks.
         _, sample, _ = self._find(images, options.min_contrast, _SAMPLE_EVERY)
         contrast, paint = self._survey(sample, frame.chroma is not None)
         line, table, ends = self._find(images, max(contrast, options.min_contrast))
@@ -295,9 +297,9 @@ class FrameDetector:
         return self._line[: ends[-1]], self._table[:, : ends[-1]], np.array(ends)
 
     def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, Paint | None]:
-        """Return the height from which on it pays to look, and paint.
+        """Return the least useful height of peaks, and the paint.
 
-        From that height on there are not many more peaks than the lasers can make.
+        Above that height there are not many more peaks than the lasers can make.
         """
         n_possible = self._n_possible / _SAMPLE_EVERY
         most = _MOST_PEAKS * n_possible
@@ -310,9 +312,9 @@ class FrameDetector:
         return max(useful_height(sample[HEIGHT], likelihood), crowded), paint
 
     def _likelihood(self, table: FloatArray, paint: Paint | None, n_possible: float) -> FloatArray:
-        """Return how likely each peak is laser light of any of the colours.
+        """Return the likelihood that each peak is laser light of any of the colours.
 
-        A colour that these peaks do not tell is that of a typical camera.
+        A colour that cannot be learned from these peaks is that of a typical camera.
         """
         found = [
             laser_likelihood(
@@ -335,7 +337,7 @@ def select_returns(
     min_likelihood: float,
     min_share: float,
 ) -> IntArray:
-    """Return the peaks that are likely a laser's, and bright or one of many in a row.
+    """Return the peaks that are likely laser light, and bright or one of many in a row.
 
     Parameters
     ----------

@@ -1,6 +1,8 @@
-"""Labels: what each stripe point was found to be.
+"""Labels of stripe points: the kind of object that each was found on.
 
-The arithmetic of `label_readings`: what lies on which surface, and what is told by its shape.
+`label_readings` labels light on the other surfaces first, then light on the target (on a net also
+nearby light that the search left out). What lies on no surface is labelled by the shape of its
+segment.
 """
 
 from collections.abc import Sequence
@@ -21,11 +23,11 @@ from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.segments import StretchShapes, is_bent, is_round, is_straight
 from aqualvs.scanning.surfaces import Surface, lit_cells, number_cells
 
-# Position error of the best returns there are: quality 1.
+# Position error of the best returns: quality 1.
 _BEST_SIGMA_PX = 0.1
 # A surface is a fish if this share of its light lies in bent stretches.
 _MOSTLY = 0.5
-# The frame's bright returns are higher than this share of them.
+# Quantile of the height of a frame's bright returns.
 _BRIGHT_SHARE = 0.9
 # Compiled code takes numbers more easily than members of an enumeration.
 _NET, _SOLID, _FISH = np.uint8(Label.NET), np.uint8(Label.SOLID), np.uint8(Label.FISH)
@@ -62,7 +64,7 @@ def label_other(
         Completed in place.
     """
     n, n_bent, n_behind = 0, 0, 0
-    # Nearest places to the target on either side: they decide where half lie behind it.
+    # Distances nearest to the target on either side: they decide if half of them lie behind it.
     nearest_before, nearest_behind = -np.inf, np.inf
     for i in range(points.shape[0]):
         if not members[chunk_index[i]]:
@@ -102,7 +104,7 @@ def label_target(
     explained: BoolArray,
     label: NDArray[np.uint8],
 ) -> None:
-    """Label the light on the target, on a net also what the search left out; mark it as explained.
+    """Label the light on the target, on a net also nearby light; mark it as explained.
 
     Parameters
     ----------
@@ -176,7 +178,7 @@ def label_loose(
     label: NDArray[np.uint8],
     rows: IntArray,
 ) -> int:
-    """Label what lies on no surface by its shape; write the readings to list, and count them.
+    """Label points on no surface by their shape; write the rows to list, and return their number.
 
     Parameters
     ----------
@@ -236,7 +238,7 @@ def _kind_of(
     target: FloatArray,
     working_range: tuple[float, float],
 ) -> np.uint8:
-    """Return what a reading is that is the only one of its return."""
+    """Return the label of a candidate that is the only one of its peak."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
     if straight:
         if target.shape[0] and height_over(target, x, y, z) > 0.0:
@@ -283,7 +285,7 @@ def copy_points(
         out_measures[3, k] = min(_BEST_SIGMA_PX / sigma_px[i], 1.0)
 
 
-# What kernels are given where there is no target, and no net.
+# Arguments of kernels where there is no target, and no net.
 _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)
 
 
@@ -295,7 +297,7 @@ def label_readings(
     found: Measurement,
     working_range: tuple[float, float],
 ) -> tuple[ScanPoints, IntArray]:
-    """Label every return once, as the laser that explains it best.
+    """Label every peak once, as the laser that explains it best.
 
     Parameters
     ----------
@@ -308,16 +310,16 @@ def label_readings(
     target : Surface or None
         The one the posture is measured to.
     found : Measurement
-        The posture, and the readings that it rests on.
+        The posture and its inliers.
     working_range : (float, float)
         Distances from the dome's centre, in metres, beyond which clutter is out of range.
 
     Returns
     -------
     points : ScanPoints
-        Readings of a return that another reading explains are left out. A return that nothing
-        explains is told by its shape, and ambiguous where that says nothing and several lasers
-        could have made it.
+        Candidates of a peak that another candidate explains are left out. A peak that no surface
+        explains is labelled by its shape, or as ambiguous if the shape is not distinctive and
+        several lasers could have made it.
     listed : int array, shape (P,)
         Row of each point's reading.
     """
@@ -370,7 +372,7 @@ def label_readings(
 
 
 def _facing(target: Surface | None, found: Measurement) -> FloatArray:
-    """Return the target's surface, as well as it is known, as `Patch.packed` gives it."""
+    """Return the best estimate of the target's surface, as `Patch.packed` gives it."""
     if target is None:
         return _NOTHING
     if found.patch is not None:

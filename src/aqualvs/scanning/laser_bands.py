@@ -1,4 +1,4 @@
-"""Where in the image each laser can appear, and which way its stripe may run there.
+"""Laser bands: the part of the image where each laser can appear, and its possible slopes there.
 
 A laser sheet, limited to the working range, is seen only in a band of the image that follows from
 the rig. The band replaces the hand-drawn areas of the paper (section 3.1).
@@ -19,18 +19,18 @@ from aqualvs.scanning.laser_colour import LaserColour
 SLOPE_CELL = 8
 """Positions, and search lines, per cell of the slope tables and of the grid bands come from."""
 
-# Points of a target at the far end of the range lie up to this much farther out, off the axis.
+# Factor on the far range: off the axis, points of a target there are farther by up to this much.
 _OFF_AXIS_STRETCH = 1.5
-# Targets are expected within this angle of facing the vehicle; it bounds the stripe's direction.
+# Largest angle of a target from square to the vehicle; it bounds the stripe's direction.
 _MAX_TARGET_TILT = np.deg2rad(45.0)
 # Wider pictures have finer pixels than stripes need; lines are binned to about this many.
 _PIXELS_PER_LINE_FROM = 1280
-# Slopes beyond this are as good as along the search line.
+# Slopes beyond this count as parallel to the search line.
 _STEEPEST = 5.0
 
 
 class SearchAxis(Enum):
-    """Along which image axis a stripe is searched: across its usual direction."""
+    """Image axis of the search lines: across the usual direction of a stripe."""
 
     ALONG_Y = "y"
     """Search lines are columns; for stripes that run more horizontal than vertical."""
@@ -40,7 +40,7 @@ class SearchAxis(Enum):
 
 @dataclass(frozen=True, slots=True)
 class StripeSearch:
-    """Where to look for one laser.
+    """The search band of one laser in the image.
 
     Attributes
     ----------
@@ -68,12 +68,12 @@ class StripeSearch:
 
     @property
     def visible(self) -> bool:
-        """Whether the laser can appear in the image at all."""
+        """Whether the laser can appear in the image."""
         return bool(np.any(self.lowest <= self.highest))
 
 
 def searched_range(working_range: tuple[float, float]) -> tuple[float, float]:
-    """Widen the working range, so that a target beyond it is seen, and named as such."""
+    """Return the working range widened, so that a target beyond it is detected and reported."""
     near, far = working_range
     return 0.8 * near, 1.2 * far
 
@@ -84,7 +84,7 @@ def pixels_per_line(size_px: tuple[int, int]) -> int:
 
 
 def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
-    """Work out the search of each of the rig's lasers.
+    """Compute the search band of each of the rig's lasers.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def _points_on_grid(
     camera: Camera,
     steps: tuple[int, int],
 ) -> tuple[FloatArray, BoolArray]:
-    """Points on the sheet that a grid of pixels sees, and whether they are to be looked for."""
+    """Return points on the sheet that a grid of pixels sees, and a mask of those in range."""
     width, height = camera.size_px
     x = np.arange(0, width + steps[0], steps[0], dtype=np.float64)
     y = np.arange(0, height + steps[1], steps[1], dtype=np.float64)
@@ -144,7 +144,7 @@ def _points_on_grid(
 
 
 def _stripe_directions(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Stripe direction (rise along the rows, run along the columns) for several targets.
+    """Return the stripe direction (rise along the rows, run along the columns) for several targets.
 
     The stripe of a target n·X = d is the contour line of n·X over the image; square first.
     """
@@ -178,7 +178,7 @@ def _slope_bounds(rise: FloatArray, run: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _band_limits(in_band: BoolArray, n_lines: int, length: int) -> tuple[IntArray, IntArray]:
-    """First and last position on each line, one cell wider than the grid says."""
+    """Return the first and last position on each line, one cell wider than the grid says."""
     any_in = in_band.any(axis=0)
     first = np.argmax(in_band, axis=0)
     last = in_band.shape[0] - 1 - np.argmax(in_band[::-1], axis=0)

@@ -1,13 +1,13 @@
-"""Colour of laser light: how it moves a pixel's chroma, and how likely a peak is laser light.
+"""Colour of laser light: its effect on a pixel's chroma, and the likelihood that a peak is laser.
 
 A camera sees a 532 nm line neither as pure green nor always as green: its colour filters overlap,
 white balance scales the channels, and an overexposed core is white inside a green halo. On nine
 cameras, in air and under water, green lines lower V in 94 to 100 % of their pixels, but U in 0 to
-100 %; red lines raise V. So colour is evidence and no gate: the wavelength says in which half of
-the chroma plane to look, the frame's own best stripes say in which direction, and how far for each
-grey level of height, its lines move the chroma, and every peak gets the likelihood that it is such
-a line and not paint, twine or glare. A frame learns from itself, so that a white balance that
-drifts needs no tracking, and a frame's answer depends on nothing but the frame.
+100 %; red lines raise V. So colour is evidence, not a gate: the wavelength gives the half of the
+chroma plane to look in; the frame's own best stripes give the direction in which its lines move the
+chroma, and the amount for each grey level of height; and every peak gets the likelihood that it is
+such a line and not paint, twine or glare. The colour is learned from each frame alone: a white
+balance that drifts needs no tracking, and a frame's result depends on nothing but the frame.
 """
 
 import math
@@ -24,68 +24,68 @@ from aqualvs.geometry.quantile import element_at
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
-# Wavelengths (nm) that part blue, green and red lines.
+# Wavelengths (nm) that separate blue, green and red lines.
 _BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
 # R and B by V and U, in the scale of limited-range luma (BT.601).
 _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # The thresholds of learning were tuned on the rendered sample and benchmark dives, the photographs
 # of the sample folders and dives of the simulated cameras.
-# Stripes to learn from: peaks of so many grey levels, with a chroma step beyond that of paint of so
-# many standard deviations and so many levels, within an angle of this cosine to the wavelength's
-# direction, and at least a share of the largest for their height; how many of them it takes, and
-# by what shares of their mean step half of them scatter at most, and are taken to at least.
+# Stripes to learn from: least height of the peaks in grey levels; least chroma step beyond that of
+# paint, in standard deviations and in levels; least cosine of its angle to the wavelength's
+# direction; least share of the largest step for their height; least number of such peaks; and the
+# largest and the smallest scatter of half of them, as shares of their mean step.
 _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.2
 _BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
-# So many peaks are enough to learn from.
+# Number of peaks that is enough to learn from.
 _ENOUGH = 2500
-# So tall peaks near one colour, so many times as many as the lasers can make, are paint. It
-# spreads by so much at least, as chroma for each level, and by no more across the tint of its
-# light. Then how far off its middle, in standard deviations, other things and lines are.
+# Paint: least height of the peaks near one colour, and least ratio of their number to what the
+# lasers can make; its least spread, as chroma for each level, and its largest spread across the
+# tint of its light; and the distances from its middle, in standard deviations, of other things and
+# of lines.
 _TALL, _CROWD, _LEAST_SPREAD, _MOST_ACROSS = 20.0, 1.5, 0.02, 0.045
 _OF_CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 2.5, 4.0, 1.4826
-# Chroma levels for each grey level of height: what a line is expected to show where none is clear
-# enough to learn from, the least and the most that is believed of a learned one, and how far paint
-# and glare spread about none. Lines of nine cameras show 0.15 to 0.7.
+# Chroma levels for each grey level of height: the expected value of a line where none is clear
+# enough to learn from, the least and the most that is accepted of a learned one, and the spread of
+# paint and glare about zero. Lines of nine cameras show 0.15 to 0.7.
 RATIO_EXPECTED, RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
 # One frame's lines spread about their ratio by this share, and by the second one across their
 # direction: overexposed ones show less and differ in hue, faint ones more.
 _RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
-# Paint shows up to this share of the tint of its flanks, and no more than the second share of what
-# a line would, be the scene ever so green.
+# Paint shows up to this share of the tint of its flanks, and at most the second share of the chroma
+# of a line, however green the scene is.
 _TINT_SHARE, _PAINT_SHARE = 0.5, 0.5
-# The learned ratio is that which so many of the best stripes exceed.
+# The learned ratio is the one that this share of the best stripes exceeds.
 _LEARNED_QUANTILE = 0.35
-# Levels: what rounding and subsampling leave of chroma noise.
+# Least chroma noise after rounding and subsampling, in levels.
 _LEAST_SIGMA = 0.7
-# Heights that are counted as one kind, and how often the shares of lines among them are refined.
+# Width of the bins of height, and number of refinements of the shares of lines in them.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
 _KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
 _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
-# Heights of which so few, or no more than this share, of a sample's peaks are clearly lines are not
-# looked at.
+# Heights at which so few of a sample's peaks, or at most this share, are clearly lines are skipped.
 _FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
-# A core this bright, in limited-range luma, says nothing by its colour: every light is white there.
+# The colour of a core this bright, in limited-range luma, is ignored: every light is white there.
 WHITE = 225.0
-# Luma from which on a channel may be clipped, and full scale, where lines show the last share of
-# their chroma: measured on rendered stripes, whose middle or edge counts.
+# Luma from which on a channel may be clipped; full scale; and the share of its chroma that a line
+# shows there: measured on rendered stripes, at the middle or an edge.
 _CLIPPED, _FULL, _LEFT_AT_FULL = 185.0, 235.0, 0.33
 # A quarter of a normal distribution lies within this many standard deviations.
 _QUARTER_OF_NORMAL = 0.3186
-# The largest of three normal numbers is so many standard deviations above their mean; up to so many
-# levels of noise the lines' own differences are larger.
+# The largest of three normal numbers is this many standard deviations above their mean; up to this
+# many levels of noise the lines' own differences are larger.
 _LARGEST_OF_THREE, _QUIET = 0.85, 1.4
-# Nothing is more certain than e to this power.
+# Limit of the log-likelihood ratio.
 _MAX_LOG_ODDS = 12.0
 
 # Spreads of 0: unknown.
 _NO_PAINT = (0.0, 0.0, 0.0, 0.0)
 
 HIGHEST_USEFUL = 32
-"""Peaks of so many grey levels are always looked at."""
+"""Height in grey levels from which on peaks are always used."""
 
 
 class LaserColour(Enum):
-    """Channel of the camera in which a laser's light is brightest.
+    """The camera channel in which a laser's light is brightest.
 
     The value is the direction in the (U, V) plane in which the light moves the chroma of a typical
     camera: for green and red the mean over the cameras measured, for blue that of the primary.
@@ -106,7 +106,7 @@ class LaserColour(Enum):
 
 
 def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
-    """Return the picture in which a laser's light stands out best.
+    """Return the picture in which a laser's light has the most contrast.
 
     This is luma for green, of which luma mostly consists. A blue line raises luma by a ninth of
     what it raises blue, a red one by a third, so blue and red are made of luma and chroma.
@@ -132,7 +132,7 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
 
 
 def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
-    """Return what has the size of a frame's chroma at the size of its luma, interpolated."""
+    """Return an image of the size of a frame's chroma, interpolated to the size of its luma."""
     size = 2 * half.shape[1], 2 * half.shape[0]
     full = cv2.resize(half, size, interpolation=cv2.INTER_LINEAR)
     height, width = frame.luma.shape
@@ -140,7 +140,7 @@ def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
 
 
 class Paint(NamedTuple):
-    """What the paint of one frame shows, in levels of chroma for each grey level of height.
+    """Colour of the paint in one frame, in levels of chroma for each grey level of height.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class Paint(NamedTuple):
 
 
 class LineColour(NamedTuple):
-    """What the lines of one frame do to the chroma.
+    """Chroma step of the laser lines of one frame.
 
     Attributes
     ----------
@@ -166,11 +166,11 @@ class LineColour(NamedTuple):
     ratio : float
         Levels along it for each grey level of a line's height.
     sigma : float
-        Standard deviation of a step that nothing but noise makes, in levels.
+        Standard deviation of a step by noise alone, in levels.
     along, across : float
-        How lines spread about their mean, as shares of `ratio`, along their direction and across.
+        Spread of lines about their mean, as shares of `ratio`, along their direction and across.
     paint : Paint or None
-        What is no line, where most is of one colour.
+        Colour of the peaks that are not lines, where most are of one colour.
     """
 
     u: float
@@ -183,9 +183,9 @@ class LineColour(NamedTuple):
 
 
 def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
-    """Learn the colour of what most tall peaks are, where the lasers cannot make so many.
+    """Learn the colour of most tall peaks, where there are more than the lasers can make.
 
-    Such as twine in the sun.
+    An example is twine in the sun.
 
     Parameters
     ----------
@@ -200,12 +200,12 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
         None where there are few tall peaks, or they are not of one colour.
     """
     *paint, across_tint, n_near = _learn_paint(table, _CROWD * n_possible)
-    # Paint shows more or less of the light's tint; other differences are a mixture with lines.
+    # The share of the light's tint in paint varies; other differences are a mixture with lines.
     return Paint(*paint) if across_tint < _MOST_ACROSS and n_near > _CROWD * n_possible else None
 
 
 def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour | None:
-    """Learn from a frame's peaks what its lines do to the chroma.
+    """Learn the chroma step of the laser lines from a frame's peaks.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
         Measures of peaks, rows as `stripe` names them.
     colour : LaserColour
     paint : Paint or None
-        What most of the peaks are: then lines are what differs from it.
+        Colour of most of the peaks: then lines are the peaks that differ from it.
 
     Returns
     -------
@@ -229,20 +229,20 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
 
 
 def expected_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour:
-    """Return what lines do to the chroma of a typical camera, with the noise of these peaks."""
+    """Return the chroma step of lines in a typical camera, with the noise of these peaks."""
     return LineColour(*colour.value, RATIO_EXPECTED, float(_noise(table)), paint=paint)
 
 
 def laser_likelihood(
     table: FloatArray, line: LineColour, widest_white_px: float, n_possible: float = np.inf
 ) -> FloatArray:
-    """Return how likely each peak of a frame is laser light, and not something else that is bright.
+    """Return the likelihood that each peak of a frame is laser light, not another bright thing.
 
-    Compares two explanations of a chroma step: a line moves the chroma in proportion to its height,
-    as the frame's best stripes do; noise does not move it, and brighter paint under the same light
-    shows more of the tint that its flanks have, which is none where the light is white. How many
-    peaks of about the same height are lines is found from the same steps: low ones are mostly
-    noise.
+    Two explanations of a chroma step are compared: a line moves the chroma in proportion to its
+    height, as the frame's best stripes do; noise does not move it, and brighter paint under the
+    same light shows more of the tint that its flanks have, which is zero where the light is white.
+    The share of lines among peaks of about the same height is estimated from the same steps: low
+    peaks are mostly noise.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def laser_likelihood(
     Returns
     -------
     array, shape (N,)
-        0 to 1; 0.5 where colour says nothing.
+        0 to 1; 0.5 where colour gives no evidence.
     """
     likelihood = np.empty(table.shape[1])
     paint = line.paint or _NO_PAINT
@@ -297,7 +297,7 @@ def _noise(table: FloatArray) -> float:
 def _beyond_paint(
     table: FloatArray, i: int, left: float, tint_share: float, most: float
 ) -> tuple[float, float]:
-    """Return what paint leaves unexplained of a share `left` of a peak's chroma step, as U and V.
+    """Return the part (U, V) of a share `left` of a peak's chroma step that is not due to paint.
 
     Brighter paint shows up to `tint_share` of the tint that its flanks have, and at most `most`.
     """
@@ -315,7 +315,7 @@ def _beyond_paint(
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
-    # What differs from all that paint may show is the surest; a line as green as the water is not.
+    # Steps that differ from any paint are the most certain; a line as green as the water is not.
     for tint_share in (1.0, _TINT_SHARE):
         best = _best_stripes(table, u, v, sigma, tint_share)
         if best.shape[0] < _MIN_LEARNED:
@@ -353,9 +353,9 @@ def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
 def _learn_paint(
     table: FloatArray, n_least: float
 ) -> tuple[float, float, float, float, float, int]:
-    """Return the fields of a `Paint`, its spread across the flanks' tint, and how many are near.
+    """Return the fields of a `Paint`, its spread across the flanks' tint, and the number near it.
 
-    None are where no more than `n_least` peaks are tall.
+    The number is zero if at most `n_least` peaks are tall.
     """
     tall = np.flatnonzero(table[HEIGHT] >= _TALL)
     if tall.shape[0] <= n_least:
@@ -392,7 +392,7 @@ def _learn_beside_paint(
     spread_u: float,
     spread_v: float,
 ) -> tuple[float, float, float, float, float, float]:
-    """Return direction, ratio, noise and spreads of what is no paint; a ratio of 0 if unknown."""
+    """Return direction, ratio, noise and spreads of non-paint peaks; a ratio of 0 if unknown."""
     sigma = _noise(table)
     is_clear = np.zeros(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
@@ -419,7 +419,7 @@ def _learn_beside_paint(
 
 @inline_kernel
 def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
-    """Tell whether a chroma step is within the widest angle of a direction."""
+    """Return whether a chroma step is within the widest angle of a direction."""
     along = u * step_u + v * step_v
     return along > 0.0 and along**2 > _LEAST_COSINE**2 * (step_u**2 + step_v**2)
 
@@ -434,9 +434,9 @@ def _colour_left(top: float) -> float:
 def _best_stripes(
     table: FloatArray, u: float, v: float, sigma: float, tint_share: float
 ) -> IntArray:
-    """Return the peaks with the most chroma beyond that of paint, for their height.
+    """Return the peaks with the most chroma beyond that of paint, relative to their height.
 
-    The highest peaks may be paper.
+    The highest peaks are not taken instead, because they may be white paper.
     """
     share, least = np.zeros(table.shape[1]), max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
     for i in range(table.shape[1]):
@@ -480,7 +480,7 @@ def _weigh(
     n_possible: float,
     likelihood: FloatArray,
 ) -> None:
-    """Write the likelihood of each peak, given what a line shows for each level of height."""
+    """Write the likelihood of each peak, given a line's chroma for each level of height."""
     n = table.shape[1]
     odds, kind = np.empty(n), np.empty(n, np.int64)
     for i in range(n):
@@ -489,7 +489,7 @@ def _weigh(
         line = full * _colour_left(table[TOP, i])
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         size = math.sqrt(step_u**2 + step_v**2)
-        # A step is the largest of three, so that noise alone has one.
+        # A step is the largest of three, so its mean is not zero for noise alone.
         left = (
             max(1.0 - _LARGEST_OF_THREE * max(sigma - _QUIET, 0.0) / size, 0.0)
             if size > 0.0
@@ -504,7 +504,7 @@ def _weigh(
         if spread_u > 0.0:
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
             var_u, var_v = sigma**2 + (spread_u * height) ** 2, sigma**2 + (spread_v * height) ** 2
-            # The narrower of two explanations says more where both hold.
+            # Where both explanations hold, the narrower one has the higher density.
             off_paint = off_u**2 / var_u + off_v**2 / var_v
             off_paint -= math.log(var_along * var_across / (var_u * var_v))
         else:
@@ -524,7 +524,7 @@ def _weigh(
             likelihood[i] = prior * odds[i] / (prior * odds[i] + 1.0 - prior)
             lines[kind[i]] += likelihood[i]
             peaks[kind[i]] += 1.0
-        # The lasers make no more than they can.
+        # The number of lines is limited to the number that the lasers can make.
         share = lines / peaks * min(n_possible / np.sum(lines), 1.0)
     for i in range(n):
         if table[TOP, i] >= WHITE and table[WIDTH, i] <= widest_white_px:

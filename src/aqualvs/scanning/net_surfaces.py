@@ -1,12 +1,11 @@
-"""Whether the stripes on a surface are broken as those on a net are, and how far they reach.
+"""Net surfaces: classification of stripes as a net's, joining of coplanar pieces, and mean plane.
 
-How two surfaces share the stripes: side by side, or the one seen through the other.
-
-A net is the only surface that another one is seen through: along a stripe, light on it takes turns
-with light behind it. The flanks of a fold, which are found as planes of their own, lie side by
-side, and the one begins where the other ends.
-
-The mean plane of a net that is mostly folds, and the doubt that it casts on another.
+`describe_pattern` classifies the stripes on a surface by their lit lengths and gaps. A net is the
+only surface through which another one is seen: along a stripe, light on it alternates with light
+behind it (`seen_through`). The flanks of a fold, which are found as planes of their own, lie side
+by side, and the one begins where the other ends (`continues`); `joined_plane` gives their plane.
+For a net that is mostly folds `fit_mean` fits the mean plane, and `doubted` widens the covariance
+of a posture that disagrees with it.
 """
 
 from collections.abc import Sequence
@@ -24,8 +23,8 @@ from aqualvs.scanning.plane_fit import PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Posture
 
-# Turns along the stripes, as a share of those that light in random order takes: fewer are side by
-# side, more are seen through each other if there are enough of them.
+# Transitions along the stripes, as a share of those in random order: with fewer, surfaces are side
+# by side; with more, one is seen through the other, if there are enough transitions.
 _MOST_TURNS = 0.5
 _LEAST_TURNS = 0.6
 _ENOUGH_TURNS = 8
@@ -33,14 +32,14 @@ _ENOUGH_TURNS = 8
 # share of the range.
 _STEEPEST = 2.0
 _LOOSE_SHARE = 0.01
-# Share of the turns at which the one must begin where the other ends.
+# Share of the transitions at which the one surface must begin where the other ends.
 _MOST = 0.5
-# With this share of a net's light a plane is the net's, and the rest is folds in it.
+# With this share of a net's light a plane is the net's plane, and the rest is folds in it.
 _MAIN_SHARE = 0.5
 
 
 def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
-    """Tell whether what lies on one surface goes on, side by side, as another one.
+    """Return whether one surface continues, side by side, as another one.
 
     Parameters
     ----------
@@ -59,7 +58,7 @@ def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks)
 
 
 def seen_through(first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
-    """Tell whether one surface is seen through the gaps of another.
+    """Return whether one surface is seen through the gaps of another.
 
     Parameters
     ----------
@@ -83,10 +82,10 @@ def _turns(
     second: BoolArray,
     plane: FloatArray,
 ) -> tuple[int, float, int]:
-    """Count the turns from one surface to the other along the stripes.
+    """Count the transitions from one surface to the other along the stripes.
 
-    Also how many there would be in random order, and at how many the step over the plane is one
-    that a fold makes.
+    Also return their expected number in random order, and the number at which the step off the
+    plane is one that a fold makes.
     """
     rows = np.flatnonzero(first | second)
     order = rows[np.argsort(laser[rows] * 1_000_000 + first_line[rows])]
@@ -107,7 +106,7 @@ def _turns(
 
 @kernel
 def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
-    """Tell whether the step from one chunk to another is one that a fold makes."""
+    """Return whether the step from one chunk to another is one that a fold makes."""
     square = 0.0
     step = 0.0
     for k in range(3):
@@ -148,9 +147,9 @@ _EXACT = 1e-9
 
 
 def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
-    """Fit m·X = 1 to the strands of a folded net: all alike, whatever the errors of their places.
+    """Fit m·X = 1 to the strands of a folded net, with equal weights.
 
-    Their scatter about the plane is that of the folds, and gives the covariance.
+    The scatter about the plane is due to the folds, and gives the covariance.
 
     Parameters
     ----------
@@ -175,7 +174,7 @@ def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
 def _fit_mean(
     points: FloatArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
 ) -> float:
-    """Refine m in place, write weights and covariance; the rms, NaN where no plane is fixed."""
+    """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
     n, one = points.shape[0], np.ones(points.shape[0])
     off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(_ITERATIONS):
@@ -205,14 +204,14 @@ def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
 
 
 def doubted(posture: Posture, other: Posture, share: float) -> Posture:
-    """Return a posture with its covariance widened by another opinion.
+    """Return a posture with its covariance inflated by its difference from another one.
 
     Parameters
     ----------
     posture, other : Posture
-        Both opinions.
+        Both estimates.
     share : float
-        Of the light that holds the other one.
+        Share of the light that supports the other one.
     """
     apart = np.array(
         [other.range - posture.range, other.pitch - posture.pitch, other.yaw - posture.yaw]
@@ -220,29 +219,29 @@ def doubted(posture: Posture, other: Posture, share: float) -> Posture:
     return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
 
 
-# A typical lit stretch over itself and a typical gap: below, it is a mesh. Strands of a net leave
-# longer gaps than they light; a wall behind a net is lit between short shadows.
+# Duty of a mesh at most: a typical lit stretch over the sum of it and a typical gap. The gaps of a
+# net are longer than the lit strands; a wall behind a net is lit between short shadows.
 _MESH_DUTY = 0.6
-# Below this the gaps are at least no specks: a dense net, or a wall in a net's shadows.
+# Below this duty the gaps are real, not specks: a dense net, or a wall in a net's shadows.
 _GAPPY_DUTY = 0.9
 # Lit stretches with fewer dark search lines between them are one.
 _MIN_GAP_LINES = 3
 _MIN_STRETCHES = 3
-# So many short stretches on all lasers, and none longer, are a net of which little is seen.
+# This many short stretches on all lasers, and none longer, are a net of which little is seen.
 _FEW_STRETCHES = 5
 LONGEST_STRETCH = 0.03
 """The light on one strand is typically shorter than this, in metres."""
 # A stripe with this share of its light in stretches so much longer lies on something solid that is
 # partly hidden or broken by its texture; growth and strands along a laser make few of them.
 _UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
-# A chunk with a smaller share of its light as voice lies in a curved stretch.
+# A chunk whose sampling weight is a smaller share of its light lies in a curved stretch.
 _CURVED_VOICE = 0.21
 # Share of the lines at each end of a stripe that may be stragglers.
 _STRAGGLERS = 0.1
 
 
 class Pattern(NamedTuple):
-    """How the stripes on a surface are broken.
+    """Pattern of lit stretches and gaps of the stripes on a surface.
 
     Attributes
     ----------
@@ -373,11 +372,10 @@ def _describe_stripe(
     order: IntArray,
     focal_px: float,
 ) -> tuple[int, float, float, float, float, float]:
-    """Stretches of one laser's stripe: number, duty, typical length (m), extent, light on strands.
+    """Return number, duty, typical length (m), extent and light on strands of a laser's stretches.
 
-    Last the share of the lit search lines that are in stretches much longer than a strand's light.
-
-    Medians, so that what hides behind a fish or a box for a while does not count.
+    The last value is the share of the lit search lines in stretches much longer than a strand's
+    light. Medians are used, so that parts hidden by a fish or a box do not count.
     """
     n = order.shape[0]
     lit, dark, distance, bright = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)

@@ -1,13 +1,12 @@
-"""Curved nets: a paraboloid where a plane leaves too much over.
+"""Curved nets: fit of a paraboloid where the residuals of a plane ask for it.
 
 Over the plane that the search found, the net is a height
 
     h(u, v) = a + b u + c v + (p u² + 2 q u v + r v²) / 2
 
 with u to the right and v upward in that plane. The plane touches the net along a band only; the fit
-starts there and grows outward, because what it has learned in the band predicts the net beside it.
-
-The arithmetic of `quadric`: weighted least squares in six coefficients.
+starts there and grows outward, because the fitted band predicts the net beside it. Each step is a
+weighted least-squares fit of the six coefficients.
 """
 
 from dataclasses import replace
@@ -41,19 +40,19 @@ from aqualvs.scanning.plane_fit import SharedError
 N = 6
 """Coefficients a, b, c, p, q, r."""
 GATE_SHARE, GATE_PX = 0.004, 1.2
-"""What lies on a patch is so near to it: in shares of the range, and in pixels."""
+"""Gate of a patch: as a share of the range, and in pixels."""
 MIN_PIECES = 12
-"""Observations that a patch needs."""
+"""Least number of observations of a patch."""
 
 _STEPS = 16
 _TUKEY = 4.685  # 95 % efficiency for normal errors
 _REWEIGHTS = 6
-# Steeper bends than a radius of half a metre are something else.
+# Largest curvature: a net does not bend with a radius below half a metre.
 _STRONGEST = 2.0
-# The residual asks for curvature when it gains so much of the light or of the scatter ...
+# Curvature is fitted when it gains this share of the light or of the scatter ...
 _MORE_LIGHT = 1.10
 _LESS_SCATTER = 0.6
-# ... and the curvature is no chance.
+# ... and the curvature is significant.
 _SIGNIFICANT = 6.0
 # A pivot below this share of its diagonal is rounding, not information.
 _LEAST_PIVOT = 1e-13
@@ -82,13 +81,13 @@ def fit_over(
     points, sensitivity, sigma_px, line, laser
         Of M observations.
     gates : float
-        The fit begins with what is so many gates from the base; 0 for what is marked.
+        The fit begins with observations within this many gates of the base; 0: with `inside`.
     shift_px, tilt_px : float
-        What each laser's stripe shares, as standard deviations.
+        Errors that each laser's stripe shares, as standard deviations.
     least_bend : float
         Share of the range by which the net must bend where it is seen.
     inside : bool array, shape (M,)
-        Where the fit begins, unless `gates` says so; then what it has taken in.
+        Initial observations, unless `gates` selects them; then those of the grown fit.
     patch : array, shape (16,)
         The base, as `write_flat` writes it; completed by the coefficients.
     covariance : array, shape (6, 6), weights : array, shape (M,)
@@ -97,7 +96,7 @@ def fit_over(
     Returns
     -------
     found, asked_for : bool
-        Whether there is a fit, and whether the base leaves too much over for a plane.
+        Whether there is a fit, and whether the residuals of the plane ask for it.
     rms : float
         Weighted root mean square distance from the patch, in metres.
     """
@@ -138,7 +137,7 @@ def _asked_for(
     least_bend: float,
     rms: float,
 ) -> bool:
-    """Tell whether the residual of the base plane asks for curvature."""
+    """Return whether the residual of the base plane asks for curvature."""
     n_inside, square = 0, 0.0
     least, most = np.inf, -np.inf
     for i in range(height.shape[0]):
@@ -189,14 +188,14 @@ def over_plane(
     height: FloatArray,
     per_px: FloatArray,
 ) -> None:
-    """Write what a fit over a patch's base needs of M observations.
+    """Write the terms of a fit over a patch's base for M observations.
 
     Parameters
     ----------
     points, sensitivity : array, shape (M, 3)
         In `dome`: metres, and m/px.
     patch : array, shape (16,)
-        Whose base counts.
+        Only its base is used.
     terms : array, shape (M, 6)
         Written.
     height, per_px : array, shape (M,)
@@ -222,9 +221,9 @@ def _solve(
     factor: FloatArray,
     coefficients: FloatArray,
 ) -> bool:
-    """Fit the coefficients; `factor` gets the Cholesky factor of the normal matrix.
+    """Fit the coefficients; write the Cholesky factor of the normal matrix to `factor`.
 
-    False where the observations do not determine them.
+    Return False where the observations do not determine them.
     """
     right = np.zeros(N)
     factor[:] = 0.0
@@ -279,9 +278,9 @@ def grow(
     inside: BoolArray,
     coefficients: FloatArray,
 ) -> bool:
-    """Refit and take in what the fit predicts until nothing changes; False where it comes to none.
+    """Refit and add the predicted observations until nothing changes; return False on failure.
 
-    `inside` is where the fit begins and then what it has taken in.
+    `inside` holds the initial observations, and then those of the grown fit.
     """
     n = height.shape[0]
     weight, factor = np.empty(n), np.empty((N, N))
@@ -315,9 +314,9 @@ def reweight(
     weights: FloatArray,
     covariance: FloatArray,
 ) -> tuple[float, float]:
-    """Go on from a grown fit with Tukey's biweight, in place; the scale, and the rms in metres.
+    """Refine a grown fit with Tukey's biweight, in place; return the scale, and the rms in metres.
 
-    `covariance` gets the inverse of the normal matrix.
+    The inverse of the normal matrix is written to `covariance`.
     """
     n = height.shape[0]
     z, weight = np.empty(n), np.empty(n)
@@ -417,16 +416,16 @@ __all__ = (
 )
 
 LEAST_BEND = 0.003
-"""By so much of the range a net must bend where it is seen, or it is flat."""
+"""Least bend of a curved net where it is seen, as a share of the range."""
 
 _WIDE_GATE = 3.0
 _HINT = 2.0
-# Strands on a bend err together more than on a plane: found on simulated nets.
+# Errors of strands on a bend are more correlated than on a plane: found on simulated nets.
 _LOOSENED = 1.5
 
 
 def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
-    """Whether the residuals of a plane fit look bent: a cheap look before the fit of a patch.
+    """Return whether the residuals of a plane fit look bent: a cheap test before a patch fit.
 
     Parameters
     ----------
@@ -445,7 +444,7 @@ def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) ->
 def fit_patch(
     seen: Observations, plane: Plane, shared: SharedError, least_bend: float = LEAST_BEND
 ) -> PatchFit | None:
-    """Fit a patch to what lies on it among M observations, if they ask for one.
+    """Fit a patch to M observations, if they are not fitted as well by a plane.
 
     Parameters
     ----------
@@ -454,7 +453,7 @@ def fit_patch(
     plane : Plane
         As the search found it.
     shared : SharedError
-        What each laser's stripe shares.
+        Errors that each laser's stripe shares.
     least_bend : float
         Share of the range by which the net must bend where it is seen.
 
@@ -463,7 +462,7 @@ def fit_patch(
     PatchFit or None
         None where a plane is as good, or the curvature is not determined.
     """
-    # Of a coarse net few strands are on the plane, and the others not far from it.
+    # Few strands of a coarse net are on the plane, and the others not far from it.
     first = _fit_over(seen, plane, shared, 1.0, least_bend)
     first = first or _fit_over(seen, plane, shared, _WIDE_GATE, least_bend)
     return first.fit if first is not None and first.asked_for else None
@@ -497,7 +496,7 @@ def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> 
 
 
 class _Attempt(NamedTuple):
-    """A patch over one base plane, and whether the base leaves too much over."""
+    """A patch over one base plane, and whether the residuals of the plane ask for it."""
 
     fit: PatchFit
     asked_for: bool
@@ -510,7 +509,7 @@ def _fit_over(
     start: BoolArray | float,
     least_bend: float = LEAST_BEND,
 ) -> _Attempt | None:
-    """Fit a patch over a plane, grown from some observations or from those in so many gates."""
+    """Fit a patch over a plane, grown from given observations or from those within some gates."""
     n = len(seen.line)
     inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
     patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)

@@ -1,9 +1,7 @@
-"""Patches: pieces of paraboloids over a plane, and the point of them nearest to the vehicle.
+"""Patches: pieces of paraboloids over a plane, and their point nearest to the vehicle.
 
-The arithmetic of `Patch`: heights over it, and its point nearest to the vehicle.
-
-A patch is 16 numbers: normal and offset of its base, the two unit vectors along u and v, and the
-coefficients a, b, c, p, q, r of the height.
+For kernels a patch is 16 numbers: normal and offset of its base, the two unit vectors along u and
+v, and the coefficients a, b, c, p, q, r of the height.
 """
 
 from dataclasses import dataclass
@@ -16,12 +14,12 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 
 NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
-"""Where what begins, and how many numbers there are."""
+"""Offsets of the parts of a packed patch, and its length."""
 
 SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
-"""What is expected of nets before looking, in 1/m: bent by a metre's radius, hardly twisted."""
+"""Prior standard deviations of the curvatures of nets, in 1/m: radius of a metre, little twist."""
 
-# The nearest point is looked for in so many Newton steps, and only where they are downhill.
+# Newton steps of the search for the nearest point, which must go downhill.
 _FOOT_STEPS = 12
 _LEAST_CURVED = 0.05
 
@@ -41,7 +39,7 @@ def write_flat(normal: FloatArray, offset: float, patch: FloatArray) -> None:
 
 @inline_borrowing_kernel
 def height_over(patch: FloatArray, x: float, y: float, z: float) -> float:
-    """Return by how much a point lies behind a patch (16,), along its base's normal, in metres."""
+    """Return the distance of a point behind a patch (16,), along its base's normal, in metres."""
     u = patch[4] * x + patch[5] * y + patch[6] * z
     v = patch[7] * x + patch[8] * y + patch[9] * z
     height = patch[10] + patch[11] * u + patch[12] * v
@@ -51,7 +49,7 @@ def height_over(patch: FloatArray, x: float, y: float, z: float) -> float:
 
 @borrowing_kernel
 def heights_over(points: FloatArray, patch: FloatArray, off: FloatArray) -> None:
-    """Write by how much points (N, 3) lie behind a patch (16,)."""
+    """Write the distances of points (N, 3) behind a patch (16,)."""
     for i in range(points.shape[0]):
         off[i] = height_over(patch, points[i, 0], points[i, 1], points[i, 2])
 
@@ -95,7 +93,7 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
 
 @kernel
 def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: FloatArray) -> bool:
-    """Write the derivatives (3, 6) of m by the coefficients, by differences; False without any.
+    """Write the derivatives (3, 6) of m by the coefficients, by differences; False if undefined.
 
     `sigma`, shape (6,), are the coefficients' standard deviations.
     """
@@ -115,7 +113,7 @@ def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: F
 def carry_to_tangent(
     patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
 ) -> None:
-    """Write the covariance (3, 3) of m by differences of the coefficients; infinite without one.
+    """Write the covariance (3, 3) of m by differences of the coefficients; infinite if undefined.
 
     `covariance`, shape (6, 6), is that of the coefficients.
     """
@@ -134,7 +132,7 @@ def carry_to_tangent(
 
 @borrowing_kernel
 def write_terms(points: FloatArray, patch: FloatArray, terms: FloatArray) -> None:
-    """Write what a patch's coefficients are multiplied by at points (N, 3), shape (N, 6)."""
+    """Write the factors (N, 6) of a patch's coefficients at points (N, 3)."""
     for i in range(points.shape[0]):
         u, v = 0.0, 0.0
         for k in range(3):
@@ -151,10 +149,10 @@ CURVATURE_PRIOR: FloatArray = np.array(
 )
 """Information on the coefficients that fits add to that of the observations."""
 
-# Coefficients differ by so much where their derivatives are taken: metres, shares, 1/m.
+# Steps of the coefficients in numerical derivatives: metres, shares, 1/m.
 _ALIKE = np.full(6, 0.1)
-# The nearest point lies at most so far beside what is seen, in shares of its width and height, and
-# its normal no farther off the vehicle's forward axis than 55 degrees.
+# Largest distance of the nearest point from the visible area, in shares of its width and height;
+# its normal lies within 55 degrees of the vehicle's forward axis.
 _BESIDE_VIEW = 0.6
 _FACING = 0.57
 
@@ -195,7 +193,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class PatchFit:
-    """A patch and how well the observations determine it.
+    """A fitted patch with its covariance.
 
     Attributes
     ----------
@@ -229,16 +227,16 @@ def packed_plane(plane: Plane) -> FloatArray:
 
 
 def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
-    """Tell whether the point at which a tangent touches is not far beside what is seen of a net.
+    """Return whether a tangent touches near the visible part of a net.
 
-    Farther out a paraboloid says nothing of the net.
+    Farther out a paraboloid does not describe the net.
 
     Parameters
     ----------
     m : array, shape (3,)
         From `nearest_tangent`.
     points : array, shape (N, 3)
-        What is seen of the net, in `dome`.
+        Visible points of the net, in `dome`.
     """
     foot = m / float(m @ m)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -250,7 +248,7 @@ def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
 def nearest_tangent(patch: Patch) -> FloatArray | None:
     """Return m = n/d of the tangent plane at the point nearest to the dome's centre.
 
-    A plane has its range and its angles at the foot of the perpendicular; so has a curved net.
+    Range and angles of a plane are those at the foot of the perpendicular; so are a curved net's.
 
     Returns
     -------
@@ -269,7 +267,7 @@ def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
 
 
 def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
-    """Return a patch as it is fitted to points (N, 3); the posture is that of its tangent.
+    """Return a patch as fitted to points (N, 3); the posture is that of its tangent.
 
     Parameters
     ----------

@@ -12,10 +12,10 @@ from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 
 @dataclass(frozen=True, slots=True)
 class SharedError:
-    """What all of one laser's stripe may share in one frame, as standard deviations.
+    """Error common to all of one laser's stripe in one frame, as standard deviations.
 
     Texture, compression, the sheet's own profile and the glow beside it move a whole stripe, not
-    only single points; residuals of the fit do not show it.
+    only single points; residuals of the fit do not show this error.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ _ITERATIONS = 6
 
 @dataclass(frozen=True, slots=True)
 class PlaneFit:
-    """The plane m·X = 1 and how well the points determine it.
+    """A fitted plane m·X = 1 with its covariance.
 
     Attributes
     ----------
@@ -62,16 +62,16 @@ class PlaneFit:
 
 
 def fit_pseudo_inverse(points: FloatArray, n_groups: int, covariance: FloatArray) -> PlaneFit:
-    """Fit m·X = 1 by the left pseudo-inverse (paper, Eq. 24): all points alike, outliers too.
+    """Fit m·X = 1 by the left pseudo-inverse (paper, Eq. 24): equal weights, outliers included.
 
     Parameters
     ----------
     points : array, shape (N, 3)
         In `dome`, metres; N >= 3 and not collinear.
     n_groups : int
-        How many weights to answer with, all 1.
+        Number of weights to return, all 1.
     covariance : array, shape (3, 3)
-        Passed on: the pseudo-inverse itself says nothing about its uncertainty.
+        Covariance to return: the pseudo-inverse itself gives none.
     """
     m = np.asarray(np.linalg.lstsq(points, np.ones(len(points)))[0], dtype=np.float64)
     residual = (points @ m - 1.0) / np.linalg.norm(m)
@@ -90,8 +90,8 @@ def fit_robust(
 ) -> PlaneFit | None:
     """Fit m·X = 1 by iteratively re-weighted least squares with Tukey's biweight.
 
-    An observation's residual is compared with what its own position error makes of it, so that
-    near and far, square and grazing ones weigh as they should.
+    Each residual is divided by its standard deviation from the observation's position error, so
+    that near and far, square and grazing observations are weighted correctly.
 
     Parameters
     ----------
@@ -108,14 +108,13 @@ def fit_robust(
     start : array, shape (3,)
         A first m, such as RANSAC gives.
     shared : SharedError
-        What each laser's stripe shares.
+        Error that each laser's stripe shares.
 
     Returns
     -------
     PlaneFit or None
-        None where the points do not determine a plane. The covariance follows from the real
-        residuals (Huber 1981, section 7.6), widened by
-        what each laser's stripe shares.
+        None where the points do not determine a plane. The covariance follows from the actual
+        residuals (Huber 1981, section 7.6), widened by the error that each laser's stripe shares.
     """
     m = np.array(start, dtype=np.float64)
     covariance = np.empty((3, 3))
@@ -129,7 +128,7 @@ def fit_robust(
 
 @kernel
 def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
-    """Write the m of m·X = 1 that fits points (N, 3) best, all alike; False if they fix none."""
+    """Write the m of m·X = 1 that best fits points (N, 3), unweighted; False if undetermined."""
     normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     one = np.ones(points.shape[0])
     normal_equations(points, one, one, normal, right)
@@ -145,7 +144,7 @@ def _normalised_residuals(
     sigma: FloatArray,
     z: FloatArray,
 ) -> None:
-    """Residuals of m·X = 1 over what the pixel error makes of them (written to `sigma`)."""
+    """Return the residuals of m·X = 1 over their sigma by pixel error (written to `sigma`)."""
     for i in range(points.shape[0]):
         per_px = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
         sigma[i] = abs(per_px) * sigma_px[i] + 1e-12
@@ -202,7 +201,7 @@ def _fit(
         if not solve_symmetric(normal, right, inverse, m):
             return np.nan
     _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
-    # A scatter below the stated errors is luck where observations are few.
+    # With few observations, a scatter below the stated errors is chance.
     factor = max(_huber_factor(z, _TUKEY * scale), 1.0)
     normal_equations(points, sigma, np.ones(n), normal, right)
     if not invert_symmetric(normal, covariance):
@@ -218,9 +217,9 @@ def _fit(
 
 @kernel
 def _huber_factor(z: FloatArray, cut: float) -> float:
-    """Factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
+    """Return the factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
 
-    Counts what the outliers cost: they add no information, though the fit ignores them.
+    Accounts for outliers: they add no information, and the fit ignores them.
     """
     n = z.shape[0]
     if n <= 3:

@@ -1,13 +1,13 @@
-"""The search for one plane among chunks of stripe: a deterministic, locally optimised RANSAC.
+"""Search for one plane among subsegments: a deterministic, locally optimised RANSAC.
 
-Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44): chunks
-next to each other on a stripe more likely share a surface than distant ones, and chunks with more
-voice more likely lie on any surface than specks. Hypotheses are scored
-by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), the promising ones refined.
+Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44):
+subsegments (chunks) next to each other on a stripe more likely share a surface than distant ones,
+and those with a larger sampling weight (`voice`) more likely lie on any surface than specks.
+Hypotheses are scored by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), and the promising
+ones are refined.
 
 Chunks come as a table, one column a chunk and one row a quantity, so that scoring a hypothesis
-runs along memory and becomes vector instructions; what is then summed is kept chunk by chunk,
-because a sum has its order.
+runs along memory and is vectorised; the scores are then summed chunk by chunk, in a fixed order.
 """
 
 import numpy as np
@@ -26,26 +26,26 @@ X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 N_ROWS = 7
 
 _MAX_HYPOTHESES = 6000
-# Trials for a plane, times the square of its share of the voice; beyond so many in all, only this
-# part of them.
+# Trials for a plane, times the square of its share of the sampling weight; beyond the second number
+# in total, only this part of them.
 _TRIALS, _MANY, _SOME = 45.0, 2500.0, 0.55
-# Chunks looked at in all: a frame full of noise must not hold up a live run.
+# Limit of the chunks scored in total: a frame full of noise must not delay a live run.
 _MAX_WORK = 10_000_000
-# So many chunks are scored before it is asked whether the rest can matter.
+# Chunks scored between checks whether the rest can change the result.
 _STEP = 32
 # A neighbour for sampling lies at most this many chunks away in the same laser's list.
 _NEIGHBOURHOOD = 8
-# Chunks with a smaller share of the typical voice are not sampled.
+# Chunks with a smaller share of the typical sampling weight are not sampled.
 _SOFTEST_SHARE = 0.5
 MIN_FACING = float(np.cos(np.deg2rad(55.0)))
-"""Normals farther from the vehicle's forward axis are not a target in front of it."""
+"""Limit of a normal's deviation from the forward axis: others are no target ahead."""
 # Distance of a chunk from a plane: this share of the range, and this shift of the stripe.
 _GATE_RANGE_SHARE = 0.003
 _GATE_PX = 1.0
 # Gate of a hypothesis before it is refined, and how near the best one it must come for that.
 _WIDE_GATE = 3.0
 _WORTH_REFINING = 0.8
-# The best laser cannot outvote the second by more than this: a plane rests on two.
+# Largest weight of the best laser relative to the second: a plane needs two lasers.
 MOST_TO_SECOND = 3.0
 
 
@@ -69,8 +69,8 @@ def _score(
 ) -> float:
     """Return the MSAC score of a plane (normal, offset) with a gate `stretch` times as wide.
 
-    It is 0 where, some way on, it is plain that the score comes to no more than `enough`.
-    `voice_after` has the voice of each chunk and all after it, `lanes` is overwritten.
+    The score is 0 if a partial sum shows that it cannot exceed `enough`. `voice_after` holds the
+    sampling weight of each chunk and all after it; `lanes` is overwritten.
     """
     first = 0.0
     second = 0.0
@@ -94,7 +94,7 @@ def _score(
 def _near(
     table: FloatArray, at: int, stop: int, plane: FloatArray, stretch_2: float, lanes: FloatArray
 ) -> float:
-    """Sum the voice of some chunks, each by how near it is to a plane."""
+    """Sum the sampling weights of some chunks, scaled by their closeness to a plane."""
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
@@ -118,7 +118,7 @@ def refine_plane(
     scratch: FloatArray,
     lanes: FloatArray,
 ) -> bool:
-    """Refit the plane to what lies in the stretched gate, X·m = 1 (paper, Eq. 24), in place."""
+    """Refit the plane X·m = 1 (paper, Eq. 24) to the chunks in the widened gate, in place."""
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
@@ -158,7 +158,7 @@ def refine_plane(
 
 @inline_kernel
 def _plane_through(table: FloatArray, i: int, j: int, k: int, plane: FloatArray) -> bool:
-    """Write the plane through three chunks, normal outward; False where they are on a line."""
+    """Write the plane through three chunks, normal outward; return False if they are collinear."""
     ax, ay, az = table[X, i], table[Y, i], table[Z, i]
     ux, uy, uz = table[X, j] - ax, table[Y, j] - ay, table[Z, j] - az
     vx, vy, vz = table[X, k] - ax, table[Y, k] - ay, table[Z, k] - az
@@ -175,14 +175,14 @@ def _plane_through(table: FloatArray, i: int, j: int, k: int, plane: FloatArray)
 
 @inline_kernel
 def _next_random(state: np.uint64) -> tuple[np.uint64, float]:
-    """One step of a 64-bit linear congruential generator (Knuth's MMIX constants), in [0, 1)."""
+    """Step a 64-bit linear congruential generator (Knuth's MMIX constants); value in [0, 1)."""
     state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
     return state, float(state >> np.uint64(11)) / 9007199254740992.0
 
 
 @inline_borrowing_kernel
 def _pick(voice_up_to: FloatArray, guide: IntArray, draw: float) -> int:
-    """Draw a chunk with a probability in proportion to its voice."""
+    """Draw a chunk with a probability proportional to its sampling weight."""
     wanted = draw * voice_up_to[voice_up_to.shape[0] - 1]
     at = guide[int(draw * guide.shape[0])]
     while at > 0 and voice_up_to[at - 1] > wanted:
@@ -194,7 +194,7 @@ def _pick(voice_up_to: FloatArray, guide: IntArray, draw: float) -> int:
 
 @borrowing_kernel
 def _guide(voice_up_to: FloatArray, guide: IntArray) -> None:
-    """Write where `_pick` begins to look, for draws in as many steps as there are chunks."""
+    """Write the start of the search in `_pick`, for draws in as many steps as there are chunks."""
     n = guide.shape[0]
     step = voice_up_to[n - 1] / n
     at = 0
@@ -206,13 +206,13 @@ def _guide(voice_up_to: FloatArray, guide: IntArray) -> None:
 
 @kernel
 def _middle_voice(voice: FloatArray) -> float:
-    """Return the voice that one half of all voice is in chunks with at most that of."""
+    """Return the weighted median of the sampling weights."""
     values = voice.copy()
     wanted, below = 0.5 * np.sum(voice), 0.0
     low, high = 0, values.shape[0]
     while high - low > 1:
         pivot = values[(low + high) // 2]
-        # Softer ones to the front, louder ones to the end.
+        # Partition: smaller weights to the front, larger ones to the end.
         first, last, k = low, high, low
         softer, same = 0.0, 0.0
         while k < last:
@@ -240,9 +240,9 @@ def _middle_voice(voice: FloatArray) -> float:
 
 @kernel
 def _loud(voice: FloatArray) -> IntArray:
-    """Return the chunks to sample: those not much softer than the one half of all voice is above.
+    """Return the chunks to sample: those not much below the weighted median.
 
-    Where glare makes specks by the thousand, most neighbours on a stripe would be specks.
+    Where glare makes thousands of specks, most neighbours on a stripe would be specks.
     """
     return np.flatnonzero(voice >= _SOFTEST_SHARE * _middle_voice(voice))
 
@@ -268,7 +268,7 @@ def search_plane(
     laser_start : int array, shape (n_lasers + 1,)
         First chunk of each laser, and C.
     nearest, farthest : float
-        Hypotheses beyond are not considered, in metres.
+        Limits of the hypotheses, in metres.
     seed : int
         The same seed and chunks give the same plane.
     best_plane : array, shape (4,)
@@ -308,7 +308,7 @@ def search_plane(
             continue
         if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
             continue
-        # A plane through neighbours is rough: judged by a wide gate, drawn in by narrower ones.
+        # A plane through neighbours is rough: scored with a wide gate, refined with narrower ones.
         score = _score(
             table, laser_start, plane, _WIDE_GATE, voice_after, _WORTH_REFINING * best_rough, lanes
         )
@@ -322,10 +322,10 @@ def search_plane(
             continue
         best = score
         best_plane[:] = plane
-        # With a share s of the voice on the plane a trial succeeds with probability of s^2 / 12 to
-        # s^2 / 5: of neighbours half fit or fewer, and a third of the draws are of one laser. Where
-        # two thirds of a net's light make a plane of their own, its trials leave one search in
-        # 1000 without the whole net. Planes through noise are not worth as many.
+        # With a share s of the weight on the plane a trial succeeds with a probability of s^2 / 12
+        # to s^2 / 5: half of the neighbours fit or fewer, and a third of the draws are of one
+        # laser. Where two thirds of a net's light make a plane of their own, its trials leave one
+        # search in 1000 without the whole net. Planes through noise do not deserve as many.
         share = min(best / total, 1.0)
         trials = _TRIALS / (share * share)
         needed = min(most, int(max(min(trials, _MANY), _SOME * trials)) + 20)

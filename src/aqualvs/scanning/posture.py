@@ -1,4 +1,4 @@
-"""Posture relative to a plane target: range, pitch, yaw and how far to trust them."""
+"""Posture relative to a plane target: range, pitch and yaw, with their covariance."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,17 +12,17 @@ from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.scanning.plane_fit import PlaneFit
 
-# Beyond these a posture tells nothing that a pilot could use.
+# Limits of the standard deviations of a posture that a pilot can use.
 _MAX_SIGMA_RANGE_SHARE = 0.05
 _MAX_SIGMA_ANGLE = np.deg2rad(5.0)
 MAX_RMS_SHARE = 0.02
 """A plane fits a net or a wall within this share of the range, or it is not a plane."""
-# What detection noise may add to the edge of the working range.
+# Tolerance at the edge of the working range for detection noise.
 _RANGE_TOLERANCE = 0.01
 
 
 class Reason(StrEnum):
-    """Why there is no posture; the value is what `posture.csv` says in `reason`."""
+    """Reason for a refusal; the value is that of `reason` in `posture.csv`."""
 
     NO_STRIPES = "no_stripes"
     """Nothing in the lasers' bands stands out."""
@@ -52,7 +52,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """No posture, and why; falsy."""
+    """A refused posture with its reason; falsy."""
 
     reason: Reason
     detail: str = ""
@@ -71,11 +71,11 @@ class Posture:
     range, pitch, yaw : float
         Distance of the dome's centre from the plane in metres, angles in radians.
     covariance : array, shape (3, 3)
-        Of (range, pitch, yaw) by the noise of this frame alone, in m and rad: what differs from
-        frame to frame, and what averaging lowers. A time filter wants this one.
+        Of (range, pitch, yaw) by the noise of this frame alone, in m and rad: the part that differs
+        from frame to frame and that averaging reduces. A time filter needs this one.
     rig_covariance : array, shape (3, 3)
         Of the same by the uncertainty of the rig (intrinsics, dome, water, lasers): nearly the same
-        error in all frames of a dive. Zero where the rig is exact or was not asked.
+        error in all frames of a dive. Zero where the rig is exact or its uncertainty was not used.
     normal_in_dome : array, shape (3,)
         Unit normal of the target plane, pointing away from the vehicle.
     slant_range : float
@@ -83,7 +83,7 @@ class Posture:
     nearest : float
         Distance from the dome's centre to the nearest measured point of the target, in metres.
     n_points : int
-        Stripe points that the fit rests on.
+        Number of inliers of the fit.
     rms : float
         Root mean square distance of their chunks from the plane, in metres; from the curved
         surface where there is one.
@@ -114,21 +114,21 @@ class Posture:
     def total_covariance(self) -> FloatArray:
         """Covariance (3, 3) of (range, pitch, yaw) by frame and rig together, in m and rad.
 
-        How far the posture may be from the truth: what others should be told.
+        The expected error of the posture, for use outside of the package.
         """
         total: FloatArray = self.covariance + self.rig_covariance
         return total
 
 
 def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: FloatArray) -> Posture:
-    """Turn a plane fit into a posture (paper, Eq. 23-26), whatever it is worth.
+    """Convert a plane fit to a posture (paper, Eq. 23-26), without validation.
 
     Parameters
     ----------
     fit : PlaneFit
         Of the target.
     points : array, shape (N, 3)
-        The stripe points that the fit rests on, in `dome`, metres.
+        The inliers of the fit, in `dome`, metres.
     camera_axis_in_dome : array, shape (3,)
         Unit vector along which the camera looks.
     """
@@ -139,7 +139,7 @@ def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: Flo
 def posture_of(
     fit: PlaneFit, nearest: float, n_points: int, camera_axis_in_dome: FloatArray
 ) -> Posture:
-    """Do as `posture_from_fit` where the points are counted and the nearest of them is known."""
+    """Convert a plane fit to a posture, given the number of points and the nearest distance."""
     covariance, normal = np.empty((3, 3)), np.empty(3)
     approach = _carry_over(fit.m, fit.covariance, camera_axis_in_dome, covariance, normal)
     distance, pitch, yaw = range_pitch_yaw(fit.m)
@@ -159,16 +159,16 @@ def posture_of(
 def believable(
     posture: Posture, working_range: tuple[float, float], max_rms_share: float = MAX_RMS_SHARE
 ) -> Posture | Refusal:
-    """Return the posture if a pilot may rely on it, else why not.
+    """Return the posture if a pilot may rely on it, else a refusal.
 
     Parameters
     ----------
     posture : Posture
         As measured.
     working_range : (float, float)
-        Nearest and farthest range that is believed, in metres.
+        Nearest and farthest range that is accepted, in metres.
     max_rms_share : float
-        Points may scatter about the surface by this share of the range.
+        Largest scatter of the points about the surface, as a share of the range.
     """
     near, far = working_range
     distance = posture.range
@@ -193,7 +193,7 @@ def believable(
 
 
 def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
-    """Range (m), pitch and yaw (rad) of the plane m·X = 1 (paper, Eq. 25-26 as arctangents)."""
+    """Return range (m), pitch and yaw (rad) of m·X = 1 (paper, Eq. 25-26 as arctangents)."""
     x, y, z = m.tolist()
     return 1.0 / math.hypot(x, y, z), math.atan2(z, y), math.atan2(x, y)
 
@@ -206,7 +206,7 @@ def _carry_over(
     out_covariance: FloatArray,
     out_normal: FloatArray,
 ) -> float:
-    """Write the covariance of (range, pitch, yaw) and the unit normal; returns m along the axis."""
+    """Write the covariance of (range, pitch, yaw) and the unit normal; return m along the axis."""
     jacobian, length = np.empty((3, 3)), np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
     posture_by_plane(m, jacobian)
     for k in range(3):
@@ -222,7 +222,7 @@ def _carry_over(
 
 @borrowing_kernel
 def rested_on(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
-    """Count the points (N, 3) that have a weight; the distance of the nearest from the origin."""
+    """Return the number of points (N, 3) with a weight, and the least distance from the origin."""
     n, square = 0, np.inf
     for i in range(points.shape[0]):
         if weights[i] > 0.0:

@@ -1,6 +1,8 @@
-"""The posture to one surface: which readings it rests on, and the fit to them.
+"""The posture to one surface: its inliers, the fit to them, and the checks of the result.
 
-The arithmetic of `PostureMeter`: what is measured of a surface, and what a fit rests on.
+`PostureMeter.measure` selects the pieces of stripe on the surface, fits a plane or a paraboloid to
+them, follows a net where it leaves the surface, and replaces or widens the posture where a net is
+mostly folds.
 """
 
 import math
@@ -40,7 +42,7 @@ from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, be
 from aqualvs.scanning.region_growing import SOME, follow_net, much_beside
 from aqualvs.scanning.surfaces import Surface
 
-# Two stripes disturb each other within this many full widths, and this many pixels more.
+# Reach of a crossing: this many full widths of the stripes, and this many pixels more.
 _CROSSING_WIDTHS = 1.2
 _CROSSING_PX = 2.0
 
@@ -58,16 +60,16 @@ def select_pieces(
     focal_px: float,
     group: IntArray,
 ) -> tuple[int, int]:
-    """Give numbers to pieces of stripe on the target, -1 to readings elsewhere or in crossings.
+    """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
 
-    A piece belongs as a whole: a part of a strand's light would have its centre off the sheet.
+    A piece is used as a whole: the centre of a part of a strand's light would be off the sheet.
 
     Parameters
     ----------
     points, laser, width
         Of N readings.
     piece : int array, shape (N,)
-        Number of each reading's piece: its stretch or its chunk.
+        Number of each candidate's piece: its stretch or its chunk.
     min_lines : int
         Shorter pieces are left out.
     on_target : bool array, shape (N,)
@@ -84,7 +86,7 @@ def select_pieces(
     Returns
     -------
     n_groups, n_readings : int
-        How many groups there are, and readings in them.
+        Number of groups, and of candidates in them.
     """
     number = _pieces_on(piece, min_lines, on_target)
     mean_width = _mean_widths(laser, width, piece, number, planes.shape[0])
@@ -124,7 +126,7 @@ def _pieces_on(piece: IntArray, min_lines: int, on_target: BoolArray) -> IntArra
 def _mean_widths(
     laser: IntArray, width: FloatArray, piece: IntArray, number: IntArray, n_lasers: int
 ) -> FloatArray:
-    """Mean stripe width of each laser; a single width is inflated by the crossing itself."""
+    """Return each laser's mean stripe width; single widths are inflated by the crossing itself."""
     total, count = np.zeros(n_lasers), np.zeros(n_lasers)
     for i in range(piece.shape[0]):
         if number[piece[i]] != -1:
@@ -145,7 +147,7 @@ def in_crossing(
     mean_width: FloatArray,
     focal_px: float,
 ) -> bool:
-    """Whether another laser's stripe crosses the target here (paper, section 3.1)."""
+    """Return whether another laser's stripe crosses the target here (paper, section 3.1)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
     m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
     for b in range(planes.shape[0]):
@@ -179,7 +181,7 @@ def mark_rested_on(
     points: FloatArray,
     rests_on: BoolArray,
 ) -> tuple[int, float, int]:
-    """Mark the readings that a fit rests on.
+    """Mark the inliers of a fit.
 
     Parameters
     ----------
@@ -188,7 +190,7 @@ def mark_rested_on(
     laser : int array, shape (M,), weights : array, shape (M,)
         Of the observations.
     of_all : bool
-        Whether observations without weight count for `second`.
+        Whether observations without weight are counted in `second`.
     points : array, shape (N, 3)
         Of the readings.
     rests_on : bool array, shape (N,)
@@ -197,11 +199,11 @@ def mark_rested_on(
     Returns
     -------
     n_points : int
-        How many are marked.
+        Number of inliers.
     nearest : float
         Distance of the nearest of them from the origin.
     second : int
-        Observations that the second best laser has, those without weight counted if asked for.
+        Number of observations of the second best laser.
     """
     n, square = 0, np.inf
     for i in range(group.shape[0]):
@@ -235,7 +237,7 @@ def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: Fl
 def mark_beside(
     source: IntArray, whole: BoolArray, off: FloatArray, most: float, beside: BoolArray
 ) -> None:
-    """Mark the readings of a net, and those near its plane whose light the net does not explain.
+    """Mark the candidates of a net, and those near its plane whose light the net does not explain.
 
     Parameters
     ----------
@@ -246,7 +248,7 @@ def mark_beside(
     off : array, shape (N,)
         From `distances_off`.
     most : float
-        What is farther off is not near.
+        Largest distance that is near.
     beside : bool array, shape (N,)
         Written.
     """
@@ -265,7 +267,7 @@ def mark_beside(
 def light_share_near(
     group: IntArray, trust: FloatArray, points: FloatArray, patch: FloatArray, near: float
 ) -> float:
-    """Return the share of the light that is in pieces nearer to a patch than `near`, in metres.
+    """Return the share of the light in pieces nearer to a patch than `near`, in metres.
 
     Parameters
     ----------
@@ -298,7 +300,7 @@ def weigh_readings(
     alike: bool,
     weights: FloatArray,
 ) -> None:
-    """Write what each reading weighs in a fit of m·X = 1, its piece's weight in equal shares.
+    """Write the weight of each candidate in a fit of m·X = 1: an equal share of its piece's.
 
     Parameters
     ----------
@@ -309,9 +311,9 @@ def weigh_readings(
     sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)
         Of the observations.
     alike : bool
-        Whether the fit took all observations alike, and not by their errors.
+        Whether the fit gave all observations equal weights, regardless of their errors.
     weights : array, shape (N,)
-        Written: 1 over the variance of m·X; 0 where the fit does not rest on a reading.
+        Written: 1 over the variance of m·X; 0 for outliers.
     """
     count, weight = np.zeros(sigma_px.shape[0]), np.empty(sigma_px.shape[0])
     for i in range(group.shape[0]):
@@ -326,56 +328,58 @@ def weigh_readings(
 
 
 MIN_LINES = 30
-"""Stripe points that a posture needs."""
+"""Least number of stripe points of a posture."""
 
-# The light on a strand covers this many search lines; less is a fragment, off the strand's middle.
+# Least search lines of the light on a strand; less is a fragment, off the strand's middle.
 _SHORTEST_STRAND = 3
 # A net bends out of the plane that touches it by at most this share of the range.
 _DEEPEST_BEND = 0.15
 _FEW_STRANDS, _STRONG_BEND = 36, 0.02
-# With less than this share of a net's light a surface does not stand for the net: its mean plane
-# does. Up to the greater share that casts doubt.
+# With less than this share of a net's light on the surface, the net's mean plane replaces it. Up to
+# the greater share, the mean plane inflates the covariance.
 _MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
 # Fewer strands do not show that a net is folded.
 _LEAST_FOLDED = 12
-# So far, as a share of the range, strands may scatter about the mean plane of a folded net.
+# Largest scatter of strands about the mean plane of a folded net, as a share of the range.
 _FOLDED_RMS_SHARE = 0.04
 _NEAR_SHARE = 0.005
-# Light that lies so near the plane (share of the range) may be the net's where nothing else
-# explains it. A net with less than the first shares of its strands and of their light on the
-# surface is folds; with more than the last of light there is doubt only, as beside a single fold.
-# Found on simulated nets: folded ones reach 0.43 and 0.51, with a single fold 0.37 and 0.48; flat
-# ones in strong sun and those with growth come down to 0.34 and 0.57, or to 0.56 and 0.29.
+# Light this near the plane (share of the range) may be the net's if nothing else explains it. A net
+# with less than the first two shares, of its strands and of their light, on the surface is mostly
+# folds; with more light than the last share, as beside a single fold, only the covariance is
+# inflated. Found on simulated nets: folded ones reach 0.43 and 0.51, with a single fold 0.37 and
+# 0.48; flat ones in strong sun and those with growth come down to 0.34 and 0.57, or to 0.56 and
+# 0.29.
 _BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT, _DOUBTED_LIGHT = 0.06, 0.45, 0.54, 0.47
 # Independent pieces of stripe that the second best laser must show.
 _MIN_PIECES = 3
 
 
 class FitMethod(StrEnum):
-    """How the plane is fitted to the target's points."""
+    """Method of the plane fit to the target's points."""
 
     ROBUST = "robust"
     """Weighted by each point's uncertainty, outliers rejected."""
     PSEUDO_INVERSE = "pseudo_inverse"
-    """The paper's Eq. 24, for comparison: all points alike."""
+    """The paper's Eq. 24, for comparison: equal weights."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A posture, or why there is none, and the readings it rests on.
+    """A posture or its refusal, with the inliers and their weights.
 
     Attributes
     ----------
     posture : Posture or Refusal
-        The answer.
+        The result.
     rests_on : bool array, shape (N,)
-        Readings in the posture; none where it is refused.
+        Inliers: candidates in the posture; none where it is refused.
     patch : Patch or None
-        The curved surface, where the net is none that a plane describes.
+        The curved surface, where a plane does not describe the net.
     whole : bool array, shape (N,), or None
-        Readings on the net, also where its folds leave the surface; None for what is no net.
+        Mask of the net: candidates on it, also where its folds leave the surface; None if the
+        target is no net.
     weights : array, shape (N,), or None
-        What each reading weighs in the fit, as 1 over the variance of m·X; None without a posture.
+        Weight of each candidate in the fit, 1 over the variance of m·X; None without a posture.
     folded : bool
         Whether the posture is that of a folded net's mean plane.
     """
@@ -389,7 +393,7 @@ class Measurement:
 
 
 class PostureMeter:
-    """Measures postures to surfaces with one rig.
+    """Estimator of postures to surfaces with one rig.
 
     Parameters
     ----------
@@ -398,7 +402,7 @@ class PostureMeter:
     searches : sequence of StripeSearch
         One for each laser.
     fit : FitMethod
-        How planes are fitted.
+        Method of the plane fit.
     """
 
     def __init__(self, rig: Rig, searches: Sequence[StripeSearch], fit: FitMethod) -> None:
@@ -407,7 +411,7 @@ class PostureMeter:
         self._working_range = rig.working_range
         sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
         self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
-        # A kernel that is given None is compiled without the way to bent sheets.
+        # A kernel that is given None is compiled without the code for bent sheets.
         self._bent = sheets if sheets[:, WINDOWED].any() else None
         self._focal_px = rig.focal_px
         self._line_px = max((search.line_px for search in searches), default=1)
@@ -423,10 +427,10 @@ class PostureMeter:
         chunk_index : int array, shape (N,)
             Row of each reading's chunk in the surface's `members`.
         target : Surface
-            What to measure to.
+            Surface that the posture is measured to.
         """
-        # On a net a stretch is one strand, whose light has one centre; on a wall a chunk is enough
-        # for errors to be independent.
+        # On a net a stretch is one strand, whose light has one centre; on a wall a chunk is long
+        # enough for independent errors.
         mesh = target.is_mesh
         piece, min_lines = (readings.stretch, _SHORTEST_STRAND) if mesh else (readings.chunk, 1)
         on_target = target.members[chunk_index]
@@ -446,7 +450,7 @@ class PostureMeter:
         return self._believed(readings, flat)
 
     def _believed(self, readings: Readings, found: Measurement) -> Measurement:
-        """Return what was found if a pilot may rely on it, else why not."""
+        """Return the measurement if a pilot may rely on it, else a refusal."""
         if isinstance(found.posture, Refusal):
             return found
         max_rms_share = _FOLDED_RMS_SHARE if found.folded else MAX_RMS_SHARE
@@ -458,11 +462,11 @@ class PostureMeter:
     def _measure_net(
         self, readings: Readings, seen: "_Seen", fit: PlaneFit, flat: Measurement, target: Surface
     ) -> Measurement:
-        """Measure the posture to a net, which may bend or fold, and find what is seen of it."""
+        """Measure the posture to a net, which may bend or fold, and find its visible part."""
         plane = _plane_of(fit)
         off = np.empty(len(readings))
         distances_off(readings.points, plane.normal, plane.offset, off)
-        # Few strands hint at nothing; only a strong bend is believed then.
+        # With few strands only a strong bend is accepted.
         few = len(seen.pieces.laser) < _FEW_STRANDS and much_beside(off, SOME)
         bends = target.n_pieces > 1 or much_beside(off)
         bends = bends or hints_at_curvature(seen.pieces, fit.weights, plane)
@@ -470,7 +474,7 @@ class PostureMeter:
         curved = None if least == 0.0 else self._measure_curved(readings, plane, off, least)
         best = flat if curved is None else curved
         if curved is not None and not self._tells(readings, curved):
-            # The net bends, but how it stands at its nearest point cannot be told.
+            # The net bends, but its posture at the nearest point is not observable.
             best = _doubted(flat, curved, 1.0)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         whole = self._followed(readings, best.rests_on, plane, patch)
@@ -481,7 +485,7 @@ class PostureMeter:
     def _followed(
         self, readings: Readings, rests_on: BoolArray, plane: Plane, patch: FloatArray
     ) -> BoolArray:
-        """Mark what is seen of a net, also where its folds leave the surface."""
+        """Mark the visible part of a net, also where its folds leave the surface."""
         whole, height = rests_on.copy(), np.empty(len(readings))
         heights_over(readings.points, patch, height)
         follow_net(
@@ -540,7 +544,7 @@ class PostureMeter:
         best: Measurement,
         is_curved: bool,
     ) -> Measurement:
-        """Return the measurement, doubted or replaced by a net's mean plane where it is folds."""
+        """Return the measurement, widened or replaced by the mean plane if the net is folds."""
         seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, whole, plane.normal)
         if len(seen.pieces.laser) < _LEAST_FOLDED:
             return best
@@ -553,7 +557,7 @@ class PostureMeter:
         return mean if share < _MAIN_SHARE else _doubted(best, mean, 1.0 - share)
 
     def _tells(self, readings: Readings, curved: Measurement) -> bool:
-        """Tell whether the posture to a curved net may be relied on."""
+        """Return whether the posture to a curved net may be relied on."""
         posture = curved.posture
         return (
             isinstance(posture, Posture)
@@ -566,7 +570,7 @@ class PostureMeter:
     def _measure_curved(
         self, readings: Readings, plane: Plane, off: FloatArray, least_bend: float
     ) -> Measurement | None:
-        """Measure the posture to a curved net; None where a plane does."""
+        """Measure the posture to a curved net; None where a plane is as good."""
         near = off < _DEEPEST_BEND
         seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, near, plane.normal)
         if not len(seen.pieces.laser):
@@ -630,10 +634,10 @@ class PostureMeter:
     def _measured(
         self, readings: Readings, seen: "_Seen", fit: PlaneFit, *, of_all: bool = False
     ) -> Measurement | None:
-        """Return the posture of a fit; None unless a second laser fixes the plane's turn.
+        """Return the posture of a fit; None unless a second laser determines the plane's angles.
 
-        A line and one point always share a plane: a single piece would not show that it is wrong.
-        With `of_all` pieces count that the fit has rejected.
+        A line and one point always share a plane: an error of a single piece would not show.
+        With `of_all`, pieces that the fit has rejected count too.
         """
         rests_on = np.empty(len(readings), np.bool_)
         laser = seen.pieces.laser
@@ -643,7 +647,7 @@ class PostureMeter:
         if second < _MIN_PIECES:
             return None
         weights, pieces = np.empty(len(readings)), seen.pieces
-        # The mean plane of folds and the pseudo-inverse do not look at the errors.
+        # The mean plane of folds and the pseudo-inverse do not use the errors.
         alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
         weigh_readings(
             seen.group, fit.m, pieces.sensitivity, pieces.sigma_px, fit.weights, alike, weights
@@ -653,7 +657,7 @@ class PostureMeter:
 
 
 class _Seen(NamedTuple):
-    """Pieces of stripe on a surface; which one each reading is in, -1 for none, how many are."""
+    """Pieces of stripe on a surface; each candidate's piece (-1: none), number of candidates."""
 
     group: IntArray
     n_readings: int
@@ -666,7 +670,7 @@ def _plane_of(fit: PlaneFit) -> Plane:
 
 
 def _doubted(found: Measurement, other: Measurement, share: float) -> Measurement:
-    """Widen a posture's covariance by another opinion, which so much of the light holds."""
+    """Inflate a posture's covariance by its difference from another one with a share of light."""
     one, two = found.posture, other.posture
     return replace(found, posture=doubted(one, two, share)) if one and two else found
 

@@ -1,15 +1,13 @@
-"""Following a net where it leaves its plane: from strand to strand along each stripe.
-
-Where a net folds, its light leaves the plane, but not at once: the next strand is about as far
-away as the last one, give or take what a flank of a fold makes of the way between them. Readings
-of other lasers' light, bubbles and what is seen through the net have no such neighbours, or are
-farther off than the right reading of the same light.
-
-Light that belongs to the target although the search for planes left it out.
+"""Region growing: light of the target that the search for planes left out.
 
 A plane is sought with a narrow gate, among whole pieces of stripe, so that nothing foreign enters
-the posture. To say what a point lies on, the gate may be wider: a strand's light is off the plane
-by the strand's thickness, a net bulges, and where stripes cross two lasers share the light.
+the posture. To label points the gate may be wider (`recruit`): a strand's light is off the plane by
+the strand's thickness, a net bulges, and where stripes cross two lasers share the light.
+
+`follow_net` follows a net along each stripe, from strand to strand. Where a net folds, its light
+leaves the plane gradually: the next strand is about as far away as the last one, within the
+steepness of a flank. Candidates of other lasers' light, bubbles and light seen through the net have
+no such neighbours, or are farther off than the right candidate of the same light.
 """
 
 import numpy as np
@@ -18,21 +16,21 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.net_surfaces import LONGEST_STRETCH
 
-# Distance from the target at which light belongs to it: a share of the range, and pixels.
+# Largest distance of light on the target: a share of the range, and pixels.
 _NEAR_SHARE = 0.010
 _NEAR_PX = 2.0
-# What of a piece must be near.
+# Share of a piece that must be near.
 _MOST = 0.5
-# Light counts as on a plane, or beside it, within these shares of the range.
+# Limits of light on a plane, and of light beside it, as shares of the range.
 _ON_IT, _BESIDE = 0.008, 0.04
 MUCH, SOME = 0.85, 0.5
 """Light beside a plane over light on it."""
 
 
 def much_beside(off: FloatArray, much: float = MUCH) -> bool:
-    """Tell whether so much light lies just off a plane that the net may bend away from it.
+    """Return whether enough light lies just off a plane for the net to bend away from it.
 
-    Where stripes cross, wrong readings lie there as well.
+    Where stripes cross, wrong candidates lie there as well.
 
     Parameters
     ----------
@@ -56,7 +54,7 @@ def recruit(
     taken: BoolArray,
     on_target: BoolArray,
 ) -> None:
-    """Mark readings near the target as on it.
+    """Mark candidates near the target as on it.
 
     Parameters
     ----------
@@ -99,30 +97,30 @@ def recruit(
             on_target[i] = True
 
 
-# Rows of what is known of stretches: search lines, means of height, line and trust, shares of light
-# on the net and of light that is on it by another reading, laser, length in metres.
+# Rows of the table of stretches: search lines, means of height, line and confidence, shares of
+# light on the net and of light that is on it by another candidate, laser, length in metres.
 LINES, HEIGHT, LINE, TRUST, ON_NET, TAKEN, LASER, SIZE, _N_FACTS = range(9)
 
-# The steepest flank that is followed, and what noise adds to a step, as a share of the range.
+# The steepest flank that is followed, and the noise of a step, as a share of the range.
 _STEEPEST = 1.2
 _LOOSE_SHARE = 0.006
-# A strand alone is believed within this share of the range; farther off only as one of a flank.
+# A single strand is accepted within this share of the range; farther off only as part of a flank.
 _LONELY_SHARE = 0.015
-# And a fold has at least so many strands that leave the surface by as much, of all lasers.
+# Least number of strands of a fold beyond that share, of all lasers.
 _LEAST_STRANDS = 6
-# The next strand is at most so far: a share of the range, and so many usual distances.
+# Largest distance to the next strand: a share of the range, and in usual distances.
 _FARTHEST_SHARE, _FARTHEST_GAP = 0.15, 2.5
 # A net strays from its plane by at most this share of the range.
 _DEEPEST_SHARE = 0.2
-# And among so many of the stretches before, so that the cost does not grow with clutter.
+# Number of preceding stretches that are compared, so that the cost does not grow with clutter.
 _LOOK_BACK = 16
-# A strand continues one of the last so many on the net.
+# A strand continues one of this many last strands on the net.
 _MOST_TRIED = 2
-# Light on fewer lines is a speck; what is dimmer than this share of the net's light is none of it.
+# Least lines of a strand, less is a speck; and its least brightness as a share of the net's light.
 _SPECK_LINES = 3
 _DIMMEST = 0.6
-# In a fold the plane itself has no strands: a gap wider than so many usual ones, or half of that
-# where the net's last strand is on one side only.
+# In a fold the plane itself has no strands: least gap in usual distances, or half of that where the
+# net's last strand is on one side only.
 _FOLD_GAP = 1.7
 
 
@@ -193,7 +191,7 @@ def _describe(
     taken: BoolArray,
     facts: FloatArray,
 ) -> None:
-    """Write what is known of every stretch of light."""
+    """Write the table of the stretches of light."""
     n_stretches = facts.shape[1]
     first, last = np.full(n_stretches, -1), np.full(n_stretches, -1)
     for i in range(stretch.shape[0]):
@@ -243,7 +241,7 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
 
 @kernel
 def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
-    """Take out what leaves the surface, where it is too little to be a fold."""
+    """Remove stretches that leave the surface, where they are too few to be a fold."""
     n_far = 0
     for s in range(cost.shape[0]):
         n_far += cost[s] < np.inf and abs(height[s]) >= lonely
@@ -255,9 +253,9 @@ def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
 
 @kernel
 def _drop_between(order: IntArray, facts: FloatArray) -> float:
-    """Take out what lies between strands on the plane that follow one another as they should.
+    """Remove stretches between regularly spaced strands on the plane.
 
-    The answer is their usual distance in search lines; infinite where there are none.
+    Return the usual distance of the strands in search lines; infinite where there are none.
     """
     n = order.shape[0]
     before, after = np.full(n, np.nan), np.full(n, np.nan)
@@ -302,9 +300,9 @@ def _sweep(
     dimmest: float,
     cost: FloatArray,
 ) -> None:
-    """Go along the stripes one way, from strand to strand; keep the least cost of each.
+    """Go along the stripes in one direction, from strand to strand; keep the least cost of each.
 
-    The cost of a strand is that of the dearest step that led to it.
+    The cost of a strand is that of the most expensive step of the path to it.
     """
     n = order.shape[0]
     n_stretches = cost.shape[0]
@@ -325,7 +323,7 @@ def _sweep(
                 break
             if reached[p] == np.inf:
                 continue
-            # Along the stripe only: where light is across it follows from its height.
+            # Along the stripe only: the position across it follows from the height.
             beside = abs(facts[LINE, s] - facts[LINE, p]) * m_per_line
             if beside > farthest or tried == _MOST_TRIED:
                 break
@@ -350,7 +348,7 @@ def _sweep(
 def _settle(
     stretch: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
 ) -> None:
-    """Mark the readings of the strands that were reached; of one return only the cheapest."""
+    """Mark the candidates of the strands reached; only the cheapest of each peak."""
     best = np.full(taken.shape[0], np.inf)
     for i in range(stretch.shape[0]):
         best[source[i]] = min(best[source[i]], cost[stretch[i]])

@@ -1,4 +1,4 @@
-"""What goes in and out of the scanner: frames, stripe points, scans."""
+"""Data types at the scanner's interface: frames in, stripe points and scans out."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -65,7 +65,7 @@ def planes_of_image(image: ImagePlane) -> Planes:
 
 
 class Label(IntEnum):
-    """What a stripe point was found to be; `points.parquet` holds the lower-case name."""
+    """Label of a stripe point; `points.parquet` holds the lower-case name."""
 
     NET = 0
     """On a surface whose stripes are broken as those on a net are."""
@@ -78,9 +78,9 @@ class Label(IntEnum):
     BACKGROUND = 4
     """On a surface behind the target: the tank's wall behind the net."""
     CLUTTER = 5
-    """On nothing that can be told: marine snow, glare, fragments."""
+    """On nothing that can be identified: marine snow, glare, fragments."""
     AMBIGUOUS = 6
-    """As clutter, and several lasers could have made it; listed once for each of them."""
+    """Clutter that several lasers could have made; listed once for each of them."""
     OUT_OF_RANGE = 7
     """On no surface, and outside the working range."""
 
@@ -105,8 +105,8 @@ class ScanPoints:
     label : uint8 array, shape (N,)
         `Label` values.
     used : bool array, shape (N,)
-        Points that entered the posture. Others on the target lie where stripes cross, are
-        fragments of a strand, or stand out of the plane.
+        Inliers of the posture. Other points on the target lie where stripes cross, are fragments
+        of a strand, or stand out of the plane.
     """
 
     laser: NDArray[np.int8]
@@ -142,14 +142,14 @@ class ScanPoints:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The scanner's answer to one frame.
+    """The scanner's result for one frame.
 
     Attributes
     ----------
     index, time_s
         As in the `Frame`.
     posture : Posture or Refusal
-        Falsy with its reason when there is none.
+        A refusal is falsy and has a reason.
     points : ScanPoints
         Every stripe point, labelled.
     n_water : float

@@ -1,13 +1,13 @@
-"""Segments: returns of neighbouring search lines that follow one another.
+"""Segments: stripe peaks on neighbouring search lines that follow one another, and their shape.
 
-A stripe on a wall makes segments of hundreds of returns, a strand of a net one of a few. A long
+A stripe on a wall makes segments of hundreds of peaks, a strand of a net one of a few. A long
 segment that runs in a direction in which its laser's stripe cannot run belongs to another laser;
-a short one says nothing by its direction, because it follows the strand, not the stripe. Segments
-that go on where another ends, or meet there, make a stretch: one strand with its knots.
+the direction of a short one carries no information, because it follows the strand, not the stripe.
+Segments that continue where another ends, or meet there, form a connected component (a "stretch"):
+one strand with its knots.
 
-The shape of single stretches of light: straight, bent smoothly, or as high as they are wide.
-
-A flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
+`StretchShapes` describes single components: straight, bent smoothly, or as high as they are wide.
+The flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
 edge breaks it; a bubble is a spot.
 """
 
@@ -23,27 +23,27 @@ from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.laser_bands import SLOPE_CELL, StripeSearch
 from aqualvs.scanning.stripe import Returns
 
-# A bend of this height over its chord is no lens error.
+# Least height of a bend over its chord, beyond errors of the lens.
 _LEAST_SAGITTA_PX = 1.0
-# What may be left over of a smooth bend: a floor, and a share of its height. A corner leaves more.
+# Largest residual of a smooth bend: a floor, and a share of its height. A corner leaves more.
 _ROUGH_PX = 0.3
 _ROUGH_SHARE = 0.05
 # A bend of this height lies beyond the gate for planes.
 _CURVED_PX = 2.0
-# Shorter pieces are as short as the light on a strand and have no shape of their own.
+# Shorter pieces are as short as the light on a strand and have no distinctive shape.
 _LEAST_LINES = 16
 # A spot is as long as it is wide within these factors, and no larger than that.
 _ROUND_FROM, _ROUND_TO = 0.5, 2.6
 _SPOT_LINES = 4
 _LARGEST_SPOT = 0.012
-# And it glints: as bright as the frame's bright returns, or nearly.
+# And it glints: its brightness as a share of that of the frame's bright peaks.
 _GLINT_SHARE = 0.75
 # What is summed over a stretch: powers 0 to 4 of the place, its moments, and squares.
 _MOMENTS, _SQUARES, _N_SUMS = 5, 8, 9
 
 
 class StretchShapes(NamedTuple):
-    """What stretches look like, one row a stretch number.
+    """Shapes of stretches (connected segments), one row for each stretch number.
 
     Attributes
     ----------
@@ -70,19 +70,19 @@ class StretchShapes(NamedTuple):
     height: FloatArray
 
     def bent(self) -> BoolArray:
-        """Tell which are bent smoothly, as the flank of a fish."""
+        """Mark the stretches that are bent smoothly, as the flank of a fish."""
         return self._those(is_bent)
 
     def curved(self) -> BoolArray:
-        """Tell which are no straight lines, whatever the cause: not on a plane."""
+        """Mark the stretches that are not straight for any reason, so not on a plane."""
         return self._those(is_curved)
 
     def straight(self) -> BoolArray:
-        """Tell which are long and straight, as on a plane."""
+        """Mark the stretches that are long and straight, as on a plane."""
         return self._those(is_straight)
 
     def round(self, bright: float) -> BoolArray:
-        """Tell which are spots of at least nearly the height `bright`."""
+        """Mark the stretches that are spots of at least nearly the height `bright`."""
         return self._those(lambda shapes, s: is_round(shapes, s, bright))
 
     def _those(self, asked: Callable[["StretchShapes", int], bool]) -> BoolArray:
@@ -91,7 +91,7 @@ class StretchShapes(NamedTuple):
 
 @inline_borrowing_kernel
 def is_bent(shapes: StretchShapes, s: int) -> bool:
-    """Tell whether stretch s is bent smoothly, as the flank of a fish."""
+    """Return whether stretch s is bent smoothly, as the flank of a fish."""
     sagitta_px = shapes.sagitta_px[s]
     smooth = shapes.rough_px[s] < _ROUGH_PX + _ROUGH_SHARE * sagitta_px
     bent = sagitta_px > _LEAST_SAGITTA_PX and smooth
@@ -100,20 +100,20 @@ def is_bent(shapes: StretchShapes, s: int) -> bool:
 
 @inline_borrowing_kernel
 def is_curved(shapes: StretchShapes, s: int) -> bool:
-    """Tell whether stretch s is no straight line, whatever the cause: not on a plane."""
+    """Return whether stretch s is not straight for any reason, so not on a plane."""
     return bool(shapes.n_lines[s] >= _LEAST_LINES and shapes.sagitta_px[s] > _CURVED_PX)
 
 
 @inline_borrowing_kernel
 def is_straight(shapes: StretchShapes, s: int) -> bool:
-    """Tell whether stretch s is long and straight, as on a plane."""
+    """Return whether stretch s is long and straight, as on a plane."""
     is_long = shapes.n_lines[s] >= 2 * _LEAST_LINES
     return bool(is_long and shapes.sagitta_px[s] <= _LEAST_SAGITTA_PX)
 
 
 @inline_borrowing_kernel
 def is_round(shapes: StretchShapes, s: int, bright: float) -> bool:
-    """Tell whether stretch s is a spot of at least nearly the height `bright`."""
+    """Return whether stretch s is a spot of at least nearly the height `bright`."""
     n_lines = shapes.n_lines[s]
     ratio = n_lines / max(shapes.thickness[s], 1.0)
     spot = _ROUND_FROM <= ratio <= _ROUND_TO and n_lines >= _SPOT_LINES
@@ -129,7 +129,7 @@ def stretch_shapes(
     width: FloatArray,
     height: FloatArray,
 ) -> StretchShapes:
-    """Describe the stretches of N readings.
+    """Describe the stretches of N candidates.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def describe_stretches(
     width: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Do as `stretch_shapes`; the answer is a table, shape (6, S)."""
+    """Return the fields of `StretchShapes` as a table, shape (6, S)."""
     n = 0
     for i in range(stretch.shape[0]):
         n = max(n, stretch[i] + 1)
@@ -178,7 +178,7 @@ def describe_stretches(
 
 @inline_borrowing_kernel
 def run_end(numbers: IntArray, begin: int) -> int:
-    """Return where those readings end that have the same number and stand together from `begin`."""
+    """Return the end of the run of equal numbers that begins at `begin`."""
     end, number = begin + 1, numbers[begin]
     while end < numbers.shape[0] and numbers[end] == number:
         end += 1
@@ -310,23 +310,23 @@ _LONG_SEGMENT = 24
 # A segment that begins this near to another one's end belongs to the same stretch.
 _JOIN_LINES = 4
 _JOIN_PX = 4.0
-# Direction of a measured segment against the bounds for a plane target; covers curvature.
+# Tolerance of a segment's direction beyond the bounds for a plane target; covers curvature.
 _SLOPE_MARGIN = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """Returns of one laser's search, grouped.
+    """Peaks of one laser's search, grouped by segment, stretch and chunk.
 
     Attributes
     ----------
     order : int array, shape (N,)
         Indices into the `Returns`, segment by segment, along each segment.
     stretch : int array, shape (N,)
-        Number of the stretch that the segment belongs to, in the order of `order`.
+        Number of the stretch (connected segments) of each peak, in the order of `order`.
     chunk : int array, shape (N,)
-        Number of the chunk, likewise; a segment's chunks are consecutive. A short segment, such as
-        the light on one strand of a net, is one chunk.
+        Number of the chunk (subsegment), likewise; a segment's chunks are consecutive. A short
+        segment, such as the light on one strand of a net, is one chunk.
     """
 
     order: IntArray
@@ -364,7 +364,7 @@ def link_segments(returns: Returns, search: StripeSearch) -> Segments:
 
 @kernel
 def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
-    """Mark the returns (N,) of segments of at least `CHUNK_LINES`, wherever they run.
+    """Mark the returns (N,) of segments of at least `CHUNK_LINES`, of any direction.
 
     Parameters
     ----------
@@ -393,10 +393,10 @@ def segment_returns(
     slope_high: FloatArray,
     numbers: IntArray,
 ) -> int:
-    """Write (order, stretch, chunk) as in `Segments`, shape (3, N); returns how many are kept."""
+    """Write (order, stretch, chunk) as in `Segments`, shape (3, N); return the number kept."""
     n = line.shape[0]
     segment_of = np.empty(n, np.int64)
-    # First and last return of each segment, and how many it has.
+    # First and last return of each segment, and their number.
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     n_segments = _link(line, position, lowest, highest, segment_of, first, last, count)
     start = _sort(segment_of, count[:n_segments], numbers)
@@ -416,7 +416,7 @@ def segment_returns(
 
 @inline_borrowing_kernel
 def _still_due(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: FloatArray) -> int:
-    """Say where segments are due on search line x; drop those that have ended, count the others."""
+    """Predict the segments' positions on search line x; drop ended ones, return the number left."""
     kept = 0
     for k in range(n_alive):
         step = x - alive[1, k]
@@ -444,8 +444,8 @@ def _link(
 ) -> int:
     """Give each return the segment that it continues, or a new one; -1 outside the band."""
     n = line.shape[0]
-    # Segments that may go on: number and last line; last position, slope and how far the next
-    # return may change it; and where they are due on this search line.
+    # Active segments: number and last line; last position, slope and the largest change of it by
+    # the next return; and the predicted position on this search line.
     alive, track, due = np.empty((2, n), np.int64), np.empty((3, n)), np.empty(n)
     n_alive = 0
     n_segments = 0
@@ -472,7 +472,7 @@ def _link(
             n_alive += 1
         else:
             s = alive[0, best]
-            # The way to the last return is one search line or two.
+            # The last return is one or two search lines away.
             seen = (place - track[0, best]) * (1.0 if x - alive[1, best] == 1 else 0.5)
             track[1, best] += track[2, best] * (seen - track[1, best])
             count[s] += 1
@@ -485,7 +485,7 @@ def _link(
 
 @kernel
 def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
-    """Sort the returns by segment into the first row of `numbers`; where each segment begins."""
+    """Sort the returns by segment into the first row of `numbers`; return the segments' starts."""
     n_segments = count.shape[0]
     start, fill = np.empty(n_segments + 1, np.int64), np.empty(n_segments, np.int64)
     start[0] = 0
@@ -545,7 +545,7 @@ def _direction_possible(
     slope_low: FloatArray,
     slope_high: FloatArray,
 ) -> bool:
-    """Whether a long segment runs as its laser's stripe can."""
+    """Return whether the direction of a long segment is possible for its laser's stripe."""
     n = members.shape[0]
     mean_line = 0.0
     mean_position = 0.0
@@ -570,7 +570,7 @@ def _direction_possible(
 
 @kernel
 def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray) -> IntArray:
-    """Give one number to segments whose ends meet, transitively: that of the first of them.
+    """Assign each connected component of segments whose ends meet the number of its first segment.
 
     `first` and `last` are the returns at the segments' ends; segments are ordered by the first.
     """
@@ -585,7 +585,7 @@ def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray)
                 root[max(one, other)] = min(one, other)
             b += 1
     for a in range(n):
-        # Roots come before what hangs on them.
+        # Roots come before their children.
         root[a] = root[root[a]]
     return root
 

@@ -1,10 +1,10 @@
-"""Stripe detection: sub-pixel returns along search lines.
+"""Stripe peaks: sub-pixel detection along search lines.
 
-A return is a run of pixels above the local background with one peak. The background on one side is
-the least pixel within reach; the higher of the two sides counts, so that a step edge (a box before
-a dark wall) has no contrast, and a stripe that runs along the search line has none either. The
-centre is the centroid of what stands above half height, which keeps its place when the top
-saturates.
+A peak ("return") is a run of pixels above the local background with one maximum. The background on
+one side is the least pixel within reach; the higher of the two sides counts, so that a step edge (a
+box before a dark wall) has no contrast, and a stripe that runs along the search line has none
+either. The centre is the centroid of the pixels above half height, which keeps its place when the
+top saturates.
 """
 
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 
 U8Array: TypeAlias = NDArray[np.uint8]
 
-# Doubling the contrast threshold ends here.
+# Limit of the doubled contrast threshold.
 _MAX_CONTRAST = 120
 # A valley below this many tenths of the lower of two peaks separates two returns.
 _VALLEY_TENTHS = 6
-# Marks of pixels, bytes of 0 or 1, are looked at eight at a time.
+# Marks of pixels, bytes of 0 or 1, are read eight at a time.
 _WORD = 8
 _NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
 _EACH_BYTE, _BYTE_NUMBERS = np.uint64(0x0101010101010101), np.uint64(0x0001020304050607)
@@ -45,13 +45,13 @@ class StripeOptions:
     Attributes
     ----------
     min_contrast : int
-        Smallest height of a return above its background, in grey levels; more is asked for where
-        hardly any return of that height is a laser's.
+        Smallest height of a return above its background, in grey levels; raised where hardly any
+        return of that height is laser light.
     reach_share : float
-        How far the background is looked for on each side, as a share of the image width; must
+        Reach of the search for the background on each side, as a share of the image width; must
         exceed the width of the widest stripe.
     min_likelihood : float
-        Returns whose colour is less likely a laser's are left out, 0 to 1. Only used where the
+        Least likelihood, 0 to 1, that the colour of a return is laser light. Only used where the
         source has colour.
     min_share : float
         Returns lower than this share of the frame's bright returns (their 90 % quantile) are kept
@@ -82,7 +82,7 @@ class StripeOptions:
 
 @dataclass(frozen=True, slots=True)
 class Returns:
-    """Returns of one search direction, ordered by search line, then by position.
+    """Stripe peaks (returns) of one search direction, ordered by search line, then by position.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Returns:
     width : array, shape (N,)
         Full width at half height along the line, in pixels.
     likelihood : array, shape (N,)
-        That the return is laser light, by its colour: 0 to 1; 1 for a grey source.
+        Likelihood that the peak is laser light, by its colour: 0 to 1; 1 for a grey source.
     """
 
     line: IntArray
@@ -110,7 +110,7 @@ class Returns:
 
 
 class SearchImage(NamedTuple):
-    """A frame as one search direction sees it, with search lines as rows.
+    """A frame laid out for one search direction, with search lines as rows.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class SearchImage(NamedTuple):
 
 
 class _Scratch(NamedTuple):
-    """Buffers of one search line: its pixels with margins, sliding minima, what stands out."""
+    """Buffers of one search line: pixels with margins, sliding minima, marks above background."""
 
     padded: U8Array
     minima: U8Array
@@ -143,7 +143,7 @@ class _Scratch(NamedTuple):
 
 
 class PeakFinder:
-    """Finds peaks along every search line of one direction; several per line.
+    """Finder of peaks along every search line of one direction; several per line.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class PeakFinder:
     lowest, highest : int array, shape (n_lines,)
         First and last position of interest on each line (an empty interval skips the line).
     reach_px : int
-        How far the background is looked for on each side; wider stripes are left out.
+        Reach of the search for the background on each side; wider stripes are left out.
     directions : array, shape (n_colours, 2)
         The lasers' colours in the (U, V) plane.
     """
@@ -168,7 +168,7 @@ class PeakFinder:
         self._lowest, self._highest = lowest, highest
         self._reach_px, self._directions = reach_px, directions
         padded, minima, spare = np.full((3, length + 2 * reach_px), 255, np.uint8)
-        # With room for a gap and a mark after the last pixel.
+        # There is room for a gap and a mark after the last pixel.
         background, above = np.zeros((2, (length // _WORD + 3) * _WORD), np.uint8)
         words = above.view(np.uint64)
         self._scratch = _Scratch(padded, minima, spare, background, above, words)
@@ -181,21 +181,21 @@ class PeakFinder:
         line: IntArray,
         table: FloatArray,
     ) -> int:
-        """Find the peaks of one frame, and return how many they are.
+        """Find the peaks of one frame, and return their number.
 
         Parameters
         ----------
         image : SearchImage
-            Of the shape that this was made for.
+            Of the shape that the finder was made for.
         min_contrast : int
             Least height above the background, in grey levels; doubled where noise makes N peaks
             or more.
         every : int
-            Look at one search line of so many.
+            Use one search line of this many.
         line : int array, shape (N,)
-            Gets the search line of each peak; ascending.
+            Written: search line of each peak; ascending.
         table : array, shape (9, N)
-            Gets the measures of each peak, rows as named above.
+            Written: measures of each peak, rows as named above.
         """
         while True:
             n = _find_peaks(
@@ -228,7 +228,7 @@ def _find_peaks(
     line: IntArray,
     table: FloatArray,
 ) -> int:
-    """Write the search line and the measures of each peak; return how many."""
+    """Write the search line and the measures of each peak; return the number of peaks."""
     n = 0
     for x in range(0, lowest.shape[0], every):
         if lowest[x] > highest[x]:
@@ -258,9 +258,9 @@ def _mark_above(
 ) -> None:
     """Mark the pixels [first, end) that stand above the background; index 0 is `first`."""
     n = end - first
-    # Slices from 0 on, so that LLVM sees that no index is negative and uses vector instructions.
+    # Slices from 0 on: LLVM sees that no index is negative, and uses vector instructions.
     padded, pixels = scratch.padded[: n + 2 * reach_px], scratch.padded[reach_px : reach_px + n]
-    # Beyond the border all is bright: one flank is not visible there, so nothing can stand out.
+    # Pixels beyond the border count as bright: one flank is not visible there, so no peak is found.
     before, after = min(reach_px, first), min(reach_px, row.shape[0] - end)
     padded[: reach_px - before] = _BRIGHT
     _copy(row[first - before : end + after], padded[reach_px - before :])
@@ -296,15 +296,15 @@ def _copy(source: U8Array, out: U8Array) -> None:
 
 @inline_borrowing_kernel
 def _next_with(mark: np.uint64, words: NDArray[np.uint64], at: int) -> int:
-    """Return the first pixel from `at` on that is marked, for 1, or not, for 0; there is one."""
-    # Bytes of the word that have the mark become 1, others 0; those before `at` as well.
+    """Return the first pixel from `at` on that has the mark (0 or 1); there must be one."""
+    # Bytes of the word that have the mark become 1; others, and those before `at`, become 0.
     other = _EACH_BYTE * (np.uint64(1) - mark)
     index = at >> 3
     found = (words[index] ^ other) & (_EACH_BYTE << np.uint64(8 * (at & 7)))
     while found == _NOTHING:
         index += 1
         found = words[index] ^ other
-    # The lowest of these bits alone shifts the number of its byte to the top.
+    # A product with the lowest of these bits shifts the number of its byte to the top.
     lowest = found & (~found + np.uint64(1))
     return (index << 3) + int((lowest * _BYTE_NUMBERS) >> np.uint64(56))
 
@@ -330,12 +330,12 @@ def _measure_run(
     start, end = first + run[0], first + run[1]
     base = np.int64(background[run[0]])
     low = max(start - reach_px, 0)
-    # Beyond the run the profile may still be falling towards half height.
+    # Outside the run the profile may still fall towards half height.
     high = min(end + reach_px, row.shape[0]) - 1
     while start < end and n < line.shape[0]:
         peak, start = _next_peak(row, start, end, base)
         last = high if start >= end else start
-        # Twice the grey levels keep half a level a whole number.
+        # Doubled grey levels, so that half a level is a whole number.
         level = np.int64(row[peak]) + np.int64(background[peak - first])
         a, b = _feet(row, peak, low, last, level)
         low = start
@@ -383,8 +383,8 @@ def _separates(valley: np.int64, lower_peak: np.int64, base: np.int64) -> bool:
 def _feet(row: U8Array, peak: int, low: int, high: int, level: np.int64) -> tuple[int, int]:
     """Return the nearest positions in [low, high] around the peak that are below half height.
 
-    -1 for both where one is missing, or something higher than the peak lies nearer: then this is
-    the foot of another stripe.
+    Return -1 for both where one is missing, or where a pixel higher than the peak lies nearer: the
+    foot is then that of another stripe.
     """
     top = row[peak]
     a = peak - 1
@@ -410,7 +410,7 @@ def _width(row: U8Array, a: int, b: int, level: np.int64) -> float:
 
 @inline_borrowing_kernel
 def _centroid(row: U8Array, a: int, b: int, level: np.int64) -> float:
-    """Return the centroid of what stands above half height, between the feet."""
+    """Return the centroid of the profile above half height, between the feet."""
     total, moment = np.int64(0), np.int64(0)
     for k in range(1, b - a):
         value = 2 * np.int64(row[a + k]) - level
@@ -428,10 +428,10 @@ def _measure_chroma(
     directions: FloatArray,
     measures: FloatArray,
 ) -> None:
-    """Write how the chroma of a peak of search line `x` differs from that of its flanks.
+    """Write the difference of chroma between a peak of search line `x` and its flanks.
 
-    The peak's is that of its middle or of an edge, whichever is more of the laser's colour: a
-    saturated core is white.
+    The peak's chroma is that of its middle or of an edge, whichever is more of the laser's colour:
+    a saturated core is white.
     """
     row, chroma_line = image.lines[x], (x * image.line_px) >> 1
     edge, flank = int(0.5 * width) + 1, int(width) + 4
@@ -459,7 +459,7 @@ def _measure_chroma(
                 measures[IMBALANCE] = along_u * (u_after - u_before) + along_v * (
                     v_after - v_before
                 )
-    # In the dark there is no light that paint could show, only the line's own glow.
+    # In the dark paint has no light to reflect; there is only the line's own glow.
     per_level = 1.0 / luma if luma > _DARK else 0.0
     measures[TINT_U], measures[TINT_V] = (
         (u_flank - 128.0) * per_level,

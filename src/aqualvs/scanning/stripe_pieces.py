@@ -1,12 +1,12 @@
-"""Pieces of stripes in a whole picture, and how likely each is a laser's line.
+"""Pieces of stripes in a whole picture, and the likelihood that each is a laser's line.
 
-A piece is a smooth chain of peaks of neighbouring search lines. One peak says little: noise,
-texture and printed edges make thousands, some of them of the laser's colour. Pooled along a piece,
-the evidence is strong: a laser's line is long for its width, thin, higher than what lies on either
-side, and moves the chroma along the wavelength's direction and not across it. The evidence is
-weighed by logistic regression, twice: first against what is known of lines in general, then against
-the picture's own lines, which are learned from the pieces that are certain. Where no piece is
-certain, there is no line.
+A piece is a smooth chain of peaks of neighbouring search lines. One peak carries little evidence:
+noise, texture and printed edges make thousands, some of them of the laser's colour. Pooled along a
+piece, the evidence is strong: a laser's line is long for its width, thin, higher than either side,
+and moves the chroma along the wavelength's direction and not across it. The evidence is weighted by
+logistic regression, twice: first with general statistics of lines, then with those of the picture's
+own lines, which are learned from the pieces that are certain. Where no piece is certain, there is
+no line.
 """
 
 from typing import NamedTuple
@@ -40,40 +40,39 @@ LENGTH, HEIGHT, WIDTH, TOP, ONE_SIDED, ALONG, ACROSS, FIRST_X, FIRST_Y, LAST_X, 
 """Rows of a table of pieces: lengths and places in pixels, heights in grey levels."""
 _N_MEASURES = 11
 
-# Peaks of so many grey levels are looked at, in a picture smoothed along the stripes by so many
-# search lines: noise of one pixel does not break a faint line then. As many for each search line.
+# Least height of peaks in grey levels, in a picture smoothed along the stripes by this many search
+# lines, so that noise of one pixel does not break a faint line. Number of peaks per search line.
 _MIN_CONTRAST, SMOOTHING, _PEAKS_PER_LINE = 3, 1.0, 120
-# The background is looked for within this share of the picture's width, or so many pixels.
+# Reach of the search for the background: a share of the picture's width, or this many pixels.
 _REACH_SHARE, _LEAST_REACH = 0.045, 8
-# A piece ends where the next return is so many search lines or pixels away, or where the stripe
-# bends by so many pixels, or such a share of its width, within three returns; the fewest returns.
+# Ends of a piece: distance to the next return in search lines and in pixels; bend within three
+# returns in pixels and as a share of the width. Least number of returns.
 _MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
 _KINK_PX, _KINK_IN_WIDTHS, MIN_RETURNS = 1.0, 0.25, 5
-# Light and chroma of a stripe are summed up to its flanks, so many pixels beyond half height.
+# Light and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
 _FLANK_PX = 2
-# Ratios of chroma to light, and differences in height of the flanks for each level, are believed
-# within these bounds.
+# Ratios of chroma to light, and differences in height of the flanks for each level, are clipped to
+# these bounds.
 _MOST_RATIO, _LEAST_RATIO, _MOST_ACROSS, _MOST_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
-# Levels of chroma that noise makes.
+# Noise of chroma, in levels.
 _CHROMA_NOISE = 2.0
-# Pieces of more than these log odds, by what is known of lines in general, are certain; but none
-# that shows less chroma for each level than any camera's lines do, such as a highlight on steel.
+# Pieces of more than these log odds, by the general statistics of lines, are certain; except those
+# with less chroma for each level than any camera's lines, such as a highlight on steel.
 _CERTAIN = 2.3
-# What the picture's lines differ by in colour: chroma for each level, and as a share of theirs.
+# Spread of the colour of a picture's lines: chroma for each level, and as a share of theirs.
 _ACROSS_SPREAD, _SHARE_SPREAD = 0.08, 0.3
 _MOST_OWN = 9.0
-# A line that ends makes it more likely, by so many log odds, that what follows straight on is the
-# same line: at most this share of the picture's width away, and so many pixels, and for each pixel
-# of the gap such a share, off its direction.
+# Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
+# picture's width; largest deviation from its direction in pixels, and as a share of the gap.
 _HELP, _MOST_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
-# At a line's end, at most so many returns follow, each within so many pixels of where the line is
-# due by its slope over so many returns, as high as this share of its height at least, and with
-# fewer than so many search lines missed.
+# Extension of a line at its end: most returns; largest distance in pixels from the extrapolation by
+# its slope over this many returns; least height as a share of the line's; and limit of the search
+# lines missed.
 _MOST_FOLLOWING, _FOLLOW_PX, _SLOPE_RETURNS, _LEAST_HEIGHT_SHARE, _MOST_MISSED = 8, 1.2, 6, 0.3, 4
 
 
 class Weights(NamedTuple):
-    """What the evidence counts, as log odds.
+    """Weights of the evidence, as log odds.
 
     Attributes
     ----------
@@ -124,7 +123,7 @@ class Pieces(NamedTuple):
 
 
 class PictureRows(NamedTuple):
-    """A picture as one search direction sees it, with search lines as rows.
+    """A picture laid out for one search direction, with search lines as rows.
 
     Attributes
     ----------
@@ -303,7 +302,7 @@ def _sum_above_flanks(row: Rows, low: int, high: int) -> float:
 
 
 def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
-    """Return what tells lines from other things in any picture, one row a piece.
+    """Return the evidence that separates lines from other things in any picture, one row a piece.
 
     Parameters
     ----------
@@ -352,7 +351,7 @@ def _believed_along(table: FloatArray) -> FloatArray:
 
 
 class OwnLines(NamedTuple):
-    """What the lines of a picture look like: colour, and logarithms of width and height."""
+    """Statistics of the lines of a picture: colour, and logarithms of width and height."""
 
     along: float
     across: float
@@ -361,7 +360,7 @@ class OwnLines(NamedTuple):
 
 
 def learn_lines(table: FloatArray, log_odds: FloatArray, *, has_colour: bool) -> OwnLines | None:
-    """Learn what the picture's lines look like from the pieces that are certain.
+    """Learn the statistics of the picture's lines from the pieces that are certain.
 
     Parameters
     ----------
@@ -398,7 +397,7 @@ def learn_lines(table: FloatArray, log_odds: FloatArray, *, has_colour: bool) ->
 def own_evidence(
     table: FloatArray, lines: OwnLines, width_px: int, *, has_colour: bool
 ) -> FloatArray:
-    """Return the general evidence, and how pieces differ from the picture's own lines.
+    """Return the general evidence, and the differences of pieces from the picture's own lines.
 
     Returns
     -------
@@ -450,7 +449,7 @@ def line_log_odds(
 
 
 def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
-    """Return the length (P,) of each piece with all pieces that go on where another ends."""
+    """Return the length (P,) of each piece together with the pieces that continue it."""
     if table.shape[1] == 0:
         return np.zeros(0)
     ends = _ends(table)
@@ -463,7 +462,7 @@ def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
 
 
 def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
-    """Mark the pieces that are lines: likely ones, and less likely ones that go on where they end.
+    """Mark the pieces that are lines: likely ones, and less likely ones that continue them.
 
     Parameters
     ----------
@@ -495,9 +494,9 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
 
 
 def extended(pieces: Pieces, keep: BoolArray) -> list[IntArray]:
-    """Return the chains of returns of kept pieces, each with what follows it at its ends.
+    """Return the chains of returns of kept pieces, each with the returns that follow at its ends.
 
-    A piece ends at a kink or a gap; beyond, a few returns may still be the line's.
+    A piece ends at a kink or a gap; a few returns beyond may still belong to the line.
 
     Parameters
     ----------
@@ -573,7 +572,7 @@ def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
     middle = piece.mean(axis=0)
     off = others - middle
     along, across = off @ way, off @ np.array([-way[1], way[0]])
-    # No farther away than the piece is long: its direction is not known better.
+    # The gap is at most the length of the piece, because of the uncertainty of its direction.
     gap = np.abs(along).min(axis=1) - 0.5 * length
     reach = min(length, _MOST_GAP * width_px)
     allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)

@@ -1,17 +1,12 @@
-"""Surfaces: planes that stripes of several lasers agree on.
+"""Surfaces of a frame: planes that the stripes of several lasers agree on.
 
-One pixel may belong to the bands of several lasers. Every reading of it is triangulated; wrong
-readings scatter in space, right ones share a plane. Planes are found one after another; the light
-that one explains is free for no other.
+One pixel may belong to the bands of several lasers. Every candidate of it is triangulated; wrong
+candidates scatter in space, right ones share a plane. Planes are found one after another; light
+that one explains is not available to the next, whichever laser it was read as.
 
-Cells of the image that hold the light of a surface.
-
-One return is read as several lasers' points, and one stripe by two search directions: what lies in
-or beside a cell in which a surface has light is the same light.
-
-The search for all surfaces of a frame: planes one after another, each with the light it takes.
-
-The light that one plane explains is free for no other, by whichever laser it was read.
+Light is identified by cells of the image: one peak yields candidates of several lasers, and one
+stripe may be found by two search directions, so candidates in or beside a cell in which a surface
+has light count as the same light.
 """
 
 from dataclasses import dataclass, replace
@@ -41,17 +36,17 @@ from aqualvs.scanning.plane_search import (
 
 U8Array: TypeAlias = NDArray[np.uint8]
 
-# What marks of a lit cell say: that there is light beside it at least, or in it.
+# Marks of a cell: light beside it at least, or light in it.
 _BESIDE, _MIDDLE = np.uint8(1), np.uint8(2)
-# Light within cells of six pixels is the same, by whichever laser or search it was read.
+# Light within cells of six pixels is the same, whichever laser or search it was read by.
 _SIXTH_BITS = 18
 _SIXTH = (1 << _SIXTH_BITS) // 6 + 1
 
 
 @inline_borrowing_kernel
 def _cell(coordinate: float) -> int:
-    """Return the row or column of a place, from 1; one is left free on each side."""
-    # Whole numbers below a hundred thousand divided by six, without a division.
+    """Return the row or column of the cell of a coordinate, from 1; there is a margin of one."""
+    # Division by six by multiplication, for whole numbers below a hundred thousand.
     return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
 
 
@@ -69,7 +64,7 @@ def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
     Returns
     -------
     n_cells, n_columns : int
-        Cells in all, and in a row; a cell's neighbours are numbered as those of a picture's pixels.
+        Cells in total, and in a row; cells are numbered row by row, as the pixels of a picture.
     """
     right, low = 0.0, 0.0
     for i in range(pixels.shape[0]):
@@ -82,7 +77,7 @@ def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
 
 @inline_borrowing_kernel
 def light_up(middle: int, n_columns: int, lit: U8Array) -> None:
-    """Mark a cell and those around it, where they lie in `lit`: not 0."""
+    """Mark a cell and those around it, as far as they lie in `lit`, with nonzero values."""
     if lit[middle] == _MIDDLE:
         return
     for row in (middle - n_columns, middle, middle + n_columns):
@@ -93,7 +88,7 @@ def light_up(middle: int, n_columns: int, lit: U8Array) -> None:
 
 @kernel
 def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
-    """Mark the cells in and around which explained readings lie: those that are not 0.
+    """Mark the cells in and around which explained candidates lie, with nonzero values.
 
     Parameters
     ----------
@@ -110,13 +105,13 @@ def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int
 
 
 MOST_SURFACES = 5
-"""So many surfaces are looked for."""
+"""Largest number of surfaces in a frame."""
 MIN_LINES_PER_LASER = 8
-"""Search lines with which a laser supports a surface."""
+"""Least number of search lines with which a laser supports a surface."""
 WORTH_SHARE = 0.08
-"""A surface with a smaller share of the best one's support is left-over, not a target."""
+"""Least support of a surface, as a share of the best one's; less is left-over light."""
 LINES, SUPPORT, VOICE = range(3)
-"""What is summed over a surface: search lines on it, light, and voice."""
+"""Sums over a surface: search lines on it, light, and sampling weight."""
 
 _MIN_CHUNKS = 6
 _MIN_LINES = 30
@@ -139,7 +134,7 @@ def search_surfaces(
     members: BoolArray,
     sums: FloatArray,
 ) -> int:
-    """Find planes that two lasers agree on, best supported first; returns how many.
+    """Find planes that two lasers agree on, best supported first; return their number.
 
     Parameters
     ----------
@@ -152,14 +147,14 @@ def search_surfaces(
     n_lasers : int
         Lasers of the rig.
     nearest, farthest : float
-        Hypotheses beyond are not considered, in metres.
+        Limits of the hypotheses, in metres.
     planes : array, shape (5, 4)
         Written: normals and offsets.
     members : bool array, shape (5, C)
         Written: chunks on each; False at first.
     sums : array, shape (5, 3)
-        Written: search lines, light and voice of each. Of light and voice without what one laser
-        has beyond three times the second.
+        Written: search lines, light and sampling weight of each. Light and weight of the best laser
+        count up to three times those of the second.
     """
     free = np.ones(laser.shape[0], np.bool_)
     cell = np.empty(pixels.shape[0], np.int64)
@@ -227,7 +222,7 @@ def _collect(
     members: BoolArray,
     by_laser: FloatArray,
 ) -> int:
-    """Mark the chunks on the plane; their number, and each laser's search lines, light, voice."""
+    """Mark the chunks on the plane; return their number, and each laser's lines, light, weight."""
     n = 0
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
     for k in range(rows.shape[0]):
@@ -254,7 +249,7 @@ def collect_surface(
     members: BoolArray,
     sums: FloatArray,
 ) -> None:
-    """Mark the chunks on a plane; write what `search_surfaces` writes of a surface.
+    """Mark the chunks on a plane; write the sums of its surface as `search_surfaces` does.
 
     Parameters
     ----------
@@ -267,7 +262,7 @@ def collect_surface(
     members : bool array, shape (C,)
         Written where True; False at first.
     sums : array, shape (3,)
-        Written: search lines, light and voice.
+        Written: search lines, light and sampling weight.
     """
     by_laser = np.zeros((3, n_lasers))
     rows = np.arange(laser.shape[0])
@@ -297,7 +292,7 @@ def _claim_light(
     members: BoolArray,
     free: BoolArray,
 ) -> None:
-    """Take the members, and every other reading of the same light, out of the free chunks."""
+    """Remove the members, and every other candidate of the same light, from the free chunks."""
     lit = np.zeros(n_cells, np.uint8)
     for i in range(chunk_index.shape[0]):
         if members[chunk_index[i]]:
@@ -319,7 +314,7 @@ __all__ = (
     "surface_on",
 )
 
-# So much of a net's light lies on strands; that of a fish lies in long or bent stretches.
+# Least share of a net's light on strands; that of a fish lies in long or bent stretches.
 _STRANDS_SHARE = 0.4
 # A wall's shadows reach nearly as far as the net that casts them.
 _EXTENT_SHARE = 0.6
@@ -340,10 +335,10 @@ class Surface:
     n_lines : int
         Search lines on it.
     support : float
-        Light on it, without what one laser has beyond three times the second: a plane rests on
-        two lasers.
+        Inlier weight: light on it, that of the best laser up to three times the second's, because
+        a plane needs two lasers.
     voice : float
-        The same, but a long stretch counts as a few strands.
+        Sampling weight: the same, but a long stretch counts as a few strands.
     extent : float
         Search lines over which its broken stripes reach, summed over the lasers, stragglers left
         out.
@@ -383,7 +378,7 @@ def find_surfaces(
     Parameters
     ----------
     chunks : Chunks
-        All readings of all returns.
+        Of all candidates.
     chunk_index : int array, shape (N,)
         Row of each reading's chunk.
     pixels : array, shape (N, 2)
@@ -428,7 +423,7 @@ def find_surfaces(
 
 
 def surface_on(plane: Plane, chunks: Chunks, n_lasers: int, focal_px: float) -> Surface:
-    """Return the surface of all chunks on a plane, whatever else explains their light.
+    """Return the surface of all chunks on a plane, even if other surfaces explain their light.
 
     Parameters
     ----------
@@ -446,7 +441,7 @@ def surface_on(plane: Plane, chunks: Chunks, n_lasers: int, focal_px: float) -> 
 
 
 def shares_light(one: Surface, other: Surface, chunks: Chunks) -> bool:
-    """Tell whether half of a surface's chunks are on another one as well."""
+    """Return whether half of a surface's chunks are on another one as well."""
     shared = chunks.n_lines[one.members & other.members].sum()
     return bool(shared > _SHARED * chunks.n_lines[one.members].sum())
 
@@ -459,7 +454,7 @@ def _describe(
     n_lasers: int,
     focal_px: float,
 ) -> Surface:
-    """Make a surface of what was found."""
+    """Make a surface from a plane and its chunks."""
     lines, support, voice = sums.tolist()
     pattern = describe_pattern(chunks, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
     # Strands near the vehicle are long in search lines, and still short.
@@ -514,7 +509,7 @@ def _joined(pieces: list[Surface], chunks: Chunks) -> Surface:
 
 
 def _is_dense_net(surface: Surface, surfaces: list[Surface], chunks: Chunks) -> bool:
-    """Whether another surface, broken by shadows, is seen through the gaps of this one.
+    """Return whether another surface, broken by shadows, is seen through the gaps of this one.
 
     A net that is near may fill most of the stripes; it then has more light than what it shadows.
     """

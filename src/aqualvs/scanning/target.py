@@ -1,4 +1,4 @@
-"""The target: which of the surfaces in view the posture is measured to."""
+"""The target: the surface in view that the posture is measured to."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,14 +9,14 @@ from aqualvs.scanning.surfaces import WORTH_SHARE, Surface
 # Specks that share a plane by chance have less than these shares of the search lines of the surface
 # that has most, and of the extent of the one that reaches farthest; a sparse net reaches far.
 _LINES_SHARE, _REACH_SHARE = 0.1, 0.5
-# Among meshes, one reaches far with this share of the widest one's extent.
+# A mesh reaches far with this share of the widest mesh's extent.
 _EXTENT_SHARE = 0.75
 # And it is well supported with this share of the best one's support.
 _SUPPORT_SHARE = 0.35
 
 
 class TargetKind(StrEnum):
-    """What the posture is measured to."""
+    """Kind of surface that the posture is measured to."""
 
     AUTO = "auto"
     """A net where there is one, else the largest solid surface."""
@@ -27,7 +27,7 @@ class TargetKind(StrEnum):
 
 
 def read_as_wanted(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
-    """Return the surfaces, those solid that may be so where something solid is asked for.
+    """Return the surfaces, classified as solid where possible if a solid target is wanted.
 
     A table with gaps, or a wall whose texture breaks the stripes, may look like a net.
     """
@@ -39,15 +39,15 @@ def read_as_wanted(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
 def choose_target(
     surfaces: Sequence[Surface], kind: TargetKind, working_range: tuple[float, float]
 ) -> Surface | None:
-    """Pick the surface that the posture is measured to, or None where the kind is absent.
+    """Choose the surface that the posture is measured to, or None where the kind is absent.
 
-    What lies in the working range comes before what lies outside.
+    Surfaces in the working range come before those outside.
 
-    A net is wanted before anything solid: what stands in front of it (a fish, a box) or behind it
-    (a tank wall) may have more stripe points, but is not what the vehicle follows. Of several
-    meshes the nearest that reaches far across the picture is the net: a fish is smaller, and a
-    wall behind the net, lit through its openings, may look broken as well. A handful of left-over
-    points that look like a mesh is no net beside a wall that fills the picture.
+    A net is preferred to anything solid: an object in front of it (a fish, a box) or behind it (a
+    tank wall) may have more stripe points, but is not the target that the vehicle follows. Of
+    several meshes the nearest that reaches far across the picture is the net: a fish is smaller,
+    and a wall behind the net, lit through its openings, may look broken as well. A few left-over
+    points that look like a mesh are no net beside a wall that fills the picture.
     """
     if len(surfaces) == 1:
         only = surfaces[0]
@@ -57,7 +57,7 @@ def choose_target(
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.voice for surface in surfaces), default=0.0)
     lines = max((surface.n_lines for surface in surfaces), default=0)
-    # Unbroken stripes have no extent, but reach over as many search lines as they have.
+    # Unbroken stripes have no extent; their number of search lines serves as one.
     reach = max((max(surface.extent, surface.n_lines) for surface in surfaces), default=0.0)
     meshes = [
         one

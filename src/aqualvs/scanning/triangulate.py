@@ -38,7 +38,7 @@ class Triangulation:
 
 
 class Triangulator:
-    """Triangulates pixels with a rig's laser sheets (paper, Eq. 17-21, where they are planes).
+    """Triangulation of pixels with a rig's laser sheets (paper, Eq. 17-21, for planes).
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Triangulator:
         self._camera = camera
         sheets = packed_sheets(rig, camera)
         self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
-        # A kernel that is given None is compiled without the way to bent sheets.
+        # A kernel that is given None is compiled without the code for bent sheets.
         self._bent = sheets if sheets[:, WINDOWED].any() else None
 
     def triangulate(
@@ -93,7 +93,7 @@ class Triangulator:
         out_sensitivity: FloatArray,
         out_valid: BoolArray,
     ) -> bool:
-        """Do as `triangulate`, into arrays (N, 3), (N, 3) and (N); tell whether all are valid."""
+        """Triangulate into arrays (N, 3), (N, 3) and (N); return whether all points are valid."""
         all_valid: bool = _triangulate(
             self._camera.params,
             self._planes,
@@ -122,7 +122,7 @@ def _triangulate(
     sensitivity: FloatArray,
     valid: BoolArray,
 ) -> bool:
-    """Trace the pixels and meet the sheets; tell whether all points are valid."""
+    """Trace the pixels to the sheets; return whether all points are valid."""
     n = pixels.shape[0]
     rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
     n_rays = _place_rays(pixels, along_x, group, rays_px, owner)
@@ -150,7 +150,7 @@ def _place_rays(
 ) -> int:
     """Write the pixels, and after them the first of each group moved along the search line.
 
-    `owner` gets the row of the moved pixel whose ray tells a pixel's sensitivity.
+    The row of the moved pixel that gives each pixel's sensitivity is written to `owner`.
     """
     n = pixels.shape[0]
     n_rays = n
@@ -205,7 +205,7 @@ def _intersect_planes(
 def _distance_to_sheet(
     origins: FloatArray, directions: FloatArray, i: int, planes: FloatArray, plane: int
 ) -> float:
-    """Return how far ray i is from the plane, along itself."""
+    """Return the distance along ray i to the plane."""
     nx, ny, nz = planes[plane, 0], planes[plane, 1], planes[plane, 2]
     approach = nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2]
     behind = nx * origins[i, 0] + ny * origins[i, 1] + nz * origins[i, 2] - planes[plane, 3]
@@ -226,8 +226,8 @@ def _intersect_bent_sheets(
 ) -> None:
     """Move the points of bent sheets from the planes near them onto them.
 
-    A sheet's tangent plane at a point stands for it where the moved ray passes, and nearly where
-    the next ray of the group does.
+    A sheet's tangent plane at a point approximates it along the moved ray, and nearly so along the
+    next ray of the group.
     """
     sx, sy, sz = np.nan, np.nan, np.nan
     near = np.nan

@@ -1,4 +1,4 @@
-"""Stripes in a whole picture, when nothing is known yet of the lasers that draw them."""
+"""Stripes in a whole picture, for lasers whose planes are not known yet."""
 
 import math
 from dataclasses import dataclass, replace
@@ -22,19 +22,19 @@ from aqualvs.scanning.stripe_pieces import (
     line_log_odds,
 )
 
-# A stripe that runs less than 45 degrees off a search line is left to the other axis.
+# A stripe at less than 45 degrees to a search line is left to the other axis.
 _STEEPEST = 1.0
-# Slopes come from this many returns on either side.
+# Slopes are computed from this many returns on either side.
 _SLOPE_REACH = 6
 # A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a mark.
 _MIN_LENGTH_IN_WIDTHS = 2.5
-# Returns beyond this many median widths of their chain are a dot that sits on the stripe.
+# Returns wider than this many median widths of their chain are a dot on the stripe.
 _MAX_WIDTH = 1.8
-# The centre of a stripe wanders with its speckle by this much of its width; the least is what 8
-# bits and a Bayer pattern leave.
+# Noise of the centre of a stripe by speckle, as a share of its width; the least noise is that of 8
+# bits and a Bayer pattern.
 _SIGMA_IN_WIDTHS, _LEAST_SIGMA_PX = 0.01, 0.05
-# Where one side is lighter than the other, beyond the stripe or on its slopes, paint pulls the
-# centre by about so many widths for each height of the stripe.
+# Where one side is lighter than the other, beyond the stripe or on its slopes, paint shifts the
+# centre by about this many widths, relative to the height of the stripe.
 _FLANK_AT, _FLANK_PULL = 1.3, 0.2
 _SLOPE_AT, _SLOPE_PULL = 0.5, 0.35
 # Full width at half height of a normal distribution, in standard deviations.
@@ -49,8 +49,8 @@ class WholePictureOptions:
     Attributes
     ----------
     min_likelihood : float
-        Least likelihood that a piece of stripe is a laser's line, by its shape and colour and by
-        what the picture's other lines look like, 0 to 1.
+        Least likelihood, 0 to 1, that a piece of stripe is a laser's line, by its shape and colour
+        and by the picture's other lines.
     min_length_share : float
         Shortest unbroken piece of a stripe, as a share of the picture's width.
     wavelength_nm : float or None
@@ -80,7 +80,7 @@ class StripePixels:
     across : array, shape (N, 2)
         Unit vectors at right angles to the stripe.
     chain : int array, shape (N,)
-        Which unbroken piece of a stripe a point belongs to.
+        Number of the unbroken piece of a stripe that a point belongs to.
     height : array, shape (N,)
         Peak above background, in grey levels.
     width : array, shape (N,)
@@ -104,7 +104,7 @@ class StripePixels:
 def find_stripes(
     image: ImagePlane | Frame, options: WholePictureOptions | None = None
 ) -> StripePixels:
-    """Find the lines of lasers: what is thin, long and of their colour, and looks alike.
+    """Find the lines of lasers: thin, long, of the lasers' colour, and similar to each other.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def find_stripes(
     -------
     StripePixels
         Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
-        Nothing where no piece is certain.
+        Empty if no piece is certain.
     """
     options = options or WholePictureOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))

@@ -1,13 +1,12 @@
-"""The paper's mesh filter behind either detector.
+"""The paper's stripe detection (section 3.1), and its mesh filter behind either detector.
 
-The paper takes every bright pixel for a point of its own, so that its regions count the lit cells
-of whole reflections. Returns of the threshold detector are given to it so; those of the sub-pixel
-detector are one point each, their centre.
+For comparison: every pixel above one threshold is detected. Bright pixels that follow one another
+on a search line are one return; its position and width determine them exactly, and
+`pixels_of_returns` gives them back one by one.
 
-The paper's stripe detection, for comparison: every pixel above one threshold (section 3.1).
-
-Bright pixels that follow one another on a search line are one return: position and width say
-exactly which they are, and `pixels_of_returns` gives them back one by one.
+The paper treats every bright pixel as a point of its own, so that its regions count the lit cells
+of whole reflections. `PaperFilter` passes returns of the threshold detector to the mesh filter in
+that form; those of the sub-pixel detector are one point each, their centre.
 """
 
 from collections.abc import Sequence
@@ -54,7 +53,7 @@ class ThresholdOptions:
 
 
 class ThresholdDetector:
-    """Finds the bright pixels on every search line of one direction, inside its band.
+    """Detector of the bright pixels on every search line of one direction, inside its band.
 
     Parameters
     ----------
@@ -84,7 +83,7 @@ class ThresholdDetector:
         self._lines: NDArray[np.uint8] = np.zeros((len(lowest), length + 1), np.uint8)
 
     def detect(self, lines: NDArray[np.uint8]) -> Returns:
-        """Find the runs of bright pixels of one frame; colour is not looked at.
+        """Find the runs of bright pixels of one frame; colour is ignored.
 
         Parameters
         ----------
@@ -124,7 +123,7 @@ class ThresholdDetector:
 
 
 def pixels_of_returns(position: FloatArray, width: FloatArray) -> tuple[IntArray, FloatArray]:
-    """List the pixels that returns are made of, along their search lines.
+    """Return the pixels of returns, along their search lines.
 
     A return of the threshold detector gives its bright pixels, each once; a sub-pixel one those
     above half its height, at least one.
@@ -188,7 +187,7 @@ class FilteredPoints:
     points_in_dome : array, shape (M, 3)
         Metres. A pixel whose ray misses the laser's sheet is no point.
     on_mesh : bool array, shape (M,)
-        What the filter keeps.
+        Points that the filter keeps.
     """
 
     source: IntArray
@@ -205,7 +204,7 @@ class FilteredPoints:
 
 
 class PaperFilter:
-    """Applies the paper's filter to returns whose laser is known.
+    """The paper's filter, applied to returns of known lasers.
 
     Parameters
     ----------

@@ -2,10 +2,11 @@
 
 A laser plane cuts the threads of a net at intervals that lie between two limits. Seen in the laser
 plane, a reflection of a thread therefore has a small lit core, nothing around it, and the right
-amount of light in the ring where its two neighbours must be. docs/mesh-filter.md tells how the
-paper's text was read where it leaves a choice.
+amount of light in the ring where its two neighbours must be. docs/mesh-filter.md states the reading
+chosen where the paper's text is ambiguous.
 
-Counting lit cells near lit cells, with a spatial hash; what `mesh.mesh_filter` compiles to.
+`mesh_filter_dense` is Algorithm 1 line by line, `mesh_filter` its compiled form: it counts the lit
+cells near each lit cell with a spatial hash (`keep_points`).
 """
 
 import math
@@ -23,7 +24,7 @@ from aqualvs.geometry.transforms import SE3
 
 
 class Limits(NamedTuple):
-    """When a cell belongs to the mesh (paper, Algorithm 1).
+    """Limits by which a cell belongs to the mesh (paper, Algorithm 1).
 
     Attributes
     ----------
@@ -190,7 +191,7 @@ def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: L
             in_a += distance <= limits.a
             in_ab += distance <= limits.b
             in_abc += distance <= limits.c
-        # Counts only grow: a cell amid a wall or a fish needs no further look.
+        # Counts only grow: a cell amid a wall or a fish needs no further counting.
         if in_abc > limits.most_in_ab + limits.most_in_c:
             return False
     in_c = in_abc - in_ab
@@ -333,7 +334,7 @@ def laser_frame(plane: Plane) -> SE3:
 
 
 def _in_plane(axis: FloatArray, normal: FloatArray) -> FloatArray:
-    """Direction of an axis projected into a plane to which it is not square."""
+    """Return the direction of an axis projected into a plane to which it is not square."""
     direction = axis - normal * (normal @ axis)
     direction /= np.linalg.norm(direction)
     # What the first projection left along the normal grew when a short result became a unit.
@@ -395,7 +396,7 @@ def mesh_filter_dense(
 
 
 def _algorithm_1(lit: BoolArray, options: MeshFilterOptions) -> BoolArray:
-    """Im'' from Im (paper, Algorithm 1, lines 1-10)."""
+    """Return Im'' from Im (paper, Algorithm 1, lines 1-10)."""
     str_a, str_b, str_c = structuring_elements(options)
     pad, dg = options.padding, options.dg_theta
     padded = np.pad(lit, pad)
@@ -480,7 +481,7 @@ def _limits(options: MeshFilterOptions) -> Limits:
 def _usable_in_laser(
     points: ArrayLike, plane: Plane, working_range: tuple[float, float] | None
 ) -> tuple[FloatArray, BoolArray]:
-    """Points (N, 2) in `laser`, and which of them the filter may see."""
+    """Return the points (N, 2) in `laser`, and which of them the filter may see."""
     array = np.asarray(points, dtype=np.float64)
     if array.size == 0:
         array = array.reshape(0, 3)
