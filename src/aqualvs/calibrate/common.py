@@ -1,6 +1,6 @@
-"""What all calibrations share: finding targets in pictures, keeping and writing the rig.
+"""Common parts of all calibrations: nominal rig, target detection in pictures, output of the rig.
 
-What is known of a rig before any calibration: its name, pictures, dome and lasers.
+The nominal rig (`load_nominal`) is known before any calibration: name, picture size, dome, lasers.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""`aqualvs calibrate dome`: where the lens sits in the dome, and how the camera is turned."""
+"""`aqualvs calibrate dome`: position of the lens in the dome and rotation of the camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,9 +1,9 @@
-"""What a camera that is not quite right makes of walls, if its lasers are calibrated with it.
+"""Posture errors of a wrong camera whose lasers are calibrated with it, and of an off-centre lens.
 
-Lasers are calibrated on boards that the same camera sees. What is wrong with the camera moves the
-boards, and the lasers with them: stripes on a wall are then found where a board would be found.
-
-What it costs that the lens is not in the dome's centre.
+Lasers are calibrated on boards that the same camera sees. An error of the camera moves the boards,
+and the lasers with them: stripes on a wall are then found where a board would be found
+(`camera_errors`). `offset_costs` gives the errors for a lens that is not in the dome's centre, if
+its offset is neglected or known.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,11 +1,11 @@
-"""Which change of a design helps most: each is tried, with the lasers tilted anew.
+"""Optimisation of a design: best angles of its lasers, and the changes that help most.
 
-The best angles for a design's lasers.
+Angles: coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69). One laser after the
+other takes the best of its candidates, the others being as they are, until none changes. The
+information of stripes adds up over the lasers (`stripes`), so the candidates are traced once for
+each grid; grids become finer about the best.
 
-Coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69): one laser after the other
-takes the best of its candidates, the others being as they are, until none changes. What a stripe
-tells adds up over the lasers (`stripes`), so the candidates are traced once for each grid; grids
-become finer about the best.
+Changes: each one is tried with the lasers tilted anew (`changes`).
 """
 
 import math

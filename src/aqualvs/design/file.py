@@ -1,4 +1,4 @@
-"""`design.yaml`: what is known before anything is bought, in millimetres and degrees."""
+"""`design.yaml`: the numbers of a design known before purchase, in millimetres and degrees."""
 
 import math
 from collections.abc import Mapping

@@ -1,6 +1,7 @@
-"""How good a choice of laser angles is: errors over the working range, in goals, and penalties.
+"""Predicted errors of range, pitch and yaw of a design, from noise and tolerances, and its score.
 
-Errors of range, pitch and yaw that a design will have, from noise and from tolerances.
+The score of a choice of laser angles is the root mean square error over the working range, in
+multiples of the goals, with penalties for missing and crossing stripes (`Score`).
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,7 @@
-"""A design and what it measures, in tables.
+"""Report of a design: tables, and two figures.
 
-Two pictures of a design: errors over range, and where in the picture the stripes are.
-
-Matplotlib is asked for when a picture is drawn, and only its Agg canvas: no display is needed.
+The figures show the errors over range and the stripes in the picture. Matplotlib is imported when a
+figure is drawn, and only its Agg canvas: no display is needed.
 """
 
 import math

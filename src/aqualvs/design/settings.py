@@ -1,6 +1,6 @@
-"""A design in SI units: the nominal rig, the lasers' mounts, and what may be off.
+"""Settings of a design in SI units: nominal rig, mounts of the lasers, noise, tolerances and goals.
 
-A place for a line laser on the vehicle, and the sheet of light that leaves it.
+A `Mount` is the place of a line laser on the vehicle and the sheet of light that leaves it.
 """
 
 import math

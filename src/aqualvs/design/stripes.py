@@ -1,9 +1,9 @@
-"""What a stripe on a wall ahead tells about the wall's plane, for many sheets and ranges at once.
+"""Information of a stripe on a wall ahead about the wall's plane, for many sheets and ranges.
 
 A wall square ahead is m·X = 1 with m = (0, 1/range, 0). The scanner fits m by least squares, each
-point weighed by what a pixel's error makes of m·X. Of a stripe this needs one matrix,
+point weighted by the effect of a pixel's error on m·X. A stripe contributes one matrix,
 sum w X X', and for every error that its points share a vector, sum w X d(m·X)/d(error). Both add
-up over lasers, so that any combination of sheets is told from the sums of their parts.
+up over lasers, so that any combination of sheets follows from the sums of its parts.
 """
 
 from collections.abc import Sequence

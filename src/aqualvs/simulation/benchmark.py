@@ -1,12 +1,12 @@
-"""The public benchmark set: dives by difficulty, at fixed seeds.
+"""The public benchmark set: dives by difficulty, at fixed seeds, and their truth on disk.
 
-A difficulty is laid over the same courses and the same nets as the clear dives, so that what it
-costs can be read off. Whoever changes anything here gives the set the next number: scores are
-compared by name and checksum.
+Every difficulty is laid over the same courses and the same nets as the clear dives, so that its
+cost can be read off. After any change here the set must get the next number: scores are compared by
+name and checksum.
 
-Which points of the stripes a picture truly shows, whoever looks for them.
-
-One dive of the benchmark set on disk: video, truth, rig.
+Each dive is a folder with video, truth and rig (`render_benchmark_dive`). Part of the truth is the
+stripe points that a picture shows above a fixed contrast, independent of any detector
+(`visible_points`).
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""Pictures for a whole calibration, in the folders that a user would have made, with the truth."""
+"""Simulated pictures for a whole calibration, in the folders of a user, with the truth."""
 
 import csv
 from collections.abc import Callable, Sequence

@@ -1,6 +1,7 @@
-"""Targets of simulated calibration pictures: what is printed, and the files that describe it.
+"""Targets of simulated calibration pictures: prints, files that describe them, and poses.
 
-Where boards and vehicle stand in simulated calibration pictures.
+The poses are of boards before the bare camera and on a rail before the dome, of the vehicle before
+a box of markers, and of a plate in the view.
 """
 
 from dataclasses import dataclass

@@ -1,14 +1,13 @@
-"""Cameras by name: what a real one makes of the light, from the lens to the recorded frame.
+"""Simulated cameras by name: processing of the picture, from the lens to the recorded frame.
 
-`ideal` is a camera without faults: daylight as it is, a tone curve, noise, H.264 at high quality.
-The others add what real pictures of laser lines have and rendered ones lack: filters that let a
-green laser into red and blue, cores that clip to cyan and white inside a green halo, a mosaic of
-colours, sharpening, exposure and white balance that drift, and little room in the file.
+`ideal` is a camera without faults: daylight as it is, a tone curve, noise, H.264 at high quality
+(`spread`, `expose`). The others add what real pictures of laser lines have and rendered ones lack:
+filters that let a green laser into red and blue, cores that clip to cyan and white inside a green
+halo, a mosaic of colours, sharpening, exposure and white balance that drift, and a low bit rate.
 
 The order of the steps is that of a camera: lens, exposure, noise, full scale of the pixels, mosaic,
-white balance, colour correction, tone curve, sharpening, chroma, compression.
-
-From the radiance before the lens to the grey levels of the file.
+white balance, colour correction, tone curve, sharpening, chroma, compression. Input is the radiance
+before the lens, output the grey levels of the file.
 """
 
 from collections.abc import Mapping

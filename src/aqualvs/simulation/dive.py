@@ -1,9 +1,7 @@
-"""A whole simulated dive on disk: the video and its truth.
+"""A whole simulated dive on disk: video, truth, vehicle log and the truth of a net's holes.
 
-The log of the simulated vehicle, and the truth of a net's holes.
-
-The net hangs plumb and faces `NET_BEARING`, its middle `NET_DEPTH` deep; the vehicle's attitude is
-what the trajectory asks of it.
+For the vehicle log and the holes the net hangs plumb and faces `NET_BEARING`, its middle
+`NET_DEPTH` deep; the attitude of the vehicle follows from the trajectory.
 """
 
 import csv

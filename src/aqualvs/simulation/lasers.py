@@ -1,12 +1,14 @@
-"""Line lasers as light sources, and the kernels that say how bright their sheets are.
+"""Line lasers as light sources: irradiance of their sheets, and their colour for a camera.
 
-Wavelengths: how a camera's colour filters and the water answer to a laser's light.
-
-What a camera records of a green laser is a number for each filter, fitted to real pictures of
-laser lines; three Gaussians carry it over to other wavelengths. Real filters are lopsided and
+The camera's record of a green laser is one number for each colour filter, fitted to real pictures
+of laser lines; three Gaussians carry it over to other wavelengths. Real filters are lopsided and
 differ between makers: Jiang, Liu, Gu and Süsstrunk, "What is the space of spectral sensitivity
 functions for digital color cameras?" (WACV 2013), measured 28 cameras, with peaks near 600, 530
-and 460 nm.
+and 460 nm. The water attenuates a laser by the bands red, green and blue, interpolated linearly at
+its wavelength (`band_shares`).
+
+Compiled kernels work on the sheets as tables (`Sheets`): thickness, opening of the fan, distance at
+which a surface ends the light.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Fish nets: rays against twine.
+"""Fish nets: intersection of rays with twine, on flat, bulging or folded nets.
 
 The axes of the strands lie in the net plane (or in its bulging or folded surface, where the
 tangent plane at the crossing stands in for it). A ray that crosses the plane beside an axis at
@@ -6,7 +6,8 @@ lateral distance w meets that strand's cylinder where, in the cross-section of t
 (w + q tau)² + (z tau)² = r²; only the nearest strand of each family can be met, because the
 distance from an axis is w times the same cosine for all of them.
 
-Folds and slack: a height over a net's surface, and where rays cross it.
+Folds and slack are a height over the net's surface (`folded`); their crossing with a ray is found
+by stepping and bisection.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""A net that moves: flat or part of a cage, where it is, how a vehicle stands to it, how it looks.
+"""A moving net, flat or part of a cage: its pose over time, posture of a vehicle to it, its scene.
 
 Frames: `world` is north, east, down. `net` is fixed to the net: its origin in the middle, x right
 and z up as a vehicle before the middle sees them, y away from the vehicle; it is the frame `scene`

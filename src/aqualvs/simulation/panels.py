@@ -2,11 +2,9 @@
 
 A panel is a rectangle anywhere in `dome` with a texture on it. Every pixel's corners are traced
 through the housing once; rays inside a pixel are interpolated between them, as in
-`aqualvs.simulation.render`. A ray takes the mean of the texture over its own share of the pixel,
-exactly (the sum of a grid of cells over a rectangle is bilinear in its corners), so that no
-aliasing pulls an edge to one side.
-
-What a ray through a pixel brings home from printed panels, in compiled kernels.
+`aqualvs.simulation.render`. Compiled kernels give a ray the exact mean of the texture over its own
+share of the pixel (the sum of a grid of cells over a rectangle is bilinear in its corners), so that
+no aliasing shifts an edge.
 """
 
 from collections.abc import Sequence

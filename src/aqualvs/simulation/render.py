@@ -1,12 +1,12 @@
-"""Pictures of a scene as the rig's camera takes them.
+"""Renderer of a scene as the rig's camera takes it.
 
 Every pixel's corners are traced through the housing once; rays inside a pixel are interpolated
 between its four corners (the housing bends them by less than 1e-6 px from that inside a pixel),
-so any number of them costs no further refraction.
+so any number of them costs no further refraction. The picture is divided into tiles; each tile
+lists the ellipsoids and bubbles that it can show, and rays try only those (`tile_members`).
 
-Marine snow: particles that drift before the camera and flash where a laser sheet meets them.
-
-Which small things each part of the image can show, so that other rays need not try them.
+Marine snow is added after that: particles that drift before the camera and light up where a laser
+sheet meets them (`add_snow`).
 """
 
 from collections.abc import Sequence

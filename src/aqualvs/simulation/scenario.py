@@ -1,10 +1,8 @@
-"""A scenario: what is before the vehicle and how the vehicle moves, over the time of a dive.
+"""Scenarios: the scene before the vehicle and the vehicle's motion over the time of a dive.
 
-Fish and bubbles at random, so placed that the camera meets them.
-
-How the vehicle moves before its target: smooth functions of time.
-
-Scenario files: short YAML with the unit in every key.
+The posture follows smooth functions of time (`Course`, `Trajectory`). Fish and bubbles are placed
+at random such that the camera meets them. A scenario file is short YAML with the unit in every key
+(`read_scenario`).
 """
 
 import difflib

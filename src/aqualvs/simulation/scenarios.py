@@ -1,12 +1,11 @@
-"""Built-in scenarios by name, and how a name or a path becomes a scenario.
+"""Built-in scenarios by name, example rigs and random scenes.
 
-Rigs to simulate with, in round numbers.
+`load_scenario` takes a name or the path of a scenario file. `random_scene` draws scenes for
+statistics over conditions rather than over one dive.
 
-`example_rig` resembles the rig of the paper: a lens strongly off the dome's centre and three
-lasers, one nearly level below, one nearly upright on the left, one diagonal on the right.
-`bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome.
-
-Scenes at random, for statistics over conditions rather than over one dive.
+The rigs are in round numbers. `example_rig` resembles the rig of the paper: a lens strongly off the
+dome's centre and three lasers, one nearly level below, one nearly upright on the left, one diagonal
+on the right. `bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome.
 """
 
 from collections.abc import Mapping

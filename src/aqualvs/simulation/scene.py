@@ -1,4 +1,4 @@
-"""What the simulated vehicle looks at: surfaces, water, lasers and sensor, in SI units.
+"""Scene before the simulated vehicle: surfaces, water and sensor, in SI units.
 
 Surfaces live in the frame `scene`: x right, y away from the vehicle, z up. The target (net or
 wall) is the plane y = 0, and `Scene.dome_from_scene` places all of it before the vehicle.

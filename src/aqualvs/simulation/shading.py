@@ -1,4 +1,4 @@
-"""What one ray brings home: daylight, lasers, veil, glow of the sheets, bubbles."""
+"""Radiance along one ray: daylight, lasers, veil, glow of the sheets, bubbles."""
 
 from typing import NamedTuple
 

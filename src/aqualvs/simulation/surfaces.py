@@ -1,4 +1,4 @@
-"""All surfaces of a scene as tables in `dome`, and the kernels that cast rays at them."""
+"""Surfaces of a scene as tables in `dome`, and kernels that intersect rays with them."""
 
 from typing import NamedTuple
 

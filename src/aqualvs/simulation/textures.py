@@ -1,9 +1,10 @@
-"""Periodic noise tiles that kernels look up instead of computing noise for every ray.
+"""Textures: printed panels, and periodic noise tiles for natural surfaces.
 
-What is printed on panels: boards, walls with markers, mottled grounds.
+The texture of a panel (board, wall with markers, mottled ground) is a grid of equal square cells of
+one albedo each, so that every printed edge lies on an edge of the grid: the mean over an area is
+exact, and no raster adds jagged edges of its own.
 
-A texture is a grid of equal square cells of one albedo each, so that every printed edge lies on an
-edge of the grid: an area's mean over it is exact, and no raster adds jaggies of its own.
+Kernels look noise up in periodic tiles instead of computing it for every ray (`noise_tiles`).
 """
 
 from dataclasses import dataclass, field

@@ -1,6 +1,7 @@
-"""One row of truth for every frame.
+"""Truth of simulated pictures: lit points of the laser sheets, and one row of `truth.csv` a frame.
 
-The truth of the stripes: where the middles of the laser sheets meet what the camera sees.
+A lit point is where the middle of a laser sheet meets a surface that the camera sees
+(`find_lit_points`).
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,10 @@
-"""`calibrate camera`: intrinsics from views of a board in air, without the dome.
+"""Calibration of the camera: intrinsics from views of a board in air, without the dome.
 
-OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) starts it; the robust bundle of
-`calibrate dome` finishes it, which adds the covariance and names what does not fit.
-
-Refusals of `calibrate camera`, and where in the picture its intrinsics are to be trusted.
+OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) gives the starting values. The robust
+bundle adjustment of `solver.bundle`, which `calibrate dome` uses too, refines them, estimates their
+covariance and names the views that do not fit. The checks refuse views that are too few or too much
+alike and intrinsics that do not explain them. The result tells which areas of the picture have no
+corners or uncertain intrinsics.
 """
 
 from collections.abc import Sequence

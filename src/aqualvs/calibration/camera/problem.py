@@ -1,10 +1,11 @@
-"""The problem of `calibrate camera`: where it starts, and how many coefficients the lens takes.
+"""The least-squares problem of `calibrate camera`: initial guess, lens model and bend of the board.
 
-A board that is not quite flat: its bend as parameters, where the views ask for it.
+The number of distortion coefficients is chosen by an information criterion (`fitted_camera`).
 
-The board's surface is a polynomial of second, or second and third, degree over its corners, the
-same in all views. Poses and lens take up a part of what a bent board does to the corners, so the
-bend is solved together with them.
+A board that is not quite flat is a polynomial surface of second, or second and third, degree over
+its corners, the same in all views. Poses and lens take up a part of what a bent board does to the
+corners, so the bend is solved together with them, and only if the views show it to be significant
+(`bend_is_significant`).
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,18 +1,15 @@
-"""Find a ChArUco board: a few markers say where it is, then corner leads to corner.
+"""Detection of ChArUco boards and chessboards: inner corners, each found with its neighbours' help.
 
-Reading a marker is slow, and near the picture's border or under a laser stripe many cannot be
-read. So markers are read in the middle of the picture first, and only until enough of them agree;
-all other corners are found from their neighbours and borne out by the picture.
+ChArUco boards: reading a marker is slow, and near the picture's border or under a laser stripe many
+markers cannot be read. Markers are therefore read with OpenCV (number and rough corners) in the
+middle of the picture first, and only until enough of them agree. All other corners are predicted
+from their neighbours by an affine map and confirmed in the picture.
 
-Markers as OpenCV reads them: numbers and rough corners.
+Chessboards: OpenCV's finders give rough corners. Their grid may be wrong, for example one row off
+onto the paper's border. Every grid is tested on the picture, and further finders are tried until
+one passes the test; the corners are then put in the board's order. The whole board must be seen.
 
-The inner corners of a board as a grid: predict from neighbours, grow, find the odd ones out.
-
-Find a plain chessboard, all of it, and put its corners in the board's order.
-
-OpenCV's finders say roughly where the corners are. What they find may be a wrong grid, one row off
-onto the paper's border for example; every grid is tested on the picture, and other finders are
-tried until one stands the test.
+Both refine corners with `saddle_corners` and reject those that their neighbours contradict.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,6 +1,7 @@
-"""From pictures to views: find a board or markers, to a few hundredths of a pixel.
+"""Detection of a board or of markers in a picture, to a few hundredths of a pixel.
 
-Why a target was not found: what the picture shows instead, and what may help.
+The result is a `View`, or a clause that says why there is none: what the picture shows instead
+(other markers, another board) and what may help.
 """
 
 from collections.abc import Iterator

@@ -1,17 +1,14 @@
-"""Sub-pixel place of the corners where four squares of a chessboard meet.
+"""Sub-pixel refinement of chessboard corners, where four squares meet.
 
 Around such a corner the picture is point-symmetric: blur, gamma and the printer's ink change the
-look of the edges but not their crossing. A small model of that neighbourhood, blur included, is
-fitted to the pixels by damped least squares (`saddle_model`); the markers of a ChArUco board, which
-begin a few pixels away on small squares, are part of the model instead of a disturbance.
+look of the edges but not their crossing. A model of that neighbourhood is fitted to the pixels by
+damped least squares, in compiled kernels.
 
-What small fits to pixels inside compiled kernels share: an edge, and what is no information.
-
-What a corner of a chessboard looks like, and the compiled fit of that look to pixels.
-
-Two straight edges cross; two opposite quadrants are light. On a ChArUco board a dark marker begins
-in each light quadrant, a margin away from both edges. The blur is Gaussian, the same everywhere,
-and the tones are a level, a contrast and a slope of the level.
+Model: two straight edges cross; two opposite quadrants are light. On a ChArUco board a dark marker
+begins in each light quadrant, a margin away from both edges. On small squares that is a few pixels
+from the corner, so the markers are part of the model instead of a disturbance. The blur is
+Gaussian and the same everywhere; the tones are a level, a contrast and a slope of the level.
+`tag_corners` uses the same blurred edge.
 """
 
 import math

@@ -1,23 +1,18 @@
-"""Corners of markers without the pull of blur and gamma.
+"""Sub-pixel refinement of marker corners, without the bias of blur and gamma.
 
 An outer corner of a marker lies between light paper and dark ink. Blur and gamma shift both of its
-edges towards the dark, by a third of a pixel or so, and with them the corner. So the whole marker
-is fitted at once (`tag_model`): edges of both directions among its bits tell that shift apart from
-the marker's size. Pixels that something else covers, a laser stripe above all, do not fit; they and
-their surroundings are left out, and corners that the rest does not determine are not valid.
+edges towards the dark side, by about a third of a pixel, and the corner with them. Therefore the
+whole marker is fitted to the pixels at once, by Levenberg-Marquardt in compiled kernels: it has
+edges of both directions, outside and among its bits, which separate that shift from the marker's
+size. Pixels that something else covers, such as a laser stripe, do not fit. They and their
+surroundings are left out, and corners that the rest does not determine are not valid.
 
-What a marker looks like, and the compiled sums of its fit to pixels.
+Model: a grid of dark and light cells with a light margin around it; a homography with a slight bend
+(a dome bends straight lines) from marker to picture; a Gaussian blur of the light; a power law from
+light to grey level, the camera's gamma; a level (the dark cells' grey) and a contrast, which may
+vary linearly across the marker.
 
-A marker is a grid of dark and light cells with a light margin around it. Its model: a homography
-with a slight bend (a dome bends straight lines) from marker to picture; a Gaussian blur of the
-light; a power law from light to grey level, the camera's gamma; a level (the dark cells' grey) and
-a contrast that may vary linearly across the marker. Blur and gamma move every edge towards its dark
-side; because the model has edges of both directions, outside and among the bits, that shift is told
-apart from the marker's size, and the corners come out where they are printed.
-
-Marker coordinates q: (-1, -1) the top-left corner, (1, 1) the bottom-right one.
-
-Levenberg-Marquardt for one marker's model, compiled.
+Marker coordinates q: (-1, -1) is the top-left corner, (1, 1) the bottom-right one.
 """
 
 import math

@@ -1,11 +1,9 @@
-"""`calibrate dome`: where the lens sits in the dome, and how the camera is turned (paper, 2.2).
+"""Calibration of the dome: position of the lens in it and rotation of the camera (paper, 2.2).
 
-Boards seen through the dome at poses that are known, of which only the distance is known (the
-paper's rail), or of which nothing is known; in air, in water, or both in one solve. Tolerances of
-the dome and the covariance of the intrinsics are priors, so that what pictures cannot tell keeps
-the uncertainty it had.
-
-What a solved dome means, in plain words.
+Boards are seen through the dome at poses that are known, known by their distance only (the paper's
+rail), or unknown; in air, in water, or both in one solve. Tolerances of the dome and the covariance
+of the intrinsics are priors, so that a number that the pictures do not determine keeps the
+uncertainty it had. `findings` says in plain words what the pictures determined.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,10 @@
-"""Refusals of `calibrate dome`: no rig is better than a wrong one.
+"""Checks of `calibrate dome`: refusals of pictures and solutions that would make a wrong rig.
 
-Whether pictures were taken in the medium that they are said to have been taken in.
-
-Errors that all given distances of a rail share: its zero, and its scale against the board's.
+- Start and solution: distances that cannot be, poses from which the board is not seen, wrong units,
+  views that the solution does not explain, numbers that the pictures do not determine.
+- Medium: the stated index of each set against the one that the pictures fit best, and against the
+  other medium (water for air, air for water).
+- Rail: errors that all given distances share, their zero and their scale against the board's.
 """
 
 from collections.abc import Mapping, Sequence

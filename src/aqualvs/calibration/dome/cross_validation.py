@@ -1,4 +1,4 @@
-"""Whether the dome predicts corners that nothing was solved from better than a bare lens does."""
+"""Cross-validation of the dome: its prediction of unused corners against that of a bare lens."""
 
 from collections.abc import Sequence
 from dataclasses import replace

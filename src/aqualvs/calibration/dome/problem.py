@@ -1,11 +1,11 @@
-"""The problem of `calibrate dome`: what is free, what is known, and where to start.
+"""The least-squares problem of `calibrate dome`: its input, free and known numbers, initial guess.
 
-What `calibrate dome` is given: sets of views of boards, each in one medium, and options.
+The input is sets of views of boards, each set in one medium, and options (`BoardSet`,
+`DomeOptions`).
 
-How well boards were set up square to the rail, as the boards themselves tell.
-
-Most boards of a rail stand square, some lean by a degree or more. How closely the good ones agree
-is not known beforehand: it is estimated by likelihood, on a ladder of scales.
+Prior of the boards' tilt: most boards of a rail stand square, some lean by a degree or more. How
+closely the good ones agree is not known beforehand. It is estimated by maximum likelihood, over a
+ladder of scales (`with_leaning_as_found`).
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,9 +1,8 @@
-"""Calibrating lasers: from pictures of a box or a board that the lasers shine on, to planes.
+"""Calibration of the lasers: planes from pictures of a box, board or wall that they shine on.
 
-The paper's automatic calibration (section 3.3) with all lasers on at once, several pictures in one
-solve, and an uncertainty that carries the camera's along.
-
-How good lasers are on pictures that they were not calibrated from: leave one out.
+This is the paper's automatic calibration (section 3.3) with all lasers on at once, several pictures
+in one solve, and a covariance that includes the camera's. `leave_one_out` measures each picture's
+board with lasers that were calibrated from the other pictures.
 """
 
 from collections.abc import Sequence

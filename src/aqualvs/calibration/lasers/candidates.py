@@ -1,12 +1,11 @@
-"""Laser planes that straight stripes suggest, and the evidence for each of them.
+"""Candidates for laser planes, from straight stripes on flat surfaces, with their evidence.
 
-A line on one surface and a line on another span a plane. Such a pair meets by accident now and
-then; the plane of a laser is told by the lines of further surfaces that it meets as well. How much
-each of them says is counted by how often planes of accidental pairs meet it: an a-contrario test
-(Desolneux, Moisan & Morel 2000, doi:10.1023/A:1026593302236), whose chance rates come from the
-pictures themselves. The number of points plays no part in it.
-
-Straight lines among stripe points on one flat surface: where laser planes cut it.
+`lines_on_patch` finds the straight lines among the stripe points on one surface: a laser plane cuts
+the surface in such a line. Two lines on different surfaces that lie in one plane suggest it. Such
+pairs also occur by accident; the plane of a laser meets lines of further surfaces as well. The
+evidence of each further line follows from how often planes of accidental pairs meet it: an
+a-contrario test (Desolneux, Moisan & Morel 2000, doi:10.1023/A:1026593302236) whose chance rates
+come from the pictures themselves. The number of points does not count.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,8 @@
-"""What cannot be calibrated from, and what to tell the user about it.
+"""Checks of `calibrate lasers`, and the assignment of planes to the lasers of the rig.
 
-Which found plane is which laser of the rig, and names for lasers that the rig has not.
+The checks refuse targets, poses, distances and numbers of lasers that no calibration can be made
+from, with the remedy. Planes are matched to the rig's lasers by direction and distance; lasers that
+the rig does not have are named after the direction of their stripe.
 """
 
 from collections.abc import Sequence

@@ -1,12 +1,11 @@
-"""What a laser calibration knows in the end: one joint covariance of camera, medium and lasers.
+"""Joint covariance of camera, medium and lasers after a calibration of the lasers.
 
-The camera's numbers come from another calibration, with their own uncertainty. Either they are
-held, and their uncertainty is carried into the planes to first order (a "consider" covariance,
-Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4), or they are refined with it as their prior.
-In both cases planes and camera remain correlated, and the result says so. What centres of stripes
-have in common, on each surface, is carried along in the same way: more points do not reduce it.
-
-What is uncertain of the camera that lasers are calibrated with.
+The camera's numbers come from another calibration, with their own uncertainty (`CameraDoubt`).
+Either they are held, and their uncertainty is propagated to the planes to first order (a "consider"
+covariance, Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4), or they are refined with that
+uncertainty as their prior. In both cases planes and camera remain correlated, and the result holds
+their correlation. The error that all stripe centres on one surface share is propagated in the same
+way: more points do not reduce it.
 """
 
 from collections.abc import Sequence

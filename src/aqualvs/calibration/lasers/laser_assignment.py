@@ -1,9 +1,9 @@
-"""Which stripe points belong to which laser, when all lasers shine at once.
+"""Assignment of stripe points to lasers when all lasers shine at once.
 
-Points on known surfaces fall apart into laser planes in space. On each surface a laser plane draws
-a straight line; lines on different surfaces tell which planes there are, and how many lasers.
-
-Which of the planes that stripes suggest are lasers, which are not, and which may be.
+The points lie on known surfaces. On each surface a laser plane draws a straight line; lines on
+different surfaces together tell the planes and the number of lasers (`candidates`). Each candidate
+plane is judged by its evidence and against the better planes: laser, no laser, or undecided
+(`judged`). `split_lasers` then assigns every point to the plane it lies in.
 """
 
 from collections.abc import Sequence

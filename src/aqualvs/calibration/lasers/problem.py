@@ -1,8 +1,8 @@
-"""The joint problem of `calibrate lasers`: corners and stripes, poses, laser sheets and camera.
+"""The least-squares problem of `calibrate lasers`: corners and stripes, poses, sheets and camera.
 
-A stripe's pixel sees one point of a surface of the target; the laser's sheet should pass through
-it. The residual is its distance from the sheet, told in pixels across the stripe as it was
-measured. All of it hangs on the target's pose, on the camera's numbers and on the sheet's.
+The pixel of a stripe sees one point of a surface of the target; the laser's sheet should pass
+through that point. The residual is its distance from the sheet, converted to pixels across the
+stripe, as it was measured. It depends on the target's pose, the camera's numbers and the sheet's.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a laser calibration hands back: lasers, poses, residuals, and words about them."""
+"""The result of a laser calibration: lasers, poses, residuals and findings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,6 +1,9 @@
-"""Solving lasers from placed stripes: poses and planes together, in as many rounds as it takes.
+"""The solver of `calibrate lasers`: poses and planes together, and the model of each sheet.
 
-Whether the light of a laser behind a window is a plane in the water: by the residuals.
+`solve_lasers` solves the lasers as planes, assigns the stripe points anew by those planes, solves
+again, and then chooses between plane and bent sheet. The light of a laser behind a window is not
+exactly a plane in the water; the Bayesian information criterion of the residuals decides
+(`choose_sheets`). `paper_planes` gives the paper's planes (Eq. 33-36) for comparison.
 """
 
 from collections.abc import Callable, Sequence

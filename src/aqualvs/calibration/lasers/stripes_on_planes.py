@@ -1,8 +1,9 @@
-"""Which surface of a target a stripe's light lies on, and where.
+"""Stripe points of calibration pictures and their places on the flat surfaces of a target.
 
-What one picture says of the lasers: points on stripes, whichever laser drew them.
-
-Stripe points of one laser in one picture, in bins: what the joint problem measures.
+`StripePoints` are the points of one picture, of all lasers together. `place_stripes` intersects
+their rays with the surfaces (paper, Eq. 34); `PooledStripes` joins the points of all pictures.
+`binned` puts the points of one laser in one picture into bins, the measurements of the joint
+least-squares problem.
 """
 
 from collections.abc import Mapping, Sequence

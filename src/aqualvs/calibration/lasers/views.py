@@ -1,10 +1,10 @@
-"""The pictures of a laser calibration: where the vehicle was in each, and what its stripes lit.
+"""Pictures of a laser calibration: pose of the target in each, and stripe points on its surfaces.
 
-Where the vehicle is in a box of markers: the paper's least squares of distances in space.
-
-The paper minimises V (Eq. 32-33) over the pose and the distance along every ray; each distance has
-a closed form, so that V is the sum of squared distances of the markers' corners from their rays.
-Reprojection weighs corners as they are measured, in pixels, and is better; both are reported.
+Poses are solved by reprojection, which weighs corners in pixels, as they are measured. For
+comparison `spatial_pose` solves the paper's least squares of distances in space: V (Eq. 32-33) is
+minimised over the pose and the distance along every ray. Each distance has a closed form, so that V
+is the sum of squared distances of the markers' corners from their rays. Reprojection is better;
+both are reported.
 """
 
 from collections.abc import Sequence

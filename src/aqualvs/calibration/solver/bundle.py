@@ -1,12 +1,12 @@
 """Bundle adjustment through the dome: views of targets, one camera, one or several media.
 
-The one problem behind `calibrate camera`, `calibrate dome` and the poses of `calibrate lasers`:
-reprojection residuals of all corners, with analytic derivatives by the camera's numbers, the media
-outside and the targets' poses.
+The common problem of `calibrate camera`, `calibrate dome` and the poses of `calibrate lasers`:
+reprojection residuals of all corners, with analytic derivatives by the camera's numbers, the
+indices of the media and the targets' poses.
 
-Small changes of a target's pose, in which poses are solved and their covariance is told.
-
-Reprojection residuals of many views at once, with derivatives by camera, medium and poses.
+A step of a pose has six numbers: a rotation vector about a point of the target (the middle of the
+view's points) and a shift, both in `dome`. Poses are solved, and their covariance is given, in such
+steps (`moved_target`).
 """
 
 from collections.abc import Sequence

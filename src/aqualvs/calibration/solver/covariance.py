@@ -1,22 +1,21 @@
-"""Covariance of what all views share, estimated from how the views disagree.
+"""Covariance and observability of the parameters that all views share.
 
-Errors of corners that are common to a view (the board bends, the camera moves during the exposure,
-a rolling shutter) leave residuals that vary smoothly over the picture. A covariance that counts
-every corner as independent is then too small. Each view's pull on the shared parameters is taken as
-one observation instead: the cluster-robust "sandwich" (Liang & Zeger 1986,
-doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views of unequal leverage (Bell &
-McCaffrey 2002, Survey Methodology 28, 169-181). A few views tell many parameters' covariance badly;
-it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
+By views (`view_covariance`): errors of corners that are common to a view (the board bends, the
+camera moves during the exposure, a rolling shutter) leave residuals that vary smoothly over the
+picture. A covariance that counts every corner as independent is then too small. Each view's score
+of the shared parameters is taken as one observation instead: the cluster-robust "sandwich" (Liang &
+Zeger 1986, doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views of unequal leverage
+(Bell & McCaffrey 2002, Survey Methodology 28, 169-181). Few views determine the covariance of many
+parameters badly; it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
 doi:10.1016/S0047-259X(03)00096-4).
 
-Views from which nothing good can come, and the words that say what to do about it.
+Held parameters (`considered`): the errors of numbers that were held, though they are not known
+exactly, pass into the numbers that were solved for, through the derivatives of both. This is the
+"consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4).
 
-What the data of a solve determined, and what rests on prior knowledge.
-
-Covariance of a solve that took some numbers as they are, though they are not known exactly.
-
-The "consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4): the errors of
-numbers that were held pass into those that were solved for, through the slopes of both.
+Observability (`observability`): combinations of numbers that the data determined, and those that
+rest on their priors. Degenerate sets of views, such as boards that are all alike or distances in a
+wrong unit, are recognised and described with a remedy (`all_alike`, `scale_fault`).
 """
 
 from collections.abc import Sequence

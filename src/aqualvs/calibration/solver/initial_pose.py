@@ -1,12 +1,14 @@
-"""Where a target is, from one picture of it, with no starting values: flat targets or not.
+"""Pose of a target from one picture, without starting values, for flat and other targets.
 
 Through a dome there is no closed form. The rays that the pixels see in the outer medium are first
 taken to start at the one point nearest to them all, for which perspective-n-point has closed
 solutions: IPPE for flat targets with both of its answers (Collins & Bartoli 2014,
 doi:10.1007/s11263-014-0725-5), SQPnP for others (Terzakis & Lourakis 2020,
-doi:10.1007/978-3-030-58452-8_28). Each is then refined through the true optics, robustly.
+doi:10.1007/978-3-030-58452-8_28). Each is then refined robustly through the true optics
+(`target_pose`).
 
-Where a solve of poses starts: each view's pose by itself, then all of them turned square.
+`start_pose` gives the faster initial guess of each view for a bundle; `turned_square` then turns
+camera and boards together until most boards stand square to the dome.
 """
 
 from collections.abc import Iterator, Sequence

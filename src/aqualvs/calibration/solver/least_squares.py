@@ -1,14 +1,11 @@
-"""Robust non-linear least squares over blocks of residuals, with an honest covariance.
+"""Robust non-linear least squares over blocks of residuals, with an estimated covariance.
 
-Levenberg-Marquardt on the normal equations (Marquardt 1963, doi:10.1137/0111030), robust by
-iterated reweighting (Huber 1964, doi:10.1214/aoms/1177703732). The noise of measurements is
-estimated from their residuals, and the covariance rests on that, not on a promise.
+Levenberg-Marquardt on the normal equations (Marquardt 1963, doi:10.1137/0111030), made robust by
+iteratively reweighted least squares (Huber 1964, doi:10.1214/aoms/1177703732). A loss is a function
+of the length of an observation's residual in standard deviations (`Loss`).
 
-Loss functions of robust least squares, by the length of a residual in standard deviations.
-
-Blocks of residuals: what a least-squares problem is made of.
-
-How noisy measurements are, from their residuals: of every block, tempered by its group's.
+The noise of each block (`Block`) is estimated from its residuals, shrunk towards the noise of its
+group; the covariance follows from that estimate, not from the nominal noise.
 """
 
 import functools

@@ -1,7 +1,4 @@
-"""What is known beforehand of a rig's numbers and of media, as residuals.
-
-What a user may know of a board's pose without its pictures, as residuals of it.
-"""
+"""Priors as residuals: of a rig's numbers, of the indices of media, and of a board's pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

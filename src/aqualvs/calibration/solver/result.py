@@ -1,4 +1,4 @@
-"""What `calibrate dome` and `calibrate camera` return."""
+"""Results of `calibrate dome` and `calibrate camera`: the solved rig and the fit of each view."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,10 @@
-"""`poses.csv`: what was measured of the boards' poses, one row a picture.
+"""`poses.csv`, the measured poses of boards, one row a picture; and the pictures of a command.
 
-Columns: `file`; `distance_mm`, where the board's plane meets the dome's y axis; and `T00` to `T23`,
-the first three rows of dome_from_board (translations in millimetres). Either may be left out.
+Columns of the file: `file`; `distance_mm`, where the board's plane meets the dome's y axis; and
+`T00` to `T23`, the first three rows of dome_from_board (translations in millimetres). Either the
+distance or the matrix may be left out.
 
-Which pictures the arguments of a command mean.
+`picture_paths` expands files, folders and patterns on the command line.
 """
 
 import csv

@@ -1,15 +1,13 @@
-"""Put printed targets on pages: paper, ruler, words.
+"""Printed targets: black areas of boards and markers, layout on sheets of paper, PDF to scale.
 
-Lay out the markers of a calibration box (paper, 3.3): four planes, cut into sheets of paper.
-
-Frame `box`: origin at the middle of the open mouth, x right, y forward, z up.
-
-Where a target is black: rectangles of boards and markers, to print or to render.
-
-True-to-scale PDF of black rectangles and small text: all that printed targets need.
-
-Lengths are millimetres from a page's top-left corner, x right, y down. All rectangles of a page are
-one path, so that no viewer shows seams between neighbours; the file asks viewers not to scale it.
+- `board_rectangles` and `marker_rectangles`: the black areas, to print or to render.
+- `box_patches`: the markers of a calibration box (paper, 3.3), four planes cut into sheets of
+  paper. Frame `box`: origin at the middle of the open mouth, x right, y forward, z up.
+- `papers` and `sheet`: sizes of paper, and a page with a ruler of 100 mm and a caption.
+- `pdf_bytes`: a true-to-scale PDF of black rectangles and small text, all that printed targets
+  need. Lengths are millimetres from a page's top-left corner, x right, y down. All rectangles of a
+  page are one path, so that no viewer shows seams between neighbours; the file asks viewers not to
+  scale it.
 """
 
 import re

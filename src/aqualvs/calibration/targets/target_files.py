@@ -1,12 +1,9 @@
-"""Read and write what describes targets: `board.yaml`, `box.yaml` and `target.yaml`.
+"""Target files `board.yaml`, `box.yaml` and `target.yaml`: schema, reading, checks, writing.
 
-Files speak millimetres, types metres. docs/targets.md explains every key.
+Lengths are millimetres in the files, metres in the types. docs/targets.md explains every key.
 
-The text of target files: tolerant of notes, strict about everything else.
-
-What `board.yaml`, `box.yaml` and `target.yaml` may contain, key by key.
-
-What must hold for markers at known places: sizes, order, planes, units.
+The reader tolerates free text in notes and is strict about everything else: every key, and for
+markers at known places their sizes, corner order, planes and units.
 """
 
 import difflib

@@ -1,9 +1,9 @@
-"""What calibration pictures show: boards, and markers at known places.
+"""Calibration targets, boards and markers at known places, and views of them.
+
+A `View` is the known points of a target that were found in one picture, with their pixels.
 
 Frame `board` is OpenCV's: x right, y down, z into the board, origin at the outer corner of the
 top-left square. Lengths in metres.
-
-What one picture of a target says: known points of the target and the pixels they are seen at.
 """
 
 from dataclasses import dataclass, field, replace

@@ -1,13 +1,14 @@
-"""The index of the medium, frame by frame, from a target that is fixed on the vehicle.
+"""Estimator of the medium's refractive index, frame by frame, from a target fixed on the vehicle.
 
-Section 2.2 of the paper solves for the index alone. Here a target that is not quite where it is
-said to be, and a camera that is known only so well, count as what they are: see `index_filter`.
+Section 2.2 of the paper solves for the index alone. Here the uncertainty of the target's place and
+of the camera's numbers counts too; see `water_index.filter`.
 
-Has the index jumped? A two-sided cumulative sum over the frames' normalised surprises.
+A jump of the index is detected by a two-sided cumulative sum over the normalised innovations of the
+frames (`StepTest`; Page 1954, Continuous inspection schemes, Biometrika 41, 100,
+doi:10.1093/biomet/41.1-2.100).
 
-Page (1954), Continuous inspection schemes, Biometrika 41, 100, doi:10.1093/biomet/41.1-2.100.
-
-The index of a medium from a set of pictures, as `calibrate water` reports it.
+`calibrate_water` applies the estimator to a set of pictures, as `aqualvs calibrate water` reports
+it.
 """
 
 import math

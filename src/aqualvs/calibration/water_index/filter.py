@@ -1,13 +1,12 @@
-"""One frame's say about the index of the medium: a robust, iterated Kalman update.
+"""Robust, iterated Kalman update of the medium's refractive index by one frame.
 
-The index may change from frame to frame. What else decides where the target is seen does not: its
-place on the vehicle, the camera's numbers, and how far a corner is always off (its printing, its
-detection). Known only as well as they are, these are estimated along with the index: frames
-average out the noise of the corners and never the constants.
+The index may change from frame to frame. The target's place on the vehicle, the camera's numbers
+and the constant error of each corner (printing, detection) do not. They are known with limited
+accuracy and are estimated along with the index: frames average out the noise of the corners, never
+the error of the constants.
 
-What an index estimate takes of a picture.
-
-How a target on the vehicle is seen through a medium: prediction and derivatives by a state.
+`Frame` holds the corners of a picture that the estimate uses, `IndexModel` predicts their pixels
+and the derivatives by the state, `compare` gives the innovation, `believe` the updated state.
 """
 
 from dataclasses import dataclass, field, replace

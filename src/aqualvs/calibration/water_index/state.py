@@ -1,8 +1,8 @@
-"""What an index estimate knows: the index and the constants of rig and target, jointly Gaussian.
+"""State of the index estimate: index and constants of rig and target, jointly Gaussian.
 
-What is known of a medium's refractive index before a camera has looked at it.
-
-What an index estimate reports: options, readings, alarms, and what they mean in words.
+With it: the prior of a medium's index, before a camera has looked at it (`IndexPrior`, from air or
+from temperature and salinity), and the options, readings, alarms and remarks that an estimate
+reports.
 """
 
 import math

@@ -1,7 +1,8 @@
-"""A rigid body in moving water (Fossen 2011, Handbook of marine craft hydrodynamics, ch. 6-8).
+"""Compiled dynamics of a vehicle in moving water, and its autopilot.
 
-With nu the body's velocity, nu_r that relative to the water and v_c, a_c velocity and
-acceleration of the water, all along body axes and diagonal matrices,
+Rigid body (Fossen 2011, Handbook of marine craft hydrodynamics, ch. 6-8): with nu the body's
+velocity, nu_r that relative to the water and v_c, a_c velocity and acceleration of the water, all
+along body axes and diagonal matrices,
 
     (M_RB + M_A) nu' = tau - C_RB(nu) nu - C_A(nu_r) nu_r - D(nu_r) nu_r - g
                        + M_A (a_c - omega x v_c) + m_displaced a_c,
@@ -10,11 +11,10 @@ the last term being the Froude-Krylov force of waves on a body much shorter than
 state is a row of 13 numbers: position in the world (north, east, down), attitude as the unit
 quaternion (w, x, y, z) of world_from_body, velocity and turning rate along body axes.
 
-The vehicle's own autopilot: ArduSub's depth hold (mode_althold.cpp), compiled.
-
-Roll and pitch are held at zero and depth where it is; the sticks ask for rates of descent and of
-turning, forward and right go straight to the thrusters. It knows attitude, rates and depth as
-they are: what an estimator makes of good sensors is better than what it is asked to hold.
+Autopilot: ArduSub's depth hold (mode_althold.cpp). Roll and pitch are held at zero and depth at its
+present value; the sticks ask for rates of descent and of turning; forward and right go straight to
+the thrusters. The autopilot gets the true attitude, rates and depth: a good estimator's errors are
+smaller than the errors of control.
 """
 
 from typing import NamedTuple

@@ -1,6 +1,7 @@
-"""A simulated vehicle in its water: move its sticks, and it goes as ArduSub's depth hold would.
+"""A simulated vehicle in its water, controlled by sticks as under ArduSub's depth hold.
 
-What a simulated vehicle tells of itself: depth and attitude, with the faults of sensors.
+Its telemetry holds depth and attitude with the errors of sensors: noise, bias, slow drift and a
+limited rate (`Sensors`, `Telemetry`).
 """
 
 import math

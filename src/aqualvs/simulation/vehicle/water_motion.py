@@ -1,4 +1,4 @@
-"""How the water moves around a simulated vehicle, and what pulls at its tether.
+"""Motion of the water around a simulated vehicle, and the force of its tether.
 
 The world is north, east, down (NED) with its origin at the still surface. A current is the same
 everywhere and wanders slowly; waves are linear (Airy) waves in deep water, whose motion fades
