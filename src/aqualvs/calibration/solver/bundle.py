@@ -272,7 +272,7 @@ class Bundle:
         return np.arange(first, first + 6)
 
     def blocks(self, state: BundleState) -> list[Block]:
-        """Return the residuals: one block of corners a view, in order; then pose and other priors."""
+        """Return the residuals: one block of corners a view, in order; then all priors."""
         return [*self._corner_blocks(state), *self._known(state), *self._priors(state)]
 
     def moved(self, state: BundleState, step: FloatArray) -> BundleState:
