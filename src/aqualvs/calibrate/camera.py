@@ -38,7 +38,7 @@ from aqualvs.report.findings import Card
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRequest:
-    """What is asked for; see `aqualvs calibrate camera --help`."""
+    """Request of `aqualvs calibrate camera`, see its `--help`."""
 
     images: tuple[str, ...]
     board: Path

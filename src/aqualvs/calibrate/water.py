@@ -36,7 +36,7 @@ _FPS = 25.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterRequest:
-    """What is asked for; see `aqualvs calibrate water --help`."""
+    """Request of `aqualvs calibrate water`, see its `--help`."""
 
     source: tuple[str, ...]
     target: Path
