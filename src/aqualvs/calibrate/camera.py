@@ -54,7 +54,7 @@ def calibrate_camera(request: CameraRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     nominal = Nominal() if request.nominal is None else load_nominal(request.nominal)

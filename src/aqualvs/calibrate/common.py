@@ -28,11 +28,11 @@ from aqualvs.terminal import progress
 from aqualvs.yamlfile import read_yaml
 
 WATER_N = 1.3340
-"""Index assumed until something better is known: fresh water of 15 °C under green light."""
+"""Default index: fresh water of 15 °C in green light."""
 N_LASERS = "n_lasers"
-"""Key of `Rig.solved_from` under which a rig without lasers keeps how many it will have."""
+"""Key of `Rig.solved_from` for the planned number of lasers of a rig without any."""
 WAVELENGTH_NM = "wavelength_nm"
-"""Likewise for their wavelength, in nanometres."""
+"""The same for their wavelength, in nanometres."""
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]

@@ -83,7 +83,7 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     rig = _with_dome(load_rig(request.rig, need_lasers=False), request)

@@ -102,7 +102,7 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)

@@ -166,7 +166,7 @@ def _fitted(points: FloatArray) -> Plane:
 
 
 INDEX_ERROR = 0.005
-"""About what sea water's index is above fresh water's."""
+"""Approximate difference of the indices of sea water and fresh water."""
 
 _USUAL = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
 # Greatest offset of a lens, as a share of the inner radius.

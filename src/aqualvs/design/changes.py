@@ -21,7 +21,7 @@ from aqualvs.optics.lens import Lens
 from aqualvs.scanning.plane_fit import SharedError
 
 TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
-"""Tilts among which the best is sought."""
+"""Limits of the search for the best tilt."""
 
 _DEG = math.pi / 180.0
 # Steps of tilt and stripe from grid to grid, and number of steps to each side after the first.

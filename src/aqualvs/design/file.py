@@ -33,7 +33,7 @@ from aqualvs.yamlfile import parse_yaml, read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
 FAN_DEG = 68.0
-"""Full opening of a fan of which nothing is said: the simulator's lasers."""
+"""Default full opening of a fan: that of the simulator's lasers."""
 
 EXAMPLE = """\
 # A design for aqualvs design: lengths in mm, angles in degrees, frame 'dome' (docs/hardware.md).

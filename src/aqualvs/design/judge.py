@@ -17,7 +17,7 @@ from aqualvs.geometry.linear_algebra import invert_symmetric
 
 # Least number of search lines of a stripe for the scanner; least number of lasers for a posture.
 MIN_LINES = 16
-"""Points that a stripe must have to count as visible."""
+"""Least number of points of a visible stripe."""
 _SINGULAR = 1e-9
 
 

@@ -202,7 +202,7 @@ def _place_name(round_axis: float, i: int) -> str:
 
 
 N_WALLS = 9
-"""Ranges at which a design is judged, evenly spaced in their logarithm."""
+"""Number of ranges in the evaluation of a design, evenly spaced in their logarithm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,7 +39,7 @@ CONTRAST_LIMIT = 10.0
 """Grey levels by which a visible stripe point is brighter than without its stripe."""
 
 VISIBLE_LIMIT = 40
-"""Visible stripe points from which on a frame can be expected to be measured."""
+"""Least number of visible stripe points of a frame that should be measured."""
 
 # A stripe is narrower than this share of the picture's width; the glow of the sheets is wider.
 _WIDEST_STRIPE = 1 / 36
@@ -152,7 +152,7 @@ def _one_a_pixel(points: IntArray, pixels: FloatArray) -> IntArray:
 
 
 BENCHMARK_NAME = "aqualvs-bench-1"
-"""Of the set as a whole; the number rises with every change of a definition."""
+"""Name of the set; the number rises with every change of a definition."""
 
 N_FRAMES = 20
 """Frames of every dive."""

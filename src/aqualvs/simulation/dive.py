@@ -25,11 +25,11 @@ from aqualvs.simulation.truth import TRUTH_COLUMNS, LitPoints, truth_row
 from aqualvs.simulation.video import Recording, VideoWriter
 
 NET_BEARING = float(np.deg2rad(65.0))
-"""Compass direction in which one looks at the net, in radians."""
+"""Compass bearing of the view to the net, in radians."""
 NET_DEPTH = 6.0
 """Depth of the scene's origin, in metres."""
 LEAD_S = 20.0
-"""The log begins so long before the dive, and ends so long after it: its clock is not the video's.
+"""Lead of the log before the dive, and its length after it: its clock is not the video's.
 
 Log time = dive time + `LEAD_S`."""
 LOG_COLUMNS = ("time_s", "depth_m", "heading_deg", "roll_deg", "pitch_deg")

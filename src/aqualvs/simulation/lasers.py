@@ -34,7 +34,7 @@ from aqualvs.optics.sheet import (
 from aqualvs.simulation.scene import Vector
 
 GREEN_NM = 532.0
-"""Wavelength of a laser whose rig file tells none: a frequency-doubled Nd:YAG diode."""
+"""Default wavelength of a laser: a frequency-doubled Nd:YAG diode."""
 
 # Middles of the bands red, green and blue, in which scenes and water are described.
 _BANDS_NM = np.array([620.0, GREEN_NM, 460.0])

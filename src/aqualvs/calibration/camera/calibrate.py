@@ -162,7 +162,7 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
 # A view is bad if it is this many times noisier than the typical one, and noisier than this.
 _BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
 _MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
-# One view in so many is held back; the rest must determine a camera.
+# One view out of this number is held back; least number of views and of corners in one for that.
 _HELD_BACK_EVERY, _MIN_HELD_BACK, _CAMERA_MIN_POINTS = 4, 8, 12
 _MANY_OUTLIERS = 0.05
 _WEAK_PIXEL_PX = 1.0

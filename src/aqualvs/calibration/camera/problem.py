@@ -42,7 +42,7 @@ BEND_DEGREES = (2, 3)
 """Degrees of a bend's polynomial, each with the terms of those before it."""
 # Exponents of x and y in each term, by degree.
 _TERMS = {2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
-# A flat board passes for bent in one calibration of so many.
+# Probability that a flat board is taken for bent.
 _CHANCE = 1e-3
 # Views needed beyond the number of terms to estimate their scatter.
 _SPARE_VIEWS = 3

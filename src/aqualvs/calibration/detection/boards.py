@@ -366,7 +366,7 @@ _CROPS = (0.25, 0.5, 1.0)
 _ENOUGH_AGREED = 8
 # Window of the local threshold for a quick look at a part, as a share of the picture's width.
 _QUICK_WINDOW = 0.01
-# Markers up to so many squares apart must agree on their offset, to this share of their distance:
+# Markers up to this many squares apart must agree on their offset, to this share of their distance:
 # blur makes them look a seventh too small, and on a tilted board squares grow. An error of one
 # square, as on a board of another pattern, is a third or more.
 _NEIGHBOUR_SQUARES = 3

@@ -132,7 +132,7 @@ def _ids(markers: Markers) -> str:
 
 
 MIN_CORNERS = 6
-"""Fewer corners than this fix neither a pose nor their own mistakes."""
+"""Least number of corners that determines a pose and reveals wrong corners."""
 
 
 def detect_board(

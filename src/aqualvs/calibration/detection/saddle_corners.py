@@ -22,7 +22,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel,
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 
 LEAST_PIVOT = 1e-12
-"""A pivot of the normal matrix below this share of its diagonal is no information."""
+"""Ratio of a pivot of the normal matrix to its diagonal below which there is no information."""
 
 _SQRT_HALF = math.sqrt(0.5)
 _DENSITY_AT_ZERO = 1.0 / math.sqrt(2.0 * math.pi)

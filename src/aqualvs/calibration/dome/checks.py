@@ -38,7 +38,7 @@ from aqualvs.optics.rig import RigUncertainty
 # An index this many sigmas from the stated one contradicts it.
 _SURE = 5.0
 MAX_NOISE_PX = 1.0
-"""Corners noisier than this mean that something else is wrong than noise."""
+"""Corners noisier than this indicate an error other than noise."""
 # Differences that are refused, and that are reported.
 _WRONG, _WORTH_SAYING = 0.02, 0.003
 # Between air and water.
@@ -140,9 +140,9 @@ def _freed(bundle: Bundle, medium: int) -> Bundle:
 class _Suspicion(Enum):
     NONE = auto()
     NEARBY = auto()
-    """The residuals call for another index."""
+    """Another index fits the residuals."""
     OTHER = auto()
-    """The residuals do not tell the index, or there is something else wrong."""
+    """The residuals do not determine the index, or something else is wrong."""
 
 
 def _suspicion(

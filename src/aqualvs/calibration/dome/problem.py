@@ -45,7 +45,7 @@ class GivenPose(Protocol):
 
     @property
     def distance(self) -> float | None:
-        """Where the board's plane meets the dome's y axis, in metres, or None."""
+        """Distance along the dome's y axis to the board's plane, in metres, or None."""
 
 
 class PoseKind(StrEnum):
@@ -214,7 +214,7 @@ class DomeProblem:
 
     @property
     def rotation_is_solved(self) -> bool:
-        """Whether known poses of boards determine the camera's rotation."""
+        """True if known poses of boards determine the camera's rotation."""
         return any(shot.kind is not PoseKind.UNKNOWN for shot in self.shots)
 
     @property

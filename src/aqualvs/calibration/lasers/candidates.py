@@ -169,9 +169,9 @@ _CANDIDATES_N_FITS = 5
 _CANDIDATES_ALIGNED = 0.35
 # Number of pairs beyond which they are sampled; number of planes tried at a time.
 _MOST_PLANES, _AT_ONCE = 6000, 500
-# Prior of the rate of accidents, for when few are seen: lines spread over so many pixels, with the
-# weight of so many observed planes. Then the shift in pixels, the number of shifts and the number
-# of pairs in the random test of how often lines meet by accident.
+# Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
+# weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
+# number of pairs in the random test of how often lines meet by accident.
 _SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
 _MOVED_PX, _N_MOVES, _MOST_MOVED = 250.0, 8, 1000
 # A line nearer than this share of the tolerance is no better evidence: poses are not more accurate.

@@ -240,9 +240,9 @@ def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
 
 
 TOLERANCE_PX = 3.0
-"""A stripe this near to a plane may be the plane's; poses add to the noise of stripes."""
+"""Greatest distance of a stripe from its plane; errors of poses add to the noise of stripes."""
 BENT_TOLERANCE_PX = 10.0
-"""Likewise where the light may be bent at a window, so that no plane fits well."""
+"""The same for light that may be refracted at a window, so that no plane fits well."""
 # Distance from the stripe of a second laser within which its light biases a point's centre.
 _CROSSING_PX = 9.0
 _N_FITS = 5
@@ -298,7 +298,7 @@ class LaserSplit:
 
     @property
     def torn(self) -> bool:
-        """Whether a laser appears as several planes, as on a board that is not flat."""
+        """True if a laser appears as several planes, as on a board that is not flat."""
         return any(plane.verdict is Verdict.TORN for plane in self.spare)
 
 
@@ -320,7 +320,7 @@ def split_lasers(
     n_lasers : int, optional
         Number of lasers that shine; by default all planes with clear evidence.
     tolerance_px : float
-        How far a stripe may be from its plane.
+        Greatest distance of a stripe from its plane.
 
     Returns
     -------

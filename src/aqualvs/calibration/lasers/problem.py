@@ -29,7 +29,7 @@ from aqualvs.optics.sheet import Sheet
 N_LASER = len(LASER_PARAMETERS)
 N_SLACK = 3
 SLACK = "slack"
-"""Group of what is said beforehand about how a board lies on its surface."""
+"""Group of the priors on a board's pose on its surface."""
 
 
 def stripes_group(i_laser: int) -> str:

@@ -319,7 +319,7 @@ def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArra
 
 
 BIN_PX = 12.0
-"""Neighbouring points share speckle, paint and blur; so many pixels along count as one."""
+"""Length of a bin along a stripe: neighbouring points share speckle, paint and blur."""
 # A gap of more pixels than this along a stripe ends a bin.
 _GAP_PX = 10.0
 # Greatest lag of the autocorrelation, in bins, and least number of pairs at each lag.
@@ -333,7 +333,7 @@ class StripeGroup:
     Attributes
     ----------
     view, laser : int
-        Which.
+    Their indices.
     pixels : array, shape (B, 2)
         Means of the points' centres, weighted by their noise, in `image`.
     across : array, shape (B, 2)

@@ -28,7 +28,7 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 
 MAX_RMS_PX = 5.0
-"""Corners that fit worse than this do not show the target they are said to."""
+"""Largest residual of corners of the right target."""
 _CORNERS = "corners"
 _MIN_POINTS = 4
 # Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.

@@ -35,7 +35,7 @@ class Loss(StrEnum):
     HUBER = "huber"
     """As its square up to three standard deviations, linearly beyond: for measurements."""
     CAUCHY = "cauchy"
-    """Logarithmically beyond two or so: where a good part of the data obeys another law."""
+    """Logarithmically beyond about two: if a large part of the data has another distribution."""
 
     def cost(self, lengths: FloatArray) -> FloatArray:
         """Return the loss of residuals (N,), half the square for short ones."""

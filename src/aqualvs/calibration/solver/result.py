@@ -116,7 +116,7 @@ class HeldBack:
 
     @property
     def dome_is_better(self) -> bool:
-        """Whether the bare lens is worse, view by view, by more than chance."""
+        """True if the bare lens is worse, view by view, by more than chance."""
         return self.p_value < _CHANCE
 
 

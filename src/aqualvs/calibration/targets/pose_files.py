@@ -24,7 +24,7 @@ from aqualvs.special_files import refuse_special
 from aqualvs.yamlfile import read_text
 
 PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
-"""What a folder is searched for."""
+"""File name extensions of pictures in a folder."""
 
 
 def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
@@ -106,7 +106,7 @@ class BoardPose:
     name : str
         File name of the picture.
     distance : float or None
-        Where the board's plane meets the y axis of `dome`, in metres.
+        Distance along the y axis of `dome` to the board's plane, in metres.
     dome_from_board : SE3 or None
         The whole pose.
     """

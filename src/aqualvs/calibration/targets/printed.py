@@ -371,12 +371,12 @@ PAPERS_MM: dict[str, tuple[float, float]] = {
 """Width and height of papers, upright."""
 
 FIT = "fit"
-"""Paper that is cut to what is printed on it."""
+"""Paper that is cut to the size of the print."""
 
 _EDGE_MM = 8.0
-"""What printers leave white around a page."""
+"""Margin that printers leave white."""
 _STRIP_MM = 14.0
-"""Below what is printed: ruler and words."""
+"""Strip below the print for ruler and caption."""
 _RULER_MM = 100.0
 _TEXT_MM = 3.2
 _HAIR_MM = 0.2

@@ -33,10 +33,10 @@ from aqualvs.optics.camera import parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 
 MIN_POINTS = 4
-"""Corners that a frame needs: with fewer, a bad one cannot be told from a good one."""
+"""Least number of corners of a frame: with fewer, an outlier cannot be recognised."""
 
 MOST_POINTS = 64
-"""Corners beyond these would cost time and add little."""
+"""Greatest number of corners: more cost time and add little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +83,9 @@ class Frame:
 
 
 WIDE = 0.2
-"""Standard deviation of an index that is not known at all, or has just jumped."""
+"""Standard deviation of an unknown index, or of one that has just jumped."""
 BLIND = 1e-6
-"""Below this motion of the picture, pixels per unit of index, nothing is seen at all."""
+"""Motion of the picture, in pixels per unit of index, below which the index is unobservable."""
 LINEAR = 1e-4
 """Steps of the index up to this are linear to far below the noise of a corner."""
 

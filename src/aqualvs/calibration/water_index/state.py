@@ -115,12 +115,12 @@ class IndexPrior:
 
 
 N, ANCHOR, BEFORE = 0, 1, 2
-"""Index now; when the prior was given; before the last step."""
+"""Present index; index when the prior was given; index before the last step."""
 N_INDICES = 3
 POSE = slice(3, 9)
 FIRST_CAMERA = 9
 FAR = 0.02
-"""Changes of the index from which on slopes are taken anew."""
+"""Change of the index from which derivatives are taken anew."""
 
 # Correlation length of corners' errors over the motion of the picture, and motion below which
 # errors are kept.

@@ -394,10 +394,10 @@ BLUEROV2 = VehicleModel(
 """BlueROV2 with six thrusters: Wu 2018, "6-DoF modelling and control of a remotely operated
 vehicle", Flinders University.
 
-Nothing but buoyancy rights its pitch. Its level thrusters are placed 10 mm below the centre of
-gravity, not some 70 mm: with those and a centre of buoyancy 20 mm up, half of the thrust would turn
-the model over. Above about 0.5 m/s ahead its pitch is unstable all the same: the Munk moment of
-added mass beats the righting one.
+Only buoyancy stabilises its pitch. Its level thrusters are placed 10 mm below the centre of
+gravity, not about 70 mm: with that and a centre of buoyancy 20 mm up, half of the thrust would turn
+the model over. Above about 0.5 m/s ahead its pitch is unstable nevertheless: the Munk moment of the
+added mass exceeds the righting moment.
 """
 
 VIDEORAY = VehicleModel(
