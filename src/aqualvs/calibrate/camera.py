@@ -107,7 +107,7 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
     step = SolvedStep(
         pictures=len(result.views), points=result.n_points, rms_px=result.rms_px, extras={}
     )
-    # The lasers' own calibration looks for as many, of this colour.
+    # The calibration of the lasers searches for this number and colour.
     said = {N_LASERS: nominal.n_lasers, WAVELENGTH_NM: nominal.wavelength_nm}
     rig = replace(rig, solved_from={key: value for key, value in said.items() if value is not None})
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)

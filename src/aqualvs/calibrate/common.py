@@ -156,7 +156,7 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
 Tell: TypeAlias = Callable[[str], object]
 Image: TypeAlias = NDArray[np.uint8]
 Detect: TypeAlias = Callable[[Path, Image], View | str]
-"""Finds a target in a grey picture; a clause says why there is none."""
+"""Finder of a target in a grey picture; returns a clause if there is none."""
 
 # Greatest useful number of threads on small pictures.
 _THREADS = 4
@@ -209,7 +209,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def find_targets(paths: Sequence[Path], detect: Detect, target: str) -> Found:
-    """Look for a target in every picture.
+    """Find a target in every picture.
 
     Parameters
     ----------

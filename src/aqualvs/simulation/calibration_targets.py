@@ -56,7 +56,7 @@ def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> 
     count : int
         Number of poses.
     rng : Generator
-        Source of chance.
+        Random number generator.
     """
     poses = []
     for k in range(count):
@@ -86,7 +86,7 @@ def board_on_rail(
     distances : array, shape (N,)
         Of the board's middle, in metres.
     rng : Generator
-        Source of chance.
+        Random number generator.
 
     Returns
     -------

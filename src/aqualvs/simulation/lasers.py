@@ -229,7 +229,7 @@ def pack_sheets(
     ------
     RigError
         If there is not one source for every laser, or a source is off its laser's plane or not
-        where its laser's window says.
+        that of its laser's window.
     """
     lasers, sheets = rig.lasers, sheets_of(rig)
     if len(sources) != len(lasers):

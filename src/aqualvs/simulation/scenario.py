@@ -45,7 +45,7 @@ def random_fish(
     Parameters
     ----------
     rng : Generator
-        Source of chance.
+        Random number generator.
     count : int
         Number of fish.
     duration : float

@@ -103,7 +103,7 @@ def random_scene(rng: np.random.Generator, difficulty: Difficulty = "usual") -> 
     Parameters
     ----------
     rng : Generator
-        Source of chance; the same state gives the same scene.
+        Random number generator; the same state gives the same scene.
     difficulty : {"clean", "usual", "hard"}
     A clean net in open water; usual conditions of a dive; everything at once.
 

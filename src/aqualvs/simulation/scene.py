@@ -280,7 +280,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Everything in front of the camera at one instant (moving things carry their velocity).
+    """Scene in front of the camera at one instant; moving bodies have their velocity.
 
     Attributes
     ----------

@@ -3,7 +3,7 @@
 OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) gives the starting values. The robust
 bundle adjustment of `solver.bundle`, which `calibrate dome` uses too, refines them, estimates their
 covariance and names the views that do not fit. The checks refuse views that are too few or too much
-alike and intrinsics that do not explain them. The result tells which areas of the picture have no
+alike and intrinsics that do not explain them. The result names the areas of the picture with no
 corners or uncertain intrinsics.
 """
 
@@ -44,7 +44,7 @@ _MIN_POINTS = 60
 _MAX_NOISE_PX = 1.0
 # Focal lengths (share) and image centre (share of the width) known worse than this are of no use.
 _MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.01, 0.02
-# Views whose boards lean less than this from each other are parallel.
+# Angle between boards below which they count as parallel.
 _PARALLEL = np.deg2rad(5.0)
 
 

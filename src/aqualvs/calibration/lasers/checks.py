@@ -182,7 +182,7 @@ def check_count(
     views: Sequence[PlacedView],
     surfaces: Surfaces,
 ) -> list[str]:
-    """Refuse fewer or more lasers than expected, or an undecided number; warn of other doubts.
+    """Refuse fewer or more lasers than expected, or an undecided number; warn of uncertain ones.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Assignment of stripe points to lasers when all lasers shine at once.
 
 The points lie on known surfaces. On each surface a laser plane draws a straight line; lines on
-different surfaces together tell the planes and the number of lasers (`candidates`). Each candidate
+different surfaces together determine planes and number of lasers (`candidates`). Each candidate
 plane is judged by its evidence and against the better planes: laser, no laser, or undecided
 (`judged`). `split_lasers` then assigns every point to the plane it lies in.
 """

@@ -444,7 +444,7 @@ def points_on(
     surface : int array, shape (N,)
         Index into `planes`.
     planes : sequence of Plane
-        The target's surfaces in `dome`; their normals need not be units.
+        The target's surfaces in `dome`; their normals may have any length.
     """
     rays = camera.rays(pixels)
     normals = np.stack([plane.normal for plane in planes])[surface]

@@ -12,7 +12,7 @@ state is a row of 13 numbers: position in the world (north, east, down), attitud
 quaternion (w, x, y, z) of world_from_body, velocity and turning rate along body axes.
 
 Autopilot: ArduSub's depth hold (mode_althold.cpp). Roll and pitch are held at zero and depth at its
-present value; the sticks ask for rates of descent and of turning; forward and right go straight to
+present value; the sticks set rates of descent and of turning; forward and right go straight to
 the thrusters. The autopilot gets the true attitude, rates and depth: a good estimator's errors are
 smaller than the errors of control.
 """
