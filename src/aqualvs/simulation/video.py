@@ -57,7 +57,7 @@ class Recording:
             raise OptionError(f"JPEG quality is {self.jpeg_quality}; it must lie between 1 and 100")
 
 
-# H.264 encoders, in the order of preference.
+# Lossy encoders, in the order of preference.
 _LOSSY = ("libx264", "libopenh264", "mpeg4")
 _FALLBACK_BIT_RATE = 6_000_000
 _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}

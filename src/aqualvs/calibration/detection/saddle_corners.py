@@ -168,7 +168,7 @@ def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> b
 def _descend(
     image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
 ) -> tuple[float, int]:
-    """Levenberg-Marquardt in one window; return the sum of squares and the number of pixels.
+    """Run Levenberg-Marquardt in one window; return the sum of squares and number of pixels.
 
     vectors[0] is the start and becomes the best; matrices[0] its normal matrix.
     """

@@ -301,14 +301,14 @@ class VehicleModel:
         )
 
     def allocation(self) -> FloatArray:
-        """Force and moment on the body by unit thrust of every thruster, shape (6, n)."""
+        """Return force and moment on the body by unit thrust of every thruster, shape (6, n)."""
         positions = np.array([one.position for one in self.thrusters])
         directions = np.array([one.direction for one in self.thrusters])
         moments = np.cross(positions, directions)
         return np.ascontiguousarray(np.vstack([directions.T, moments.T]))
 
     def mixing(self) -> FloatArray:
-        """Factors of each motor input for every thruster, shape (n, 6): -1, 0 or 1.
+        """Return factors of each motor input for every thruster, shape (n, 6): -1, 0 or 1.
 
         Columns: roll, pitch, yaw, down, forward, right. As in ArduSub's frames, upright thrusters
         do roll, pitch and depth, level ones the rest.
