@@ -36,7 +36,7 @@ from aqualvs.results.files import Claim, writing
 Tell: TypeAlias = Callable[[str], object]
 
 _MM = 1e3
-# OpenCV's own boards have markers of about this share of the square.
+# Ratio of marker to square, about that of OpenCV's own boards.
 _MARKER_SHARE = 0.75
 # A light border that keeps the outer squares readable on any background, as a share of a square.
 _BORDER_SHARE = 0.25
@@ -46,12 +46,12 @@ _COUNT_SUFFIXES = (50, 100, 250, 1000)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardRequest:
-    """What is asked for; see `aqualvs board --help`. Lengths in millimetres, angles in degrees.
+    """Request of `aqualvs board`, see its `--help`. Lengths in millimetres, angles in degrees.
 
     Attributes
     ----------
     kind : str
-        What to print.
+        Kind of target.
     out : Path
         `OUT.pdf` and `OUT.yaml` are written.
     paper : str
@@ -71,7 +71,7 @@ class BoardRequest:
     first_id : int
         Number of the first marker of a box or plate.
     position_mm : (float, float, float) or None
-        Where the plate's first corner (top left of its first marker) is in `dome`.
+        Place of the plate's first corner (top left of its first marker) in `dome`.
     rotation_deg : (float, float, float)
         Rotation vector in `dome`, applied to a plate that faces the camera upright.
     overwrite : bool
@@ -102,7 +102,7 @@ def print_board(request: BoardRequest, tell: Tell) -> None:
     Raises
     ------
     OptionError
-        If the target cannot be, or does not fit the paper.
+        If the target is impossible, or does not fit the paper.
     OutputError
         If a file cannot be written.
     """

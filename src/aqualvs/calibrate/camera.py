@@ -38,7 +38,7 @@ from aqualvs.report.findings import Card
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRequest:
-    """What is asked for; see `aqualvs calibrate camera --help`."""
+    """Request of `aqualvs calibrate camera`, see its `--help`."""
 
     images: tuple[str, ...]
     board: Path
@@ -54,7 +54,7 @@ def calibrate_camera(request: CameraRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     nominal = Nominal() if request.nominal is None else load_nominal(request.nominal)
@@ -107,7 +107,7 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
     step = SolvedStep(
         pictures=len(result.views), points=result.n_points, rms_px=result.rms_px, extras={}
     )
-    # The lasers' own calibration looks for as many, of this colour.
+    # The calibration of the lasers searches for this number and colour.
     said = {N_LASERS: nominal.n_lasers, WAVELENGTH_NM: nominal.wavelength_nm}
     rig = replace(rig, solved_from={key: value for key, value in said.items() if value is not None})
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)

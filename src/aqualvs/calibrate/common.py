@@ -1,6 +1,6 @@
-"""What all calibrations share: finding targets in pictures, keeping and writing the rig.
+"""Common parts of all calibrations: nominal rig, target detection in pictures, output of the rig.
 
-What is known of a rig before any calibration: its name, pictures, dome and lasers.
+The nominal rig (`load_nominal`) is known before any calibration: name, picture size, dome, lasers.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,11 +28,11 @@ from aqualvs.terminal import progress
 from aqualvs.yamlfile import read_yaml
 
 WATER_N = 1.3340
-"""Index assumed until something better is known: fresh water of 15 °C under green light."""
+"""Default index: fresh water of 15 °C in green light."""
 N_LASERS = "n_lasers"
-"""Key of `Rig.solved_from` under which a rig without lasers keeps how many it will have."""
+"""Key of `Rig.solved_from` for the planned number of lasers of a rig without any."""
 WAVELENGTH_NM = "wavelength_nm"
-"""Likewise for their wavelength, in nanometres."""
+"""The same for their wavelength, in nanometres."""
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
@@ -41,7 +41,7 @@ _Count = Annotated[int, Field(gt=0)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nominal:
-    """A rig as its drawings tell it.
+    """Nominal rig, as known from its drawings.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Nominal:
     n_air, n_water : float
     n_lasers : int or None
     wavelength_nm : float or None
-        Of the lasers; None if nothing is said, or if they differ.
+        Of the lasers; None if unknown, or if they differ.
     working_range : (float, float)
         Metres.
     """
@@ -111,7 +111,7 @@ def load_nominal(path: Path) -> Nominal:
 
 
 def common_wavelength(lasers: Sequence[Laser]) -> float | None:
-    """Return the wavelength of lasers (nm); None if they differ, or nothing is said of it."""
+    """Return the common wavelength of lasers (nm); None if they differ or it is unknown."""
     found = {laser.wavelength_nm for laser in lasers}
     return found.pop() if len(found) == 1 else None
 
@@ -156,9 +156,9 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
 Tell: TypeAlias = Callable[[str], object]
 Image: TypeAlias = NDArray[np.uint8]
 Detect: TypeAlias = Callable[[Path, Image], View | str]
-"""Finds a target in a grey picture; a clause says why there is none."""
+"""Finder of a target in a grey picture; returns a clause if there is none."""
 
-# More threads than this gain nothing on small pictures.
+# Greatest useful number of threads on small pictures.
 _THREADS = 4
 # Names of pictures that a note lists.
 _NAMES_SHOWN = 3
@@ -166,7 +166,7 @@ _NAMES_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What was found in a set of pictures.
+    """Targets found in a set of pictures.
 
     Attributes
     ----------
@@ -177,7 +177,7 @@ class Found:
     size_px : (int, int)
         Width and height of every picture.
     missed : dict
-        Name of a picture in which it was not found, and why.
+        Names of pictures in which it was not found, with the reason.
     """
 
     views: tuple[View, ...]
@@ -187,7 +187,7 @@ class Found:
 
     @property
     def remarks(self) -> list[str]:
-        """What to warn of."""
+        """Warnings."""
         return [
             *self.notes,
             *(f"{name}: left out, {why}" for name, why in self.missed.items()),
@@ -195,7 +195,7 @@ class Found:
 
     @property
     def notes(self) -> list[str]:
-        """What is worth knowing of how targets were found, each with its pictures."""
+        """Notes on the detection, each with its pictures."""
         names: dict[str, list[str]] = {}
         for view in self.views:
             for note in view.notes:
@@ -209,16 +209,16 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def find_targets(paths: Sequence[Path], detect: Detect, target: str) -> Found:
-    """Look for a target in every picture.
+    """Find a target in every picture.
 
     Parameters
     ----------
     paths : sequence of Path
         Pictures.
     detect : callable
-        Finds the target in one.
+        Finds the target in one picture.
     target : str
-        What is looked for, for messages: "board.yaml", say.
+        Name of the target in messages, such as "board.yaml".
 
     Raises
     ------
@@ -272,7 +272,7 @@ def read_colour(path: Path) -> Image:
 
 
 def medium_index(word: str | None, rig: Rig, default: float) -> float:
-    """Return the index that `--medium` means: "air", "water" (the rig's), or a number.
+    """Return the index of `--medium`: "air", "water" (the rig's), or a number.
 
     Raises
     ------
@@ -296,7 +296,7 @@ def medium_index(word: str | None, rig: Rig, default: float) -> float:
 def finish(
     rig: Rig, page: Page, out: Path, step: str, tell: Tell, *, comments_of: Path | None = None
 ) -> None:
-    """Write the rig and the page of a calibration, and tell where they are.
+    """Write the rig and the page of a calibration, and print their paths.
 
     A rig and a page that are there already are kept under dated names.
 

@@ -1,4 +1,4 @@
-"""`aqualvs calibrate dome`: where the lens sits in the dome, and how the camera is turned."""
+"""`aqualvs calibrate dome`: position of the lens in the dome and rotation of the camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ from aqualvs.report.findings import Card
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DomeRequest:
-    """What is asked for; see `aqualvs calibrate dome --help`."""
+    """Request of `aqualvs calibrate dome`, see its `--help`."""
 
     images: tuple[str, ...]
     board: Path
@@ -70,7 +70,7 @@ class DomeRequest:
 
 @dataclass(frozen=True, slots=True)
 class _Shots:
-    """One set of pictures, looked through."""
+    """One set of pictures with the boards found in them."""
 
     found: Found
     board_set: BoardSet
@@ -83,7 +83,7 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     rig = _with_dome(load_rig(request.rig, need_lasers=False), request)
@@ -108,7 +108,7 @@ def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
 
 
 def _summary(result: DomeCalibration, shots: Sequence[_Shots]) -> list[str]:
-    """Say how many pictures were used, with what residual, and which were left out and why."""
+    """Return the numbers of pictures used and left out, the residual and the reasons."""
     n_pictures = sum(len(one.found.views) + len(one.found.missed) for one in shots)
     used = len(result.views)
     of = f" of {n_pictures}" if used < n_pictures else ""

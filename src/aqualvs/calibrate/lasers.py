@@ -71,7 +71,7 @@ _SHOTS = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LasersRequest:
-    """What is asked for; see `aqualvs calibrate lasers --help`."""
+    """Request of `aqualvs calibrate lasers`, see its `--help`."""
 
     images: tuple[str, ...]
     rig: Path
@@ -88,7 +88,7 @@ class LasersRequest:
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """What the lasers shine on."""
+    """Target that the lasers shine on."""
 
     file: Path
     surfaces: Surfaces
@@ -102,7 +102,7 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
@@ -143,10 +143,10 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
 
 
 def _known(rig: Rig, request: LasersRequest, *, in_air: bool) -> RigUncertainty:
-    """Return how well the camera is known, with defaults for what was written by hand.
+    """Return the camera's uncertainty, with defaults for numbers that were written by hand.
 
-    So lasers and camera are correlated as they are found together. Priors of a refinement are only
-    what the rig itself says, and an index that is only assumed is left to the water of the dive.
+    This makes lasers and camera correlated, as they are found together. Priors of a refinement are
+    the rig's own only, and an index that is only assumed is left to the water of the dive.
     """
     own = rig_uncertainty(rig)
     if request.refine:
@@ -158,7 +158,7 @@ def _known(rig: Rig, request: LasersRequest, *, in_air: bool) -> RigUncertainty:
 
 
 def _coloured(rig: Rig, wavelength_nm: float | None) -> Rig:
-    """Return the rig with lasers of this wavelength; as it is where none is given."""
+    """Return the rig with lasers of this wavelength; unchanged if none is given."""
     if wavelength_nm is None:
         return rig
     return replace(
@@ -167,7 +167,7 @@ def _coloured(rig: Rig, wavelength_nm: float | None) -> Rig:
 
 
 def _wavelength(request: LasersRequest, rig: Rig) -> float | None:
-    """Return the lasers' wavelength as far as anybody has said, in nanometres."""
+    """Return the lasers' wavelength in nanometres from the first source that gives it."""
     given = request.wavelength_nm
     if given is not None and not LASER_NM[0] <= given <= LASER_NM[1]:
         raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
@@ -178,7 +178,7 @@ def _wavelength(request: LasersRequest, rig: Rig) -> float | None:
 
 
 def _expected(request: LasersRequest, rig: Rig) -> int | None:
-    """How many lasers there are, as far as anybody has said; the rig's own count otherwise."""
+    """Return the number of lasers by request or by the rig's notes; None for the rig's own."""
     if request.n_lasers is not None:
         return request.n_lasers
     if request.names is not None:
@@ -211,7 +211,7 @@ def _target(request: LasersRequest, rig: Rig) -> _Target:
 
 
 def _nearer(n_nominal: float, rig: Rig) -> float:
-    """Air or the rig's own water, whichever the box's file means; the rig knows its water best."""
+    """Return air or the rig's own water, whichever is nearer to the index in the box's file."""
     return min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
 
 

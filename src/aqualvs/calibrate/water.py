@@ -36,7 +36,7 @@ _FPS = 25.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterRequest:
-    """What is asked for; see `aqualvs calibrate water --help`."""
+    """Request of `aqualvs calibrate water`, see its `--help`."""
 
     source: tuple[str, ...]
     target: Path
@@ -55,7 +55,7 @@ def calibrate_water(request: WaterRequest, tell: Tell) -> None:
     Raises
     ------
     AqualvsError
-        If a file, a picture or what they say cannot be used.
+        If a file, a picture or its content cannot be used.
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig, need_lasers=False)

@@ -1,5 +1,5 @@
-"""Calibration: targets and their detection, camera, dome, lasers, water.
+"""Calibration: targets and their detection, camera, dome, lasers, refractive index of the water.
 
-Functions take pictures' findings (`view.View`, stripe pixels) and a rig, and return solved rigs
-with their covariance. Finding stripes belongs to `scanning`; `app` joins the two.
+Functions take what was found in pictures (`targets.targets.View`, stripe points) and a rig, and
+return solved rigs with their covariance. `scanning` finds the stripes; `calibrate` joins the two.
 """

@@ -1,9 +1,9 @@
-"""What a camera that is not quite right makes of walls, if its lasers are calibrated with it.
+"""Posture errors of a wrong camera whose lasers are calibrated with it, and of an off-centre lens.
 
-Lasers are calibrated on boards that the same camera sees. What is wrong with the camera moves the
-boards, and the lasers with them: stripes on a wall are then found where a board would be found.
-
-What it costs that the lens is not in the dome's centre.
+Lasers are calibrated on boards that the same camera sees. An error of the camera moves the boards,
+and the lasers with them: stripes on a wall are then found where a board would be found
+(`camera_errors`). `offset_costs` gives the errors for a lens that is not in the dome's centre, if
+its offset is neglected or known.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,9 +22,8 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import Laser, Rig, rig_moved_by
 
-# The boards that lasers are calibrated on: how they lean (radians), where in the working range
-# they are held (as powers), corners to a side, and half a side as a share of the range: they fill
-# the picture.
+# Boards for the calibration of lasers: tilts (radians), places in the working range (as powers),
+# corners to a side, and half a side as a share of the range, such that they fill the picture.
 _LEANS = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
 _PLACES = (0.15, 0.85)
 _N_CORNERS = 11
@@ -33,19 +32,19 @@ _N_POINTS, _LEAST_POINTS = 161, 40
 
 
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
-    """Return what is left of the camera's tolerances once the lasers are calibrated with it.
+    """Return the posture errors by the camera's tolerances after a calibration of the lasers.
 
     Parameters
     ----------
     design : Design
-        With its lasers tilted as they will be.
+        With the final tilts of its lasers.
     ranges : sequence of float
         Walls square ahead, metres.
 
     Returns
     -------
     mapping from cause to array, shape (W, 3)
-        Standard deviations of (range, pitch, yaw), m and rad; NaN where lasers light no board.
+        Standard deviations of (range, pitch, yaw), m and rad; NaN if lasers light no board.
     """
     rig = design.nominal_rig()
     walls = [WallView.ahead(rig, wall) for wall in ranges]
@@ -80,22 +79,22 @@ def _steps(rig: Rig, tolerances: Tolerances) -> dict[str, list[Mapping[str, floa
 
 
 def lasers_by(believed: Rig, true: Rig) -> Rig | None:
-    """Return a rig with the lasers that it would find if it were right, from what another sees.
+    """Return a rig with lasers calibrated by its own camera in the pictures of another rig.
 
-    Boards in the working range tell, through the believed camera, where they are, and the stripes
-    on them where the lasers are: a calibration without noise.
+    A calibration without noise: the assumed camera gives the poses of boards in the working range,
+    and the stripes on them the lasers.
 
     Parameters
     ----------
     believed : Rig
-        Whose camera is taken to be right.
+        Rig whose camera is assumed.
     true : Rig
-        Who makes the pictures.
+        Rig that takes the pictures.
 
     Returns
     -------
     Rig or None
-        None where the boards, or the stripes on them, cannot be used.
+        None if the boards, or the stripes on them, cannot be used.
     """
     lit: list[list[FloatArray]] = [[] for _ in true.lasers]
     for board in _boards(true.working_range):
@@ -114,7 +113,7 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
 
 
 def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
-    """Poses `dome_from_board`; boards lie in their x-z plane."""
+    """Return poses `dome_from_board`; boards lie in their x-z plane."""
     near, far = working_range
     for share in _PLACES:
         middle = np.array([0.0, near * (far / near) ** share, 0.0])
@@ -123,7 +122,7 @@ def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
 
 
 def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
-    """Where a board seems to be."""
+    """Return the pose of a board as the assumed camera finds it."""
     half = _HALF_BOARD * float(board.translation[1])
     x, z = np.meshgrid(*(np.linspace(-half, half, _N_CORNERS),) * 2)
     corners = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
@@ -138,7 +137,7 @@ def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
 
 
 def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -> FloatArray:
-    """Points (N, 3) of a laser's stripe on a board as the believed camera places them."""
+    """Return points (N, 3) of a laser's stripe on a board as placed by the assumed camera."""
     face = board.rotate([0.0, 1.0, 0.0])
     along = np.cross(laser.plane.normal, face)
     length = float(np.linalg.norm(along))
@@ -167,34 +166,33 @@ def _fitted(points: FloatArray) -> Plane:
 
 
 INDEX_ERROR = 0.005
-"""About what sea water's index is above fresh water's."""
+"""Approximate difference of the indices of sea water and fresh water."""
 
 _USUAL = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
-# A lens farther out than this share of the inner radius has no room.
+# Greatest offset of a lens, as a share of the inner radius.
 _ROOM = 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetCost:
-    """What an offset of the lens, ahead of the dome's centre, costs.
+    """Errors by an offset of the lens ahead of the dome's centre.
 
     Attributes
     ----------
     offset : float
         Metres.
     neglected : array, shape (W, 3)
-        Errors of (range, pitch, yaw), in m and rad, where the lens is taken to be in the centre
-        and all else is right.
+        Errors of (range, pitch, yaw), in m and rad, if the lens is taken to be in the centre and
+        all else is right.
     calibrated : array, shape (W, 3)
-        The same where the lasers, too, were calibrated with the lens taken to be in the centre: on
-        boards, whose places are then wrong as well. NaN where no board's place can be told.
+        The same if the lasers, too, were calibrated with the lens taken to be in the centre, on
+        boards whose places are then wrong as well. NaN if no board's place can be found.
     aside : array, shape (W, 3)
         As `neglected`, for an equal offset to the right.
     index_error : array, shape (W, 3)
-        Errors where the offset is known, but the water's index is taken too large by
-        `INDEX_ERROR`.
+        Errors if the offset is known, but the water's index is too large by `INDEX_ERROR`.
     index_sigma : float
-        How well one picture of a known target tells the water's index; see
+        Standard deviation of the water's index from one picture of a known target; see
         `aqualvs.check.finding.index_sigma`.
     """
 
@@ -207,14 +205,14 @@ class OffsetCost:
 
 
 def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, ...]:
-    """Return the costs of offsets from none to what the dome has room for.
+    """Return the errors by offsets from none to the largest that the dome has room for.
 
     Among them are the design's own offset and its centring tolerance. None without a dome.
 
     Parameters
     ----------
     design : Design
-        With its lasers tilted as they will be.
+        With the final tilts of its lasers.
     ranges : sequence of float
         Walls square ahead, metres.
     """
@@ -246,7 +244,7 @@ def _with_lens(rig: Rig, position: tuple[float, float, float]) -> Rig:
 
 
 def _errors(true: Rig, believed: Rig | None, ranges: Sequence[float]) -> FloatArray:
-    """Return what `believed` reads of what `true` sees, less the truth (W, 3); NaN where none."""
+    """Return the posture errors (W, 3) of `believed` on pictures of `true`; NaN without posture."""
     if believed is None:
         return np.full((len(ranges), 3), np.nan)
     read = [WallView.ahead(true, wall).read_by(believed) - [wall, 0.0, 0.0] for wall in ranges]

@@ -1,11 +1,11 @@
-"""Which change of a design helps most: each is tried, with the lasers tilted anew.
+"""Optimisation of a design: best angles of its lasers, and the changes that help most.
 
-The best angles for a design's lasers.
+Angles: coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69). One laser after the
+other takes the best of its candidates, the others being as they are, until none changes. The
+information of stripes adds up over the lasers (`stripes`), so the candidates are traced once for
+each grid; grids become finer about the best.
 
-Coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69): one laser after the other
-takes the best of its candidates, the others being as they are, until none changes. What a stripe
-tells adds up over the lasers (`stripes`), so the candidates are traced once for each grid; grids
-become finer about the best.
+Changes: each one is tried with the lasers tilted anew (`changes`).
 """
 
 import math
@@ -21,31 +21,31 @@ from aqualvs.optics.lens import Lens
 from aqualvs.scanning.plane_fit import SharedError
 
 TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
-"""Tilts among which the best is sought."""
+"""Limits of the search for the best tilt."""
 
 _DEG = math.pi / 180.0
-# Steps of tilt and stripe from grid to grid, and how many to each side after the first.
+# Steps of tilt and stripe from grid to grid, and number of steps to each side after the first.
 _TILT_STEPS = (2.5 * _DEG, 0.5 * _DEG, 0.1 * _DEG)
 _STRIPE_STEPS = (15.0 * _DEG, 5.0 * _DEG, 1.0 * _DEG)
 _HALF_TILTS, _HALF_STRIPES = 6, 3
-# The first grid is so much wider where the stripe's direction is free, too.
+# Factor on the width of the first grid if the stripe's direction is free, too.
 _WIDER = 2.0
-# Choices of each kind that the exchange starts from.
+# Number of initial choices of each kind.
 _N_STARTS = 8
 _MOST_ROUNDS = 20
 
 
 def best_angles(design: Design, *, quick: bool = False) -> Design:
-    """Return the design with the best angles for the mounts that are free to turn.
+    """Return the design with the best angles of the mounts that are free to turn.
 
-    The fans of the mounts that turn are swung so that their middles are abreast of the forward
-    axis halfway through the working range.
+    The fans of these mounts are swung so that their middles are abreast of the forward axis halfway
+    through the working range.
 
     Parameters
     ----------
     design : Design
     quick : bool
-        Start from the mounts' own angles alone: enough where a design has changed but little.
+        Start from the mounts' own angles only: sufficient after small changes of a design.
     """
     if not any(mount.free_tilt or mount.free_stripe for mount in design.mounts):
         return design
@@ -64,7 +64,7 @@ def best_angles(design: Design, *, quick: bool = False) -> Design:
 
 
 def _exchange(judge: Judge, lots: Sequence[Lot], start: Sequence[int]) -> tuple[float, list[int]]:
-    """Let every laser take its best candidate until none changes."""
+    """Exchange every laser for its best candidate until none changes."""
     picked, least = list(start), math.inf
     for _ in range(_MOST_ROUNDS):
         before = list(picked)
@@ -116,7 +116,7 @@ def _around(middle: float, step: float, half: int) -> list[float]:
 
 
 def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
-    """Return choices to start from: alike for all lasers, and mixed (the same at every call)."""
+    """Return initial choices: alike for all lasers, and mixed (the same at every call)."""
     shares = (np.arange(_N_STARTS) + 0.5) / _N_STARTS
     alike = [[share] * len(lots) for share in shares.tolist()]
     mixed = np.random.default_rng(0).uniform(size=(_N_STARTS, len(lots))).tolist()
@@ -126,18 +126,18 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
     ]
 
 
-# Lasers are not put nearer to each other than this, in metres.
+# Least distance between lasers, in metres.
 _ROOM = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a change would do; all numbers are shares of what is now, 1 is no change.
+    """Effect of a change; all numbers are ratios to the present values, 1 is no effect.
 
     Attributes
     ----------
     words : str
-        What is changed.
+        Description of the change.
     score : float
         Root mean square of all errors, in goals, on walls and nets.
     noise_range, noise_angle : float
@@ -160,7 +160,7 @@ def changes(design: Design) -> list[Change]:
     Parameters
     ----------
     design : Design
-        With its lasers tilted as they will be. Those that are free to turn are turned again.
+        With the final tilts of its lasers. Those that are free to turn are turned again.
     """
     now = _measures(design)
     tried = ((words, change(design)) for words, change in _CHANGES.items())
@@ -173,7 +173,7 @@ def changes(design: Design) -> list[Change]:
 
 
 def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Score, then noise and tolerances for range (as a share) and angles."""
+    """Return the score, then noise and tolerances for range (as a share) and angles."""
     told = predict(design)
     parts = [score(design).error]
     for sigma in (told.wall, told.systematic_total):
@@ -230,7 +230,7 @@ def _longer_lens(share: float) -> Callable[[Design], Design]:
 
 
 def _one_more(design: Design) -> Design | None:
-    """Add a laser across the axis from one that has room there: where it helps most."""
+    """Add a laser at the best free place across the axis from an existing one."""
     tried = [
         best_angles(design.with_mounts([*design.mounts, _new_mount(design, place)]), quick=True)
         for place in _free_places(design)
@@ -272,7 +272,7 @@ def _centred(design: Design) -> Design | None:
 
 
 def _averaged(design: Design) -> Design:
-    """Four frames in which stripes have moved over the target: all noise halves."""
+    """Average four frames with stripes at different places of the target: all noise halves."""
     noise = design.noise
     wall, net = (
         SharedError(0.5 * one.shift_px, 0.5 * one.tilt_px) for one in (noise.wall, noise.net)

@@ -42,32 +42,32 @@ from aqualvs.results.files import Claim, writing
 
 RIG_YAML = "rig.yaml"
 
-# Ranges at which it is looked whether a stripe is in the picture.
+# Number of ranges at which stripes are checked to be in the picture.
 _N_SEEN = 181
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRequest:
-    """What is asked for; see `aqualvs design --help`.
+    """Request of `aqualvs design`, see its `--help`.
 
     Attributes
     ----------
     design, rig : Path or None
         A design file, or a rig file that exists; the example if neither is given.
     out : Path or None
-        Folder to write.
+        Output folder.
     given : mapping
-        What takes the place of the file's values, as `merged_content` takes it.
+        Replacements of the file's values, see `merged_content`.
     fan_deg : float or None
-        Of the lasers of a rig.
+        Opening of the fans of a rig's lasers.
     turn : bool
-        Whether to look for the best directions of the stripes of lasers that are tilted, too.
+        Whether to optimise the stripes' directions of the tilted lasers, too.
     tilt : bool
-        Whether to look for the best angles.
+        Whether to optimise the tilts.
     try_changes : bool
-        Whether to say which changes would help.
+        Whether to report changes that would help.
     overwrite : bool
-        Whether to replace what this command wrote to `out` before.
+        Whether to replace earlier output of this command in `out`.
     """
 
     design: Path | None = None
@@ -82,7 +82,7 @@ class DesignRequest:
 
 
 def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
-    """Judge a design and print what it measures.
+    """Evaluate a design and print its predicted errors.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
 
 
 def _tell_errors(console: Console, design: Design, title: str) -> None:
-    """Print where the lasers are, what they measure, and which tolerance makes which error."""
+    """Print the places of the lasers, their errors, and the part of each tolerance."""
     closely = predict(design, np.geomspace(*design.rig.working_range, _N_SEEN))
     ranges = shown_ranges(design.rig.working_range)
     told = predict(design, ranges)

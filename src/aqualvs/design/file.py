@@ -1,4 +1,4 @@
-"""`design.yaml`: what is known before anything is bought, in millimetres and degrees."""
+"""`design.yaml`: the numbers of a design known before purchase, in millimetres and degrees."""
 
 import math
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ from aqualvs.yamlfile import parse_yaml, read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
 FAN_DEG = 68.0
-"""Full opening of a fan of which nothing is said: the simulator's lasers."""
+"""Default full opening of a fan: that of the simulator's lasers."""
 
 EXAMPLE = """\
 # A design for aqualvs design: lengths in mm, angles in degrees, frame 'dome' (docs/hardware.md).
@@ -58,7 +58,7 @@ _N_AIR = 1.0003
 _MM = 1e-3
 
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
-# A hundred metres, and the pictures of the largest cameras: beyond them numbers are slips.
+# Limits beyond which numbers are mistakes: 100 m, and the pictures of the largest cameras.
 _MOST_MM, _MOST_PX = 1e5, 32_768
 _Place = Annotated[float, Field(ge=-_MOST_MM, le=_MOST_MM, allow_inf_nan=False)]
 _Length = Annotated[float, Field(gt=0.0, le=_MOST_MM, allow_inf_nan=False)]
@@ -69,7 +69,7 @@ _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
 
 
 class CameraPart(Part):
-    """`camera`: size and field of view, or a rig file with its intrinsics."""
+    """Schema of `camera`: size and field of view, or a rig file with its intrinsics."""
 
     width_px: _Pixels | None = None
     height_px: _Pixels | None = None
@@ -79,7 +79,7 @@ class CameraPart(Part):
 
 
 class DomePart(Part):
-    """`dome`."""
+    """Schema of `dome`."""
 
     inner_radius_mm: _Length
     thickness_mm: Annotated[float, Field(ge=0.0, le=_MOST_MM, allow_inf_nan=False)]
@@ -87,14 +87,14 @@ class DomePart(Part):
 
 
 class LensPart(Part):
-    """`lens`: where its projection centre is to be, and how far it may be off."""
+    """Schema of `lens`: nominal projection centre, and its tolerance."""
 
     position_mm: _Triple = Field(default=[0.0, 0.0, 0.0])
     centring_mm: NotNegative = 1.0
 
 
 class WaterPart(Part):
-    """`water`: its index, or what it follows from."""
+    """Schema of `water`: its index, or the values to compute it from."""
 
     n: _Index | None = None
     temperature_c: Number | None = None
@@ -102,7 +102,7 @@ class WaterPart(Part):
 
 
 class LasersPart(Part):
-    """`lasers`: evenly round the dome."""
+    """Schema of `lasers`, evenly round the dome."""
 
     count: Annotated[int, Field(ge=1, le=8)] = 3
     baseline_mm: _Length
@@ -112,7 +112,7 @@ class LasersPart(Part):
 
 
 class MountPart(Part):
-    """One of `mounts`; what is left out is looked for."""
+    """Schema of one of `mounts`; missing angles are optimised."""
 
     name: str
     position_mm: _Triple
@@ -122,14 +122,14 @@ class MountPart(Part):
 
 
 class NetPart(Part):
-    """`net`."""
+    """Schema of `net`."""
 
     bar_mm: _Length = 15.0
     twine_mm: _Length = 2.5
 
 
 class NoisePart(Part):
-    """`noise`: one sigma, see docs/hardware.md."""
+    """Schema of `noise`: one sigma, see docs/hardware.md."""
 
     point_px: Positive = Noise().point
     strand_px: Positive = Noise().strand
@@ -140,7 +140,7 @@ class NoisePart(Part):
 
 
 class TolerancesPart(Part):
-    """`tolerances`: one sigma of what calibration leaves open."""
+    """Schema of `tolerances`: one sigma of the errors after calibration."""
 
     lens_mm: NotNegative = 0.03
     rotation_deg: NotNegative = 0.01
@@ -152,14 +152,14 @@ class TolerancesPart(Part):
 
 
 class GoalsPart(Part):
-    """`goals`."""
+    """Schema of `goals`."""
 
     range_percent: Positive = 0.5
     angle_deg: Positive = 0.5
 
 
 class DesignFile(Part):
-    """A whole design file."""
+    """Schema of a whole design file."""
 
     aqualvs_design: int
     name: str = "design"
@@ -184,7 +184,7 @@ def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
     ----------
     path : Path
     given : mapping, optional
-        What the command line puts in place of the file's values, as `merged_content` takes it.
+        Replacements of the file's values by the command line, see `merged_content`.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def example_content() -> dict[str, Any]:
 
 
 def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a file with single values replaced; `given` maps part to its keys."""
+    """Return the content of a file with some values replaced; `given` maps part to its keys."""
     merged = dict(content)
     for part, values in given.items():
         if part == "lasers" and "mounts" in merged:
@@ -224,11 +224,11 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
     Parameters
     ----------
     content : object
-        What YAML made of the file.
+        Content of the YAML file.
     name : str
-        How messages call it.
+        Name in messages.
     folder : Path
-        Where a rig file that it names is looked for.
+        Folder of a rig file that it names.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
 
 
 def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
-    """Return the design of a rig that exists: its lasers may be tilted, but stay where they are.
+    """Return the design of an existing rig: its lasers may be tilted, but keep their places.
 
     Raises
     ------

@@ -1,6 +1,7 @@
-"""How good a choice of laser angles is: errors over the working range, in goals, and penalties.
+"""Predicted errors of range, pitch and yaw of a design, from noise and tolerances, and its score.
 
-Errors of range, pitch and yaw that a design will have, from noise and from tolerances.
+The score of a choice of laser angles is the root mean square error over the working range, in
+multiples of the goals, with penalties for missing and crossing stripes (`Score`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,15 +15,15 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric
 
-# Fewer search lines are no stripe to the scanner; and two lasers at least make a posture.
+# Least number of search lines of a stripe for the scanner; least number of lasers for a posture.
 MIN_LINES = 16
-"""Points that a stripe must have to count as visible."""
+"""Least number of points of a visible stripe."""
 _SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """What a design measures on walls and nets square ahead, at W ranges.
+    """Predicted errors of a design on walls and nets square ahead, at W ranges.
 
     Attributes
     ----------
@@ -32,14 +33,14 @@ class Prediction:
         Of the design's lasers, L of them.
     wall, net : array, shape (W, 3)
         Standard deviations of (range, pitch, yaw) of a single frame from noise, on a wall and on
-        the design's net, in m and rad; NaN where there is no posture.
+        the design's net, in m and rad; NaN without a posture.
     systematic : mapping from cause to array, shape (W, 3)
-        Standard deviations that the tolerances of lasers and water make, each alone; the same in
-        all frames. Those of the camera are in `calibrated.camera_errors`.
+        Standard deviations by the tolerances of lasers and water, each alone; the same in all
+        frames. `calibrated.camera_errors` gives those by the camera's.
     strands : array, shape (L, W)
-        Strands of the net that each stripe meets.
+        Number of strands of the net that each stripe meets.
     crossing : bool array, shape (L, L, W)
-        Whether two stripes cross in the picture.
+        True if two stripes cross in the picture.
     """
 
     ranges: FloatArray
@@ -52,12 +53,12 @@ class Prediction:
 
     @property
     def visible(self) -> BoolArray:
-        """Whether each laser's stripe is in the picture, shape (L, W)."""
+        """Mask (L, W) of stripes in the picture."""
         return np.asarray(self.stripes.lines >= MIN_LINES)
 
     @property
     def valid(self) -> BoolArray:
-        """At which ranges there is a posture, shape (W,)."""
+        """Mask (W,) of ranges with a posture."""
         return np.asarray(np.isfinite(self.wall).all(axis=-1))
 
     @property
@@ -91,14 +92,14 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
 
 
 def together(causes: Mapping[str, FloatArray]) -> FloatArray:
-    """Return the standard deviation (W, 3) that independent causes make together."""
+    """Return the standard deviation (W, 3) of independent causes together."""
     total: FloatArray = np.sqrt(np.sum([sigma**2 for sigma in causes.values()], axis=0))
     return total
 
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Normal equations of wall fits, and the scatter that shared errors add.
+    """Normal equations of wall fits, and the scatter added by shared errors.
 
     Attributes
     ----------
@@ -117,13 +118,13 @@ class Sums:
 
 
 def wall_parts(stripes: Stripes, noise: Noise) -> Sums:
-    """Return what each stripe (K, W) adds on an unbroken wall."""
+    """Return the contribution of each stripe (K, W) on an unbroken wall."""
     shared = noise.wall.shift_px, noise.wall.tilt_px
     return _parts(stripes, np.ones_like(stripes.lines), noise.point, shared)
 
 
 def net_parts(stripes: Stripes, design: Design) -> Sums:
-    """Return what each stripe (K, W) adds on the design's net: one point for every strand."""
+    """Return the contribution of each stripe (K, W) on the design's net: one point a strand."""
     noise = design.noise
     shared = noise.net.shift_px, noise.net.tilt_px
     return _parts(stripes, net_share(stripes, design), noise.strand, shared)
@@ -147,7 +148,7 @@ def net_sums(stripes: Stripes, design: Design) -> Sums:
 
 
 def _parts(stripes: Stripes, share: FloatArray, point: float, shared: tuple[float, float]) -> Sums:
-    """Keep `share` of the points (K, W), each with a noise of `point` pixels."""
+    """Return the sums for `share` of the points (K, W), each with a noise of `point` pixels."""
     matrix = stripes.matrix * share[..., None, None]
     pulls = stripes.own[..., :2, :] * share[..., None, None] * np.array(shared)[:, None]
     return Sums(matrix, point**2 * matrix + outer(pulls))
@@ -160,13 +161,13 @@ def outer(pulls: FloatArray) -> FloatArray:
 
 
 def laser_scatter(stripes: Stripes, tolerances: Tolerances) -> FloatArray:
-    """Return what errors of each laser's plane add to the scatter, shape (K, W, 3, 3)."""
+    """Return the scatter by errors of each laser's plane, shape (K, W, 3, 3)."""
     sizes = np.array([tolerances.laser_angle, tolerances.laser_angle, tolerances.laser_offset])
     return outer(stripes.own[..., 2:, :] * sizes[:, None])
 
 
 def posture_covariance(sums: Sums, ranges: FloatArray) -> FloatArray:
-    """Return the covariance (..., W, 3, 3) of range, pitch and yaw; NaN where there is none.
+    """Return the covariance (..., W, 3, 3) of range, pitch and yaw; NaN if undetermined.
 
     The posture's derivatives by m at a wall square ahead are -range², range and range.
     """
@@ -191,14 +192,14 @@ def inverse_of(matrix: FloatArray) -> FloatArray:
 
 
 def crossings(stripes: Stripes) -> BoolArray:
-    """Tell which stripes (K, K, W) cross where the camera sees both."""
+    """Return the mask (K, K, W) of stripes that cross within the picture."""
     crossing: BoolArray = cross(stripes, stripes)
     crossing[np.arange(len(crossing)), np.arange(len(crossing))] = False
     return crossing
 
 
 def cross(one: Stripes, other: Stripes) -> BoolArray:
-    """Tell which stripes of two lots, (K, L, W), cross within their visible parts."""
+    """Return the mask (K, L, W) of stripes of two lots that cross within their visible parts."""
     e, f = one.along[:, None, None], other.along[None, :, None]
     apart = other.centre[None] - one.centre[:, None]
     turn = _turn(e, f)
@@ -232,23 +233,23 @@ def _systematic(
 
 
 def _sigmas(covariance: FloatArray) -> FloatArray:
-    # What cancels leaves rounding, which may be negative.
+    # Rounding may leave negative variances.
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-# A stripe should keep clear of the border by this share of the picture's height, so that targets
-# that are not square stay in view, and be at least so long.
+# Margin of a stripe to the border, as a share of the picture's height, so that it stays in view on
+# oblique targets; and its least length.
 _MARGIN_SHARE, _LENGTH_SHARE = 0.05, 0.3
-# What a stripe that is out of the picture costs, in goals; and what a crossing may cost.
+# Penalty of a stripe out of the picture, in goals; greatest penalty of crossings.
 _OUT_COST, _CROSSING_SHARE = 20.0, 0.3
-# What no posture counts as, in goals squared.
+# Square error of no posture, in goals squared.
 _NO_POSTURE = 1e4
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How good a choice of angles is; less is better.
+    """Score of a choice of angles; less is better.
 
     Attributes
     ----------
@@ -256,7 +257,7 @@ class Score:
         Root mean square of the errors of range, pitch and yaw over the working range, from noise
         and the tolerances of lasers and water, on walls and nets alike, in goals.
     total : float
-        The same with what missing and crossing stripes cost.
+        The same with the penalties of missing and crossing stripes.
     """
 
     error: float
@@ -265,7 +266,7 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class Lot:
-    """Candidates for one laser, K of them, or the chosen stripes of several.
+    """K candidates for one laser, or the chosen stripes of several.
 
     Attributes
     ----------
@@ -297,7 +298,7 @@ class Lot:
 
 
 class Judge:
-    """Judges choices of stripes for one design."""
+    """Evaluator of choices of stripes for one design."""
 
     def __init__(self, design: Design) -> None:
         self._design = design
@@ -307,7 +308,7 @@ class Judge:
         self._height = min(design.rig.size_px)
 
     def trace(self, mounts: Sequence[Mount]) -> Lot:
-        """Return what the camera sees of mounts, with a margin for turned targets."""
+        """Return the stripes of mounts in the picture, with a margin for turned targets."""
         design, margin = self._design, _MARGIN_SHARE * self._height
         stripes = see_stripes(self._camera, mounts, self._ranges, self._steps, margin)
         scatter = laser_scatter(stripes, design.tolerances)
@@ -331,13 +332,13 @@ class Judge:
         return error, total + _OUT_COST * short / (1 + len(others))
 
     def _shortfall(self, stripes: Stripes) -> FloatArray:
-        """How much of each stripe's least length is missing, (K,), mean over the ranges."""
+        """Return the missing share (K,) of each stripe's least length, mean over the ranges."""
         least = _LENGTH_SHARE * self._height / line_pixels(self._camera)
         missing: FloatArray = np.maximum(1.0 - stripes.lines / least, 0.0).mean(axis=-1)
         return missing
 
     def _crossings(self, one: Stripes, others: Stripes) -> FloatArray:
-        """Share of pairs and ranges (K,) at which stripes cross in the picture."""
+        """Return the share (K,) of pairs and ranges at which stripes cross in the picture."""
         n = len(others.lines)
         if not self._design.avoid_crossings or n == 0:
             return np.zeros(len(one.lines))
@@ -348,7 +349,7 @@ class Judge:
 
 
 def score(design: Design) -> Score:
-    """Return how good the angles of a design's mounts are."""
+    """Return the score of the angles of a design's mounts."""
     judge = Judge(design)
     lot = judge.trace(design.mounts)
     errors, totals = judge.judge(lot.take([0]), lot.take(range(1, len(lot))))
@@ -384,7 +385,7 @@ def _add_squares(
                         )
             square = _NO_POSTURE
             if invert_symmetric(whole, inverse):
-                # Yaw, range and pitch by m, each in its goal.
+                # Derivatives of yaw, range and pitch by m, each in units of its goal.
                 scale[0], scale[1] = ranges[w] / wanted[2], ranges[w] / wanted[0]
                 scale[2] = ranges[w] / wanted[1]
                 square = 0.0

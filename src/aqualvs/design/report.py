@@ -1,8 +1,7 @@
-"""A design and what it measures, in tables.
+"""Report of a design: tables, and two figures.
 
-Two pictures of a design: errors over range, and where in the picture the stripes are.
-
-Matplotlib is asked for when a picture is drawn, and only its Agg canvas: no display is needed.
+The figures show the errors over range and the stripes in the picture. Matplotlib is imported when a
+figure is drawn, and only its Agg canvas: no display is needed.
 """
 
 import math
@@ -40,7 +39,7 @@ def shown_ranges(working_range: tuple[float, float]) -> list[float]:
 
 
 def summary(design: Design) -> list[str]:
-    """Return what is judged, in two or three lines."""
+    """Return the design in two or three lines."""
     rig = design.rig
     width, height = rig.size_px
     fov = 2.0 * math.degrees(math.atan(0.5 * width / rig.lens.fx))
@@ -61,7 +60,7 @@ def summary(design: Design) -> list[str]:
 
 
 def lasers_table(design: Design, told: Prediction) -> Table:
-    """Return how to mount the lasers, and from where to where they are in the picture."""
+    """Return the table of the lasers' mounts and of the ranges at which they are in the picture."""
     table = _table("Lasers: where, at what angles, at which ranges in the picture")
     headings = ("x\nmm", "y\nmm", "z\nmm", "baseline\nmm", "stripe\ndeg", "tilt\ndeg")
     for name in (*headings, "swing\ndeg", "seen\nmm"):
@@ -84,7 +83,7 @@ def _angle(angle: float) -> str:
 
 
 def _interval(ranges: FloatArray, visible: BoolArray) -> str:
-    """Ranges at which a stripe is in the picture; as many pieces as there are."""
+    """Return the intervals of range at which a stripe is in the picture."""
     pieces = []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]]).astype(int)))
     for first, last in edges.reshape(-1, 2):
@@ -128,7 +127,7 @@ def _shown(value: float) -> str:
 
 
 def cause_table(causes: Mapping[str, FloatArray], i: int, wall: float) -> Table:
-    """Return what each tolerance makes of the posture at the i-th range, `wall` in metres."""
+    """Return the table of posture errors by each tolerance at the i-th range, `wall` in metres."""
     table = _table(f"Tolerances at {wall * 1e3:.0f} mm, one by one", first="\nfrom")
     for name in ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg"):
         table.add_column(name, justify="right")
@@ -138,7 +137,7 @@ def cause_table(causes: Mapping[str, FloatArray], i: int, wall: float) -> Table:
 
 
 def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
-    """Return what offsets of the lens cost, at the nearest and the farthest range."""
+    """Return the table of errors by offsets of the lens, at the nearest and the farthest range."""
     table = _table("Lens ahead of the dome's centre: range error", first="offset\nmm", right=True)
     near, far = (f"{value * 1e3:.0f} mm" for value in (ranges[0], ranges[-1]))
     for name in (
@@ -165,7 +164,7 @@ def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
 
 
 def centring_words(design: Design, costs: Sequence[OffsetCost], ranges: Sequence[float]) -> str:
-    """Return what the design's centring tolerance costs who does not calibrate the dome."""
+    """Return the errors by the design's centring tolerance without a calibration of the dome."""
     off = min(costs, key=lambda one: abs(one.offset - design.centring))
     shares = _percents(off.neglected, ranges), _percents(off.calibrated, ranges)
     yaw = " and ".join(f"{angle:+.2f}" for angle in np.degrees(off.aside[:, 2]))
@@ -187,7 +186,7 @@ def _percent(share: float) -> str:
 
 
 def change_table(found: Sequence[Change]) -> Table:
-    """Return what changes would do, the most helpful first."""
+    """Return the table of changes and their effects, the most helpful first."""
     table = _table("Changes, lasers tilted anew: errors grow by so many per cent", first="\nchange")
     for name in ("\nall", "noise\nrange", "\nangle", "tolerances\nrange", "\nangle"):
         table.add_column(name, justify="right")
@@ -211,7 +210,7 @@ def _change(share: float) -> str:
 
 
 def findings(design: Design, told: Prediction) -> list[str]:
-    """Return what a table does not say: missing postures, stripes out of the picture, crossings."""
+    """Return findings: missing postures, stripes out of the picture, crossings."""
     lines = []
     if len(design.mounts) < 2:
         lines.append("One laser draws one line: no posture; add a second.")
@@ -261,7 +260,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 8.0,
     "legend.frameon": False,
 }
-# What the camera's tolerances make changes little with range.
+# Errors by the camera's tolerances change little with range.
 _N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
 
 
@@ -271,7 +270,7 @@ def draw_figures(design: Design, out: Path) -> list[Path]:
     Parameters
     ----------
     design : Design
-        With its lasers tilted as they will be.
+        With the final tilts of its lasers.
     out : Path
         Folder that exists.
 
@@ -291,7 +290,7 @@ def draw_figures(design: Design, out: Path) -> list[Path]:
 
 
 def _errors(design: Design) -> "Figure":
-    """Range error in per cent, pitch and yaw in degrees, over range."""
+    """Draw the range error in per cent, and pitch and yaw errors in degrees, over range."""
     ranges = np.geomspace(*design.rig.working_range, _N_RANGES)
     told = predict(design, ranges)
     few = np.geomspace(*design.rig.working_range, _N_CAMERA)
@@ -359,7 +358,7 @@ def _picture(design: Design) -> "Figure":
 
 
 def _stripe_pixels(design: Design, ranges: FloatArray) -> FloatArray:
-    """Pixels (L, W, N, 2) along every laser's visible stripe; NaN where there is none."""
+    """Return pixels (L, W, N, 2) along every laser's visible stripe; NaN if there is none."""
     stripes = predict(design, ranges).stripes
     share = np.linspace(0.0, 1.0, _N_ALONG)
     begin, end = stripes.ends[..., :1], stripes.ends[..., 1:]
@@ -371,7 +370,7 @@ def _stripe_pixels(design: Design, ranges: FloatArray) -> FloatArray:
 
 
 def _label_lasers(axes: "Axes", design: Design, ranges: FloatArray) -> None:
-    """Name every laser beside a place of its nearest stripe that is far from the others' labels."""
+    """Label every laser at a place of its nearest stripe that is far from the others' labels."""
     taken: list[FloatArray] = []
     for mount, lines in zip(design.mounts, _stripe_pixels(design, ranges), strict=True):
         seen = [line for line in lines if np.isfinite(line).all()]

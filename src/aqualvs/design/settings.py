@@ -1,6 +1,6 @@
-"""A design in SI units: the nominal rig, the lasers' mounts, and what may be off.
+"""Settings of a design in SI units: nominal rig, mounts of the lasers, noise, tolerances and goals.
 
-A place for a line laser on the vehicle, and the sheet of light that leaves it.
+A `Mount` is the place of a line laser on the vehicle and the sheet of light that leaves it.
 """
 
 import math
@@ -17,34 +17,34 @@ from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheet_in
 from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, SharedError
 
-# A sheet this square to the forward axis draws no stripe on a wall ahead.
+# Limit of a sheet square to the forward axis, which draws no stripe on a wall ahead.
 _LEAST_ACROSS = 1e-3
-# Without a source of its own a laser of a rig is taken to sit this far before the dome's centre.
+# Assumed distance before the dome's centre of a rig's laser without a source of its own.
 _BESIDE_DOME = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
-    """A line laser as it is screwed on.
+    """Mount of a line laser.
 
     Attributes
     ----------
     name : str
-        How tables call it.
+        Name in tables.
     position : (float, float, float)
-        Where the fan comes from, in `dome`, metres.
+        Origin of the fan, in `dome`, metres.
     stripe : float
         Direction of the stripe on a wall square ahead, in radians: 0 level, pi/2 upright,
         counter-clockwise as the camera sees it.
     tilt : float
-        How the sheet leans towards the forward axis through the dome's centre, in radians; negative
-        leans away.
+        Tilt of the sheet towards the forward axis through the dome's centre, in radians; negative
+        is away from it.
     fan : float
         Full opening of the fan, in radians.
     swing : float
         Turn of the fan's middle within its sheet, along the stripe's direction, in radians.
     free_tilt, free_stripe : bool
-        Whether the best angles are to be found, or these are given.
+        Whether to optimise these angles, or keep them.
     wavelength_nm : float or None
         As `Laser.wavelength_nm`.
     """
@@ -63,8 +63,8 @@ class Mount:
     def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Unit vectors in `dome`: along the stripe, across it away from the axis, along the beam.
 
-        A laser whose stripe would run through the axis has no side; upwards, or else to the left,
-        counts as away then.
+        For a laser whose stripe would run through the axis, upwards, or else to the left, counts as
+        away.
         """
         along = np.array([math.cos(self.stripe), 0.0, math.sin(self.stripe)])
         across = np.array([-along[2], 0.0, along[0]])
@@ -88,7 +88,7 @@ class Mount:
         return Plane(normal, float(normal @ self.position))
 
     def laser(self) -> Laser:
-        """Return the laser as a rig has it."""
+        """Return the laser for a rig."""
         return Laser(self.name, self.plane, wavelength_nm=self.wavelength_nm)
 
     def aimed_at(self, wall_range: float) -> "Mount":
@@ -106,11 +106,11 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
     Parameters
     ----------
     count : int
-        How many.
+        Number of lasers.
     baseline : float
         Distance from the forward axis, metres.
     back : float
-        How far they sit behind the dome's centre, metres.
+        Distance behind the dome's centre, metres.
     fan : float
         Full opening, radians.
     """
@@ -139,12 +139,12 @@ def tangential(position: Sequence[float]) -> float:
 
 
 def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
-    """Return where a laser of a rig would sit: what its plane leaves open is set to the usual.
+    """Return a mount for a laser of a rig, with default values of what its plane leaves open.
 
     Parameters
     ----------
     laser : Laser
-        Behind a window the plane that fits its light best counts.
+        Behind a window the plane that fits its light best is used.
     rig : Rig
         Its rig.
     fan : float
@@ -202,12 +202,12 @@ def _place_name(round_axis: float, i: int) -> str:
 
 
 N_WALLS = 9
-"""Ranges at which a design is judged, evenly spaced in their logarithm."""
+"""Number of ranges in the evaluation of a design, evenly spaced in their logarithm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """Standard deviations of what the scanner finds in one frame, in pixels.
+    """Noise of the scanner in one frame: standard deviations in pixels.
 
     Attributes
     ----------
@@ -216,7 +216,7 @@ class Noise:
     strand : float
         Of the light on one strand of a net.
     wall, net : SharedError
-        Of what a whole stripe shares.
+        Of the errors that a whole stripe shares.
     """
 
     point: float = 0.3
@@ -227,7 +227,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tolerances:
-    """One sigma of what calibration leaves open, in metres, radians and shares.
+    """Tolerances: one sigma of the errors after calibration, in metres, radians and shares.
 
     Attributes
     ----------
@@ -256,14 +256,14 @@ class Tolerances:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetFacts:
-    """A net as its maker describes it: length of a bar and diameter of its twine, in metres."""
+    """Nominal net: length of a bar and diameter of its twine, in metres."""
 
     bar: float
     twine: float
 
     @property
     def strands_per_metre(self) -> float:
-        """How often a stripe meets a strand: of two families, the mean over all directions."""
+        """Strands that a stripe meets per metre, of two families, averaged over all directions."""
         return 4.0 / math.pi / self.bar
 
     @property
@@ -275,7 +275,7 @@ class NetFacts:
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """Errors that count as equally bad: a share of the range, and an angle in radians."""
+    """Goals: equally bad errors, as a share of the range and as an angle in radians."""
 
     range_share: float = 0.005
     angle: float = math.radians(0.5)
@@ -283,15 +283,15 @@ class Goals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Design:
-    """What is to be judged.
+    """Design to be evaluated.
 
     Attributes
     ----------
     rig : Rig
-        Nominal camera, dome, water and working range. Its lasers do not count.
+        Nominal camera, dome, water and working range. Its lasers are ignored.
     mounts : tuple of Mount
     centring : float
-        How far the lens may be off its place before a calibration, metres.
+        Standard deviation of the lens's place before a calibration, metres.
     noise : Noise
     tolerances : Tolerances
     net : NetFacts
@@ -311,7 +311,7 @@ class Design:
 
     @property
     def ranges(self) -> FloatArray:
-        """Walls at which the design is judged, metres, shape (N_WALLS,)."""
+        """Ranges of the walls for the evaluation, metres, shape (N_WALLS,)."""
         return np.geomspace(*self.rig.working_range, N_WALLS)
 
     def with_mounts(self, mounts: Sequence[Mount]) -> "Design":
@@ -326,8 +326,8 @@ class Design:
 def index_step(camera: Camera, tolerances: Tolerances) -> FloatArray:
     """Return a step of one sigma of the water's index, in the camera's parameters (P, G).
 
-    Of all that stripes share only the water changes after the lasers have been calibrated. G is 1,
-    or 0 for a bare lens, to which the water does not matter.
+    Of all that stripes share only the water changes after the calibration of the lasers. G is 1,
+    or 0 for a bare lens, which does not depend on the water.
     """
     names = parameter_names(camera)
     if "n_water" not in names:

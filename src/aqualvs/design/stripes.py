@@ -1,9 +1,9 @@
-"""What a stripe on a wall ahead tells about the wall's plane, for many sheets and ranges at once.
+"""Information of a stripe on a wall ahead about the wall's plane, for many sheets and ranges.
 
 A wall square ahead is m·X = 1 with m = (0, 1/range, 0). The scanner fits m by least squares, each
-point weighed by what a pixel's error makes of m·X. Of a stripe this needs one matrix,
+point weighted by the effect of a pixel's error on m·X. A stripe contributes one matrix,
 sum w X X', and for every error that its points share a vector, sum w X d(m·X)/d(error). Both add
-up over lasers, so that any combination of sheets is told from the sums of their parts.
+up over lasers, so that any combination of sheets follows from the sums of its parts.
 """
 
 from collections.abc import Sequence
@@ -21,28 +21,28 @@ OWN_ERRORS = ("shift", "tilt", "laser_tilt_1", "laser_tilt_2", "laser_offset")
 The laser's tilts turn the sheet's normal towards the stripe and towards the beam.
 """
 
-# Points that look for the ends of a stripe, and those at which it is then summed up (Gauss).
+# Numbers of points in the search for the ends of a stripe, and in the sums over it (Gauss).
 _N_SEARCH, _N_PASSES, _N_SUM = 33, 2, 24
-# A fan wider than this to either side of the beam meets no wall nearby.
+# Limit of the fan to either side of the beam: beyond, it meets no wall nearby.
 _WIDEST = np.deg2rad(80.0)
-# As the scanner: wider pictures are read in lines of two pixels.
+# As in the scanner: wider pictures are read in lines of two pixels.
 _PIXELS_PER_LINE_FROM = 1280
 
 
 @dataclass(frozen=True, slots=True)
 class Stripes:
-    """Sums over the visible part of the stripes of K sheets on W walls.
+    """Sums over the visible parts of the stripes of K sheets on W walls.
 
     Attributes
     ----------
     lines : array, shape (K, W)
-        Search lines that see the stripe, one point each; 0 where it is out of the picture.
+        Number of search lines that see the stripe, one point each; 0 if it is out of the picture.
     length : array, shape (K, W)
         Visible length on the wall, metres.
     middle : array, shape (K, W, 2)
-        Pixel of the visible part's middle, in `image`; NaN where there is none.
+        Pixel of the visible part's middle, in `image`; NaN if there is none.
     matrix : array, shape (K, W, 3, 3)
-        sum w X X', each point weighed by its variance for an error of 1 px.
+        sum w X X', each point weighted by its inverse variance for an error of 1 px.
     own : array, shape (K, W, 5, 3)
         sum w X d(m·X)/d(error) for `OWN_ERRORS`.
     common : array, shape (K, W, G, 3)
@@ -50,7 +50,7 @@ class Stripes:
     centre, along : array, shapes (K, W, 3) and (K, 3)
         The stripe's line on the wall, in `dome`.
     ends : array, shape (K, W, 2)
-        Where along it the visible part begins and ends, in metres; NaN where there is none.
+        Begin and end of the visible part along it, in metres; NaN if there is none.
     """
 
     lines: FloatArray
@@ -81,7 +81,7 @@ def see_stripes(
     common: FloatArray,
     margin: float = 0.0,
 ) -> Stripes:
-    """Sum up what a camera sees of the stripes of K mounts on walls square ahead.
+    """Return the sums over a camera's view of the stripes of K mounts on walls square ahead.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def see_stripes(
     common : array, shape (P, G)
         G errors of the camera as steps of its parameters, see `parameter_names`.
     margin : float
-        Pixels at the picture's border that do not count.
+        Width of the ignored border of the picture, in pixels.
     """
     axes = [mount.axes for mount in mounts]
     along, beam = (np.array([one[i] for one in axes]).reshape(-1, 3) for i in (0, 2))
@@ -116,7 +116,7 @@ class _Lines:
 
 
 def line_pixels(camera: Camera) -> int:
-    """Return how many pixels wide the scanner's search lines are."""
+    """Return the width of the scanner's search lines in pixels."""
     return 2 if camera.size_px[0] >= _PIXELS_PER_LINE_FROM else 1
 
 
@@ -128,9 +128,9 @@ def _reach(mount: Mount) -> tuple[float, float]:
 def _visible_ends(
     camera: Camera, centre: FloatArray, along: FloatArray, fan: FloatArray, margin: float
 ) -> FloatArray:
-    """Where (K, W, 2) along the stripe its visible part begins and ends; NaN where none."""
+    """Return begin and end (K, W, 2) of the visible part along the stripe; NaN if none."""
     share = np.linspace(0.0, 1.0, _N_SEARCH)
-    # Once over the whole fan, which may be much wider than the picture; then closer.
+    # First over the whole fan, which may be much wider than the picture; then finer.
     for _ in range(_N_PASSES):
         place = fan[..., :1] + share * (fan[..., 1:] - fan[..., :1])
         inside = _depth_in_picture(camera, _points(centre, along, place), margin)
@@ -151,7 +151,7 @@ def _points(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatAr
 
 
 def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> FloatArray:
-    """Pixels from the picture's border, negative outside; NaN where nothing is seen."""
+    """Return the distance to the picture's border in pixels, negative outside; NaN if not seen."""
     pixels, valid = camera.project(points)
     width, height = camera.size_px
     x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
@@ -161,19 +161,19 @@ def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> Floa
 
 
 def _at(values: FloatArray, i: IntArray) -> FloatArray:
-    """Values (K, W, S) at places (K, W), those beyond an end being at the end."""
+    """Return values (K, W, S) at places (K, W), clipped to the ends."""
     row = np.clip(i, 0, values.shape[-1] - 1)[..., None]
     found: FloatArray = np.take_along_axis(values, row, -1)[..., 0]
     return found
 
 
 def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> FloatArray:
-    """Where the border is crossed between the outermost point inside and the next."""
+    """Return the crossing of the border between the outermost point inside and the next."""
     here, there = _at(inside, i), _at(inside, i + step)
     at, to = _at(place, i), _at(place, i + step)
     with np.errstate(invalid="ignore", divide="ignore"):
         share = here / (here - there)
-    # Where the lens model ends, or the fan, nothing tells how much farther the stripe reaches.
+    # Beyond the lens model, or the fan, the length of the stripe is unknown.
     share = np.where((there <= 0.0) & np.isfinite(share), share, 0.0)
     edge: FloatArray = at + share * (to - at)
     return edge
@@ -194,7 +194,7 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
     sensitivity = _Sensitivity.of(normal, ranges, by_point, by_parameter @ common)
     per_px = np.where(is_row, sensitivity.by_x, sensitivity.by_y)
     place = _place(camera, pixels, is_row)
-    # A stripe without depth (its sheet runs through the lens) tells nothing.
+    # A stripe without depth (its sheet runs through the lens) has no information.
     with np.errstate(divide="ignore", invalid="ignore"):
         voice = np.where(seen[..., None] & (per_px != 0.0), lines / per_px**2, 0.0)
     heard = voice[..., None] * np.where(np.isfinite(points), points, 0.0)
@@ -215,14 +215,14 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
 
 
 def _along_x(path: FloatArray) -> BoolArray:
-    """Whether the scanner looks for the stripe along rows: it runs rather upright (K, W, 1)."""
+    """Return the mask (K, W, 1) of rather upright stripes, which the scanner reads by rows."""
     x, y = np.abs(path[..., 0]).mean(axis=-1), np.abs(path[..., 1]).mean(axis=-1)
     upright: BoolArray = (y > x)[..., None]
     return upright
 
 
 def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
-    """Place along the stripe, from -1 at one border of the picture to 1 at the other."""
+    """Return places along the stripe, from -1 at one border of the picture to 1 at the other."""
     width, height = camera.size_px
     x, y = 2.0 * pixels[..., 0] / (width - 1) - 1.0, 2.0 * pixels[..., 1] / (height - 1) - 1.0
     place: FloatArray = np.where(is_row, y, x)
@@ -231,7 +231,7 @@ def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Sensitivity:
-    """What moves m·X of the points (K, W, S) that fixed pixels triangulate to.
+    """Derivatives of m·X at the points (K, W, S) that fixed pixels triangulate to.
 
     Attributes
     ----------
@@ -261,7 +261,7 @@ class _Sensitivity:
         with np.errstate(divide="ignore", invalid="ignore"):
             volume = _volume(normal, row_x, row_y) * ranges[None, :, None]
             by_x, by_y, by_normal = x_n / volume, n_y / volume, forward / volume
-            # At a fixed pixel a step of the camera acts as the opposite step of the pixel.
+            # At a fixed pixel a step of the camera acts like the opposite step of the pixel.
             by_common = -(by_x[..., None] * steps[..., 0, :] + by_y[..., None] * steps[..., 1, :])
         return cls(by_x, by_y, by_normal, by_common)
 
@@ -287,7 +287,7 @@ def _own(
     per_px: FloatArray,
     place: FloatArray,
 ) -> FloatArray:
-    """d(m·X)/d(error) for `OWN_ERRORS`, shape (K, W, S, 5)."""
+    """Return d(m·X)/d(error) for `OWN_ERRORS`, shape (K, W, S, 5)."""
     # A normal that turns towards t moves the sheet by -t·X along the old normal.
     turned = -np.stack(
         [np.einsum("kwsi,ki->kws", points, t) for t in (line.along, line.beam)], axis=-1

@@ -1,12 +1,12 @@
-"""The public benchmark set: dives by difficulty, at fixed seeds.
+"""The public benchmark set: dives by difficulty, at fixed seeds, and their truth on disk.
 
-A difficulty is laid over the same courses and the same nets as the clear dives, so that what it
-costs can be read off. Whoever changes anything here gives the set the next number: scores are
-compared by name and checksum.
+Every difficulty is laid over the same courses and the same nets as the clear dives, so that its
+cost can be read off. After any change here the set must get the next number: scores are compared by
+name and checksum.
 
-Which points of the stripes a picture truly shows, whoever looks for them.
-
-One dive of the benchmark set on disk: video, truth, rig.
+Each dive is a folder with video, truth and rig (`render_benchmark_dive`). Part of the truth is the
+stripe points that a picture shows above a fixed contrast, independent of any detector
+(`visible_points`).
 """
 
 import csv
@@ -39,7 +39,7 @@ CONTRAST_LIMIT = 10.0
 """Grey levels by which a visible stripe point is brighter than without its stripe."""
 
 VISIBLE_LIMIT = 40
-"""Visible stripe points from which on a frame can be expected to be measured."""
+"""Least number of visible stripe points of a frame that should be measured."""
 
 # A stripe is narrower than this share of the picture's width; the glow of the sheets is wider.
 _WIDEST_STRIPE = 1 / 36
@@ -50,12 +50,12 @@ _BEYOND = 1e6
 def stripe_contrast(
     renderer: Renderer, scene: Scene, t: float, radiance: NDArray[np.float32], lit: LitPoints
 ) -> NDArray[np.float32]:
-    """Return by how many grey levels the stripes lift the pixels around them.
+    """Return the contrast of the stripes in grey levels above their surroundings.
 
     Parameters
     ----------
     renderer : Renderer
-        What the scene is rendered with.
+        Renderer of the scene.
     scene : Scene
         With its lasers on.
     t : float
@@ -68,10 +68,10 @@ def stripe_contrast(
     Returns
     -------
     contrast : float32 array, shape (height, width)
-        What the lasers add to the luma (ITU-R BT.601) of the picture without noise, above what
-        they add on the lighter side of it, left and right or above and below, whichever is more
-        (a morphological opening). The glow of the sheets in the water shows no stripe, and neither
-        does a place that daylight saturates. Zero away from lit points.
+        Luma (ITU-R BT.601) that the lasers add to the picture without noise, minus that on the
+        lighter side of the stripe, left and right or above and below, whichever is more (a
+        morphological opening). The glow of the sheets in the water is no stripe, nor is a place
+        that daylight saturates. Zero away from lit points.
     """
     height, width = radiance.shape[:2]
     size = 2 * round(0.5 * _WIDEST_STRIPE * width) + 1
@@ -94,18 +94,18 @@ def _windows(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 def _above_flanks(
     lift: FloatArray, around: BoolArray, window: NDArray[np.uint8]
 ) -> NDArray[np.float64]:
-    """Return how far a picture stands above its opening by a window, where it is known."""
+    """Return the difference of a picture and its opening by a window, where it is known."""
     low = cv2.erode(np.where(around, lift, _BEYOND), window)
     opened = cv2.dilate(np.where(around, low, -_BEYOND), window)
     return np.asarray(lift - opened, dtype=np.float64)
 
 
 def visible_points(lit: LitPoints, label: int, contrast: NDArray[np.float32]) -> IntArray:
-    """Return which lit points are visible stripe points of a target.
+    """Return the indices of lit points that are visible stripe points of a target.
 
-    A stripe has one point in every pixel along it: in every column where it is rather level, in
-    every row where it is rather upright. A point is visible where the contrast at its pixel, or
-    at one beside it, reaches `CONTRAST_LIMIT`.
+    A stripe has one point in every pixel along it: in every column if it is rather level, in every
+    row if it is rather upright. A point is visible if the contrast at its pixel, or at one beside
+    it, reaches `CONTRAST_LIMIT`.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _around(lit: LitPoints, shape: tuple[int, int], size: int) -> BoolArray:
 
 
 def _places(pixels: FloatArray, shape: tuple[int, ...]) -> IntArray:
-    """Return the pixels (x, y) that exact places lie in, within an image of a shape."""
+    """Return the pixels (x, y) of exact places, clipped to an image of a shape."""
     return np.rint(pixels).astype(np.int64).clip(0, [shape[1] - 1, shape[0] - 1])
 
 
@@ -152,7 +152,7 @@ def _one_a_pixel(points: IntArray, pixels: FloatArray) -> IntArray:
 
 
 BENCHMARK_NAME = "aqualvs-bench-1"
-"""Of the set as a whole; the number rises with every change of a definition."""
+"""Name of the set; the number rises with every change of a definition."""
 
 N_FRAMES = 20
 """Frames of every dive."""
@@ -309,7 +309,7 @@ class BenchmarkDive:
     level : str
         One of `LEVELS`.
     scenario : Scenario
-        What is rendered.
+        Scenario to render.
     """
 
     name: str
@@ -323,7 +323,7 @@ class BenchmarkDive:
 
 
 def benchmark_rig() -> Rig:
-    """Return the rig of all dives: the example rig, believed from 0.25 to 1.35 m."""
+    """Return the rig of all dives: the example rig with a working range of 0.25 to 1.35 m."""
     return replace(example_rig(), name=BENCHMARK_NAME, working_range=_WORKING_RANGE)
 
 
@@ -392,7 +392,7 @@ always hold the latter: the axes of a net's twine, without folds. All are empty 
 """
 
 _LABELS = {"net": Label.NET, "wall": Label.WALL, "none": Label.NONE}
-# A laser with fewer points shows no line.
+# Least number of points of a visible laser line.
 _POINTS_OF_A_LINE = 5
 
 Cell: TypeAlias = int | float | str
@@ -401,12 +401,12 @@ Cell: TypeAlias = int | float | str
 def render_benchmark_dive(
     dive: BenchmarkDive, renderer: Renderer, folder: Path, *, tick: Callable[[int], None]
 ) -> None:
-    """Write `dive.mp4`, `truth.csv` and `rig.yaml` into a folder, which is made.
+    """Write `dive.mp4`, `truth.csv` and `rig.yaml` into a new or existing folder.
 
     Parameters
     ----------
     dive : BenchmarkDive
-        What to render.
+        Dive to render.
     renderer : Renderer
         For `benchmark_rig()`.
     folder : Path
@@ -440,7 +440,7 @@ def render_benchmark_dive(
 def render_with_visible(
     renderer: Renderer, scene: Scene, t: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], LitPoints]:
-    """Return the picture of a scene and the stripe points on its target that it truly shows."""
+    """Return the picture of a scene and its visible stripe points on the target."""
     radiance = renderer.radiance(scene, t)
     image = expose(spread(radiance, scene.water, scene.sensor), scene.sensor, rng)
     lit = renderer.lit_points(scene, t)
@@ -475,7 +475,7 @@ def _part(lit: LitPoints, points: NDArray[np.int64]) -> LitPoints:
 
 
 def _posture(plane: Plane) -> list[Cell]:
-    """Range in metres, pitch and yaw in degrees (docs/conventions.md)."""
+    """Return range in metres, pitch and yaw in degrees (docs/conventions.md)."""
     nx, ny, nz = plane.normal.tolist()
     angles = np.rad2deg([np.arctan2(nz, ny), np.arctan2(nx, ny)])
     return [f"{plane.offset:.6f}", *(f"{angle:.5f}" for angle in angles)]

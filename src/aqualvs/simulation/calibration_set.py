@@ -1,4 +1,4 @@
-"""Pictures for a whole calibration, in the folders that a user would have made, with the truth."""
+"""Simulated pictures for a whole calibration, in the folders of a user, with the truth."""
 
 import csv
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetSize:
-    """How many pictures of each kind.
+    """Numbers of pictures of each kind.
 
     Attributes
     ----------
@@ -65,16 +65,16 @@ class SetSize:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFiles:
-    """What `simulate_calibration` wrote.
+    """Files and folders written by `simulate_calibration`.
 
     Attributes
     ----------
     nominal : Path
-        What is known beforehand: name, size of the pictures, dome, number of lasers.
+        Nominal rig: name, size of the pictures, dome, number of lasers.
     camera, dome, box, index : Path
         Folders of pictures.
     board, rail_board, poses, box_file, target : Path
-        What describes their targets: two `board.yaml`, `poses.csv`, `box.yaml`, `target.yaml`.
+        Files of their targets: two `board.yaml`, `poses.csv`, `box.yaml`, `target.yaml`.
     dive, dive_truth : Path or None
         Video of a wall and its truth.
     rig : Path
@@ -137,13 +137,13 @@ class _Job:
         for scene, file in zip(scenes, names, strict=True):
             image = renderer.render(scene, rng, _BETWEEN_STILLS_S * self.done)
             _write_picture(folder / file, image, quality)
-            # Of an earlier set, which another camera took.
+            # Pictures of an earlier set by another camera.
             (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
             self.did_one()
         return names
 
     def with_lasers(self, rig: Rig) -> PanelRenderer:
-        """Return what takes the pictures of a rig with all lasers on."""
+        """Return the renderer of panels for a rig with all lasers on."""
         sheets = panel_sheets(rig, power=_LASER_POWER, filters=self.camera.filters)
         return PanelRenderer(rig.camera(), sheets, eye=self.camera)
 
@@ -163,8 +163,8 @@ def simulate_calibration(
     (`poses.csv` knows distances only, and half of the boards are not quite square), `box/` an open
     box of markers in air with all lasers on, the vehicle's pose unknown, and `index/clip_0/` a
     plate that is fixed on the vehicle, in the rig's water. `dive/` is a wall to measure afterwards.
-    All that a user would not have lies in `truth/`: the rig, and the poses of boards
-    (dome_from_board) and vehicle (box_from_dome).
+    `truth/` holds what a user would not have: the rig, and the poses of boards (dome_from_board)
+    and vehicle (box_from_dome).
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def simulate_calibration(
     out : Path
         Made if it is missing; files of an earlier set in it are overwritten.
     size : SetSize, optional
-        How many pictures.
+        Numbers of pictures.
     progress : callable, optional
         Called after every picture with the number of pictures done and of all.
     seed : int

@@ -1,6 +1,7 @@
-"""Targets of simulated calibration pictures: what is printed, and the files that describe it.
+"""Targets of simulated calibration pictures: prints, files that describe them, and poses.
 
-Where boards and vehicle stand in simulated calibration pictures.
+The poses are of boards before the bare camera and on a rail before the dome, of the vehicle before
+a box of markers, and of a plate in the view.
 """
 
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from aqualvs.yamlfile import TidyDumper
 
 Size = tuple[float, float]
 
-# Where in the picture the middle of the board is, from the top left, in turn.
+# Places of the board's middle in the picture, from the top left, in turn.
 _PLACES = (
     *((0.50, 0.50), (0.25, 0.28), (0.75, 0.30), (0.27, 0.72), (0.74, 0.72), (0.50, 0.25)),
     *((0.48, 0.78), (0.18, 0.50), (0.82, 0.52), (0.38, 0.40), (0.62, 0.60), (0.60, 0.38)),
@@ -38,13 +39,13 @@ _PLACES = (
 _SHARES = (0.78, 0.52, 0.60, 0.48, 0.66, 0.56, 0.50, 0.62)
 # Turn and tilt of the vehicle in the box, in degrees: to the left, upward, clockwise.
 _LOOKS = ((0.0, -3.0, 1.0), (12.0, -9.0, -2.0), (-10.0, -10.0, 2.0), (-3.0, -13.0, -1.0))
-# Middles of the quarters where a plate may be, a little off those of the picture.
+# Middles of the quarters for a plate, slightly off those of the picture.
 _QUARTERS = ((0.24, 0.75), (0.76, 0.75), (0.24, 0.25), (0.76, 0.25))
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> list[SE3]:
-    """Return `dome_from_board` of a board all over a bare camera's picture, most of them tilted.
+    """Return `dome_from_board` of a board all over a bare camera's picture, mostly tilted.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> 
     count : int
         Number of poses.
     rng : Generator
-        Source of chance.
+        Random number generator.
     """
     poses = []
     for k in range(count):
@@ -76,7 +77,7 @@ def board_on_rail(
 ) -> tuple[list[SE3], list[float]]:
     """Return `dome_from_board` of a board that is carried along the dome's y axis.
 
-    Every second one is off square, and rolled, by up to 1.5 degrees; all are shifted a little.
+    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted.
 
     Parameters
     ----------
@@ -85,13 +86,13 @@ def board_on_rail(
     distances : array, shape (N,)
         Of the board's middle, in metres.
     rng : Generator
-        Source of chance.
+        Random number generator.
 
     Returns
     -------
     poses : list of SE3
     measured : list of float
-        Where each board's plane meets the y axis, in metres.
+        Distance along the y axis to each board's plane, in metres.
     """
     poses, measured = [], []
     for k, distance in enumerate(distances):
@@ -118,7 +119,7 @@ def vehicle_in_box(count: int, rng: np.random.Generator) -> list[SE3]:
 
 
 def plate_in_view(rig: Rig, size: Size, far: float) -> SE3:
-    """Return `dome_from_plate` of a plate in that quarter of the view that lasers spare most.
+    """Return `dome_from_plate` of a plate in the quarter of the view farthest from the lasers.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def plate_in_view(rig: Rig, size: Size, far: float) -> SE3:
 
 
 def _clearance(rig: Rig, pose: SE3, size: Size) -> float:
-    """Return how far a rectangle stays off all sheets, in metres; negative where one crosses it."""
+    """Return the distance of a rectangle from all sheets, in metres; negative if one crosses it."""
     corners = pose.apply(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * [*size, 0.0])
     off = np.stack([sheet.signed_distance(corners) for sheet in sheets_of(rig)])
     return float(np.min(np.abs(off.sum(axis=1)) / 4.0 - np.ptp(off, axis=1) / 2.0))
@@ -167,7 +168,7 @@ _DOME_FRAME = "dome (origin at the dome's centre, x right, y forward, z up), mm"
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """A panel with markers, in a frame of its own.
+    """Panel with markers, in a frame of its own.
 
     Attributes
     ----------
@@ -230,7 +231,7 @@ def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Pane
     cell : float
         Side of its 800 x 600 cells, in metres.
     shift : int
-        Another place in the noise.
+        Offset in the noise.
     """
     texture = Texture(mottled((600, 800), 0.26, 0.45, scale=1.6, shift=shift), cell)
     width, height = texture.size
@@ -263,7 +264,7 @@ def marker_box(width_px: int) -> list[Marked]:
 
 
 def _places(cells: int, side: int) -> IntArray:
-    """Return where markers begin along one edge of a wall, evenly and in its middle."""
+    """Return the first cells of markers along one edge of a wall, evenly spaced and centred."""
     pitch = 7 * side // 4
     count = (cells - side - 2 * (side // 6)) // pitch + 1
     first = (cells - side - (count - 1) * pitch) // 2
@@ -308,7 +309,7 @@ def box_mapping(walls: list[Marked], n_outside: float) -> dict[str, Any]:
     """Return the content of a `box.yaml`; the panels are in `box`."""
     planes = {}
     for wall in walls:
-        # Positive along its axis, as one would write it down.
+        # Positive along its axis, as a person would write it.
         normal = np.abs(wall.panel.dome_from_panel.rotation[:, 2])
         offset = float(normal @ wall.panel.dome_from_panel.translation)
         planes[wall.name] = {"normal": normal.tolist(), "d": to_mm(offset)}
@@ -353,5 +354,5 @@ def write_yaml(path: Path, content: dict[str, Any]) -> None:
 
 
 def to_mm(metres: float) -> float:
-    """Return millimetres without the noise of the conversion (a picometre)."""
+    """Return millimetres, rounded to a picometre."""
     return round(1e3 * float(metres), 9) + 0.0

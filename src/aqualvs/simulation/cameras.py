@@ -1,14 +1,13 @@
-"""Cameras by name: what a real one makes of the light, from the lens to the recorded frame.
+"""Simulated cameras by name: processing of the picture, from the lens to the recorded frame.
 
-`ideal` is a camera without faults: daylight as it is, a tone curve, noise, H.264 at high quality.
-The others add what real pictures of laser lines have and rendered ones lack: filters that let a
-green laser into red and blue, cores that clip to cyan and white inside a green halo, a mosaic of
-colours, sharpening, exposure and white balance that drift, and little room in the file.
+`ideal` is a camera without faults: daylight as it is, a tone curve, noise, H.264 at high quality
+(`spread`, `expose`). The others add what real pictures of laser lines have and rendered ones lack:
+filters that let a green laser into red and blue, cores that clip to cyan and white inside a green
+halo, a mosaic of colours, sharpening, exposure and white balance that drift, and a low bit rate.
 
 The order of the steps is that of a camera: lens, exposure, noise, full scale of the pixels, mosaic,
-white balance, colour correction, tone curve, sharpening, chroma, compression.
-
-From the radiance before the lens to the grey levels of the file.
+white balance, colour correction, tone curve, sharpening, chroma, compression. Input is the radiance
+before the lens, output the grey levels of the file.
 """
 
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ from aqualvs.simulation.lasers import COLOUR_BALANCED, LUMA, ColourFilters
 from aqualvs.simulation.scene import Scene, Sensor, Vector, WaterOptics
 from aqualvs.simulation.video import Recording
 
-# The wide halo has no detail: it is computed on a picture so many times smaller.
+# Reduction of the picture on which the wide halo, which has no detail, is computed.
 _SHRINK = 4
 
 
@@ -34,7 +33,7 @@ def spread(
 ) -> NDArray[np.float32]:
     """Blur by the lens, and send the forward-scattered fraction into a wide halo.
 
-    Before saturation, as light does: a stripe far above full scale keeps its broad halo.
+    This is before saturation: a stripe far above full scale keeps its broad halo.
     """
     sharp = radiance
     if sensor.defocus_px > 0.0:
@@ -69,20 +68,20 @@ _CURVE_STEPS = 16383
 
 
 def _tone_curve(gamma: float) -> NDArray[np.uint8]:
-    """Grey level for every one of 2^14 equal steps of radiance."""
+    """Return the grey level for every one of 2^14 equal steps of radiance."""
     linear = np.arange(_CURVE_STEPS + 1) / _CURVE_STEPS
     return np.asarray(np.rint(255.0 * linear ** (1.0 / gamma)), dtype=np.uint8)
 
 
 Rgb = NDArray[np.float32]
 
-# Full scale of the sensor in counts, as its converter has it (12 bits).
+# Full scale of the sensor's converter in counts (12 bits).
 _COUNTS = 4095.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """A control loop that is never quite still: a slow swing and a faster, smaller one.
+    """Drift of a control loop: a slow swing and a faster, smaller one.
 
     Attributes
     ----------
@@ -107,13 +106,13 @@ class Drift:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Development:
-    """What happens between the lens and the recorder of a camera that is not ideal.
+    """Processing between the lens and the recorder of a camera that is not ideal.
 
     Attributes
     ----------
     lamp : (float, float, float)
-        Radiance of a white surface in the light of the camera's own lamps, which lights the whole
-        view evenly: added to the daylight of the water.
+        Radiance of a white surface in the light of the camera's own lamps, which is even over the
+        whole view and added to the daylight of the water.
     defocus_px : float
         Standard deviation of the blur of lens and pixels, in pixels.
     flare : float
@@ -123,11 +122,11 @@ class Development:
     exposure : float
         Mean grey (0 to 1, linear) that automatic exposure aims at.
     gains : (float, float)
-        Least and greatest gain that it sets.
+        Least and greatest gain of automatic exposure.
     exposure_drift, red_drift, blue_drift : Drift
-        How the gain of all and the balance of red and of blue wander.
+        Drift of the overall gain and of the balance of red and of blue.
     white_balance : float
-        How far automatic white balance goes towards a picture whose mean is grey, 0 to 1.
+        Strength of automatic white balance towards a grey mean of the picture, 0 to 1.
     read_noise : float
         Standard deviation in the dark, of full scale at gain 1.
     shot_noise : float
@@ -137,7 +136,7 @@ class Development:
     gamma : float
         Grey level = light**(1 / gamma), before `contrast`.
     contrast : float
-        Strength of an S over that, 0 to 1: darker shadows, lights that reach white earlier.
+        Strength of an S curve over that, 0 to 1: darker shadows, lights that reach white earlier.
     black : float
         Grey level of no light, of full scale.
     sharpening : float
@@ -208,7 +207,7 @@ class Development:
     def _gains(self, raw: Rgb, t: float) -> tuple[float, FloatArray]:
         """Return the gain of all colours and those of red, green and blue, from the mean picture.
 
-        What is far above full scale counts as full scale: a meter sees no more.
+        Light above full scale counts as full scale, as in an exposure meter.
         """
         lit = raw.max(axis=2) > 0.0
         means = np.minimum(raw[lit], 1.0).mean(axis=0) if lit.any() else np.ones(3)
@@ -243,20 +242,20 @@ class Development:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedCamera:
-    """A camera to take simulated pictures with.
+    """Camera for simulated pictures.
 
     Attributes
     ----------
     name : str
-        As `aqualvs simulate --camera` takes it.
+        Name for `aqualvs simulate --camera`.
     about : str
         One line for lists.
     filters : ColourFilters
-        How its sensor answers to daylight and lasers.
+        Response of its sensor to daylight and lasers.
     development : Development or None
-        None takes what the scene says of its sensor, and nothing else.
+        None uses the scene's own `Sensor` only.
     recording : Recording
-        How its videos are compressed.
+        Compression of its videos.
     still_quality : int or None
         JPEG quality (0 to 100) of its single pictures; None writes them as PNG.
     """
@@ -289,15 +288,15 @@ class SimulatedCamera:
         Parameters
         ----------
         radiance : float32 array, shape (height, width, 3)
-            What reaches the lens, rendered with this camera's `filters`.
+            Radiance before the lens, rendered with this camera's `filters`.
         water : WaterOptics
             Its halo.
         sensor : Sensor
-            The scene's; only the ideal camera has it.
+            The scene's; used by the ideal camera only.
         t : float
             Time in seconds.
         rng : Generator, optional
-            Source of noise; none without it.
+            Source of noise; without it there is none.
         """
         if self.development is None:
             return expose(spread(radiance, water, sensor), sensor, rng)

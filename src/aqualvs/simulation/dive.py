@@ -1,9 +1,7 @@
-"""A whole simulated dive on disk: the video and its truth.
+"""A whole simulated dive on disk: video, truth, vehicle log and the truth of a net's holes.
 
-The log of the simulated vehicle, and the truth of a net's holes.
-
-The net hangs plumb and faces `NET_BEARING`, its middle `NET_DEPTH` deep; the vehicle's attitude is
-what the trajectory asks of it.
+For the vehicle log and the holes the net hangs plumb and faces `NET_BEARING`, its middle
+`NET_DEPTH` deep; the attitude of the vehicle follows from the trajectory.
 """
 
 import csv
@@ -27,11 +25,11 @@ from aqualvs.simulation.truth import TRUTH_COLUMNS, LitPoints, truth_row
 from aqualvs.simulation.video import Recording, VideoWriter
 
 NET_BEARING = float(np.deg2rad(65.0))
-"""Compass direction in which one looks at the net, in radians."""
+"""Compass bearing of the view to the net, in radians."""
 NET_DEPTH = 6.0
 """Depth of the scene's origin, in metres."""
 LEAD_S = 20.0
-"""The log begins so long before the dive, and ends so long after it: its clock is not the video's.
+"""Lead of the log before the dive, and its length after it: its clock is not the video's.
 
 Log time = dive time + `LEAD_S`."""
 LOG_COLUMNS = ("time_s", "depth_m", "heading_deg", "roll_deg", "pitch_deg")
@@ -42,7 +40,7 @@ _SIGMA_DEPTH, _SIGMA_ANGLE = 0.005, float(np.deg2rad(0.2))
 
 
 def vehicle_attitude(dome_from_scene: SE3) -> tuple[float, float, float]:
-    """Return heading, roll and pitch in radians, as MAVLink's ATTITUDE has them.
+    """Return heading, roll and pitch in radians, as in MAVLink's ATTITUDE.
 
     Parameters
     ----------
@@ -70,7 +68,7 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
     Raises
     ------
     OSError
-        As the system says it.
+        Error of the system.
     """
     rng = np.random.default_rng([scenario.seed, 23])
     with path.open("w", newline="", encoding="ascii") as file:
@@ -86,7 +84,7 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
 
 
 def write_hole_truth(scenario: Scenario, path: Path) -> None:
-    """Write where the holes of a scenario's nets are.
+    """Write the places of the holes in a scenario's nets.
 
     Parameters
     ----------
@@ -94,12 +92,12 @@ def write_hole_truth(scenario: Scenario, path: Path) -> None:
         With nets.
     path : Path
         A CSV file with `HOLE_COLUMNS`: right and up of the vehicle's foot on the net in the first
-        frame, diameter, depth and bearing, and when the vehicle's foot is nearest.
+        frame, diameter, depth and bearing, and the time at which the vehicle's foot is nearest.
 
     Raises
     ------
     OSError
-        As the system says it.
+        Error of the system.
     """
     times = np.array(list(scenario.times()))
     feet = np.array([_foot(scenario, t) for t in times])
@@ -121,14 +119,14 @@ def _foot(scenario: Scenario, t: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class DiveFiles:
-    """What `simulate_dive` wrote.
+    """Files written by `simulate_dive`.
 
     Attributes
     ----------
     video, truth : Path
         `dive.mp4` and `truth.csv`.
     points : tuple of Path
-        `points_FFFF.npz` for the frames that were asked for.
+        `points_FFFF.npz` of the requested frames.
     n_frames : int
         Frames written.
     """
@@ -158,9 +156,9 @@ def simulate_dive(
     Parameters
     ----------
     scenario : Scenario
-        What to render.
+        Scenario to render.
     rig : Rig
-        With which camera, dome, water and lasers.
+        Camera, dome, water and lasers.
     out_dir : Path
         Made if it is missing; files of an earlier dive in it are overwritten.
     progress : callable, optional
@@ -171,9 +169,9 @@ def simulate_dive(
     camera : SimulatedCamera
         Sensor and processing; see `aqualvs.simulation.cameras`.
     recording : Recording, optional
-        How the video is compressed; as the camera does it by default.
+        Compression of the video; by default the camera's.
     threads : int, optional
-        Cores to render with; all of them by default. The pictures do not depend on it.
+        Number of threads; by default one a core. The pictures do not depend on it.
 
     Raises
     ------

@@ -1,12 +1,14 @@
-"""Line lasers as light sources, and the kernels that say how bright their sheets are.
+"""Line lasers as light sources: irradiance of their sheets, and their colour for a camera.
 
-Wavelengths: how a camera's colour filters and the water answer to a laser's light.
-
-What a camera records of a green laser is a number for each filter, fitted to real pictures of
-laser lines; three Gaussians carry it over to other wavelengths. Real filters are lopsided and
+The camera's record of a green laser is one number for each colour filter, fitted to real pictures
+of laser lines; three Gaussians carry it over to other wavelengths. Real filters are lopsided and
 differ between makers: Jiang, Liu, Gu and Süsstrunk, "What is the space of spectral sensitivity
 functions for digital color cameras?" (WACV 2013), measured 28 cameras, with peaks near 600, 530
-and 460 nm.
+and 460 nm. The water attenuates a laser by the bands red, green and blue, interpolated linearly at
+its wavelength (`band_shares`).
+
+Compiled kernels work on the sheets as tables (`Sheets`): thickness, opening of the fan, distance at
+which a surface ends the light.
 """
 
 from collections.abc import Sequence
@@ -32,7 +34,7 @@ from aqualvs.optics.sheet import (
 from aqualvs.simulation.scene import Vector
 
 GREEN_NM = 532.0
-"""Wavelength of a laser whose rig file tells none: a frequency-doubled Nd:YAG diode."""
+"""Default wavelength of a laser: a frequency-doubled Nd:YAG diode."""
 
 # Middles of the bands red, green and blue, in which scenes and water are described.
 _BANDS_NM = np.array([620.0, GREEN_NM, 460.0])
@@ -43,12 +45,12 @@ LUMA.flags.writeable = False
 
 
 def laser_wavelength_nm(laser: Laser) -> float:
-    """Return the wavelength of a rig's laser in nanometres; `GREEN_NM` if the rig tells none."""
+    """Return the wavelength of a rig's laser in nanometres; `GREEN_NM` if the rig has none."""
     return GREEN_NM if laser.wavelength_nm is None else laser.wavelength_nm
 
 
 def band_shares(wavelength_nm: float) -> FloatArray:
-    """Return the shares (3,) of red, green and blue that water's numbers have in a wavelength's.
+    """Return the weights (3,) of the water's red, green and blue bands at a wavelength.
 
     Linear between the middles of the bands, constant beyond: a laser of 635 nm is dimmed as red.
     """
@@ -58,23 +60,23 @@ def band_shares(wavelength_nm: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColourFilters:
-    """Colour filters of a sensor, and the matrix that the camera makes up for their crosstalk with.
+    """Colour filters of a sensor, and the colour matrix that corrects their crosstalk.
 
     Attributes
     ----------
     at_green : (float, float, float)
-        What the pixels under the red, the green and the blue filter record of a laser of
-        `GREEN_NM`, white light being recorded alike by all three; the green one has 1.
+        Response of the pixels under the red, the green and the blue filter to a laser of
+        `GREEN_NM`, relative to that to white light; the green one has 1.
     saturation : float
-        How much of the colour of daylight is lost to crosstalk between the filters, and put back
-        by the camera's colour matrix: colour minus luma is divided, then multiplied by 1 plus
-        this. Daylight comes out as it was; a laser, whose one wavelength has crosstalk of its own,
-        comes out with less red than was recorded, or with less than none: it darkens red.
+        Loss of the colour of daylight by crosstalk between the filters, restored by the camera's
+        colour matrix: colour minus luma is divided, then multiplied by 1 plus this. Daylight is
+        unchanged; a laser, whose single wavelength has crosstalk of its own, gets less red than
+        was recorded, or a negative amount: it darkens red.
     peak_nm : (float, float, float)
         Middles of the filters in nanometres. Each falls off as a Gaussian.
     width_nm : float
         Standard deviation of the green filter, and of the others on the side away from green; on
-        the side towards green they are as wide as `at_green` asks.
+        the side towards green their width follows from `at_green`.
     """
 
     at_green: Vector = (0.40, 1.0, 0.27)
@@ -84,16 +86,16 @@ class ColourFilters:
 
     @property
     def correcting(self) -> FloatArray:
-        """Matrix (3, 3) from what is recorded, with white balanced, to red, green and blue."""
+        """Matrix (3, 3) from recorded values, white balanced, to red, green and blue."""
         return (1.0 + self.saturation) * np.eye(3) - self.saturation * np.tile(LUMA, (3, 1))
 
     @property
     def crosstalk(self) -> FloatArray:
-        """Matrix (3, 3) from red, green and blue of a scene to what is recorded of them."""
+        """Matrix (3, 3) from red, green and blue of a scene to recorded values."""
         return np.asarray(np.linalg.inv(self.correcting))
 
     def recorded(self, wavelength_nm: float) -> FloatArray:
-        """Return what is recorded of a laser's light under the three filters, shape (3,)."""
+        """Return the recorded values (3,) of a laser's light under the three filters."""
         if wavelength_nm == GREEN_NM:
             return np.array(self.at_green)
         off = wavelength_nm - np.array(self.peak_nm)
@@ -105,7 +107,7 @@ class ColourFilters:
         return np.asarray(seen)
 
     def laser_colour(self, wavelength_nm: float) -> FloatArray:
-        """Return the red, green and blue (3,) that a scene must hold to be recorded so."""
+        """Return the red, green and blue (3,) of a laser in a scene."""
         return np.asarray(self.correcting @ self.recorded(wavelength_nm))
 
 
@@ -115,24 +117,24 @@ COLOUR_BALANCED = ColourFilters()
 
 # Columns of the sheet table.
 SOURCE, NORMAL, CENTRE, SIDE, SIGMA, DIVERGENCE, POWER, REACH = 0, 3, 6, 9, 12, 13, 14, 15
-# What the camera records of the light, and by which of the water's three bands it is dimmed.
+# Colour of the light for the camera, and weights of the water's three bands in its attenuation.
 COLOUR, BANDS = 16, 19
 _COLUMNS = 22
 # `LaserSource.power` is stated at this distance.
 _REFERENCE = 0.5
-# Beyond so many sigma a sheet is dark.
+# Half thickness of a sheet, in sigmas, beyond which it is dark.
 CUT = 4.0
 N_FAN = 3001
 # The fan's edge rolls off over this angle.
 _EDGE = np.deg2rad(0.8)
 _ON_PLANE = 1e-6
-# The light's way to a point is at most so many times as long as the straight line.
+# Greatest ratio of the light's way to the straight line.
 _BENT_WAY = 1.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaserSource:
-    """Where a laser sheet comes from and how its light is spread.
+    """Source of a laser sheet: place, direction and distribution of its light.
 
     Attributes
     ----------
@@ -151,7 +153,7 @@ class LaserSource:
         Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the
         source, in clear water.
     wavelength_nm : float
-        In nanometres; the camera's colour filters and the water answer to it.
+        In nanometres; decides the response of the colour filters and the attenuation by the water.
     """
 
     position: FloatArray
@@ -175,10 +177,10 @@ class Sheets(NamedTuple):
     first : array, shape (n, N_FAN)
         Distance from the source at which the sheet's middle meets a surface; infinite where none.
     optics : array, shape (n, COLUMNS)
-        The sheets as kernels of `aqualvs.optics.sheet` take them.
+        The sheets for the kernels of `aqualvs.optics.sheet`.
     stray : array, shape (n, 2)
-        How far at most a bent sheet lies off the plane near it: metres at the window, and metres
-        for every metre from the source.
+        Greatest distance of a bent sheet from the plane near it: metres at the window, and
+        metres for every metre from the source.
     """
 
     table: FloatArray
@@ -194,9 +196,9 @@ def default_sources(rig: Rig) -> tuple[LaserSource, ...]:
 
 
 def _source_on(laser: Laser, rig: Rig) -> LaserSource:
-    """Lead from the plane's point nearest to the dome back to 10 mm before the dome's centre.
+    """Return a source on the plane, near the dome, 10 mm before the dome's centre.
 
-    Behind a window the source is where the rig says.
+    Behind a window it is the rig's source.
     """
     wavelength_nm = laser_wavelength_nm(laser)
     normal = laser.plane.normal
@@ -227,7 +229,7 @@ def pack_sheets(
     ------
     RigError
         If there is not one source for every laser, or a source is off its laser's plane or not
-        where its laser's window says.
+        that of its laser's window.
     """
     lasers, sheets = rig.lasers, sheets_of(rig)
     if len(sources) != len(lasers):
@@ -276,12 +278,12 @@ def _pack_sheet(
 
 
 class FanRays(NamedTuple):
-    """The rays in a sheet's middle, as they are in the water.
+    """Rays in a sheet's middle, in the water.
 
     Attributes
     ----------
     origins, directions : array, shape (N_FAN, 3)
-        Where they enter the water, or leave the source where there is no window; unit directions.
+        Points of entry into the water, or the source without a window; unit directions.
     way : array, shape (N_FAN,)
         Length of the light's way from the source to there.
     """
@@ -292,7 +294,7 @@ class FanRays(NamedTuple):
 
 
 def fan_rays(rig: Rig, sheets: Sheets, i: int) -> FanRays:
-    """Return the rays in a sheet's middle; NaN where light does not pass the window."""
+    """Return the rays in a sheet's middle; NaN if the light does not pass the window."""
     directions = _fan_directions(sheets, i)
     sheet = sheet_in(rig.lasers[i], rig.n_air, rig.n_water)
     if sheet.is_plane:
@@ -326,7 +328,7 @@ def sheet_coordinates(p: Vec, sheets: Sheets, i: int) -> tuple[float, float, flo
         wide = CUT * (table[i, SIGMA] + table[i, DIVERGENCE] * reach)
         wide += sheets.stray[i, 0] + _BENT_WAY * sheets.stray[i, 1] * reach
         start = row3(sheets.optics, i, START)
-        # Few points are near a sheet, and a dot product says so sooner than Snell's law.
+        # Few points are near a sheet: a dot product rejects the others faster than Snell's law.
         if abs(dot(p, start) - sheets.optics[i, START + 3]) > wide:
             return off, 0.0, -1.0, 1.0
         off, rel, above = through_window(p, sheets, i)
@@ -347,7 +349,7 @@ def sheet_coordinates(p: Vec, sheets: Sheets, i: int) -> tuple[float, float, flo
 def through_window(p: Vec, sheets: Sheets, i: int) -> tuple[float, Vec, float]:
     """Return distance off a bent sheet, the way from the source to its window, height above that.
 
-    The way is that of the light which reaches the point; it exists where the height is positive.
+    The way is that of the light that reaches the point; it exists if the height is positive.
     """
     off, x, y, z, above = crossing(sheets.optics[i], p[0], p[1], p[2])
     return off, (x, y, z), above
@@ -369,13 +371,13 @@ def peak_irradiance(
 
 @inline_borrowing_kernel
 def laser_attenuation(attenuation: Vec, sheets: Sheets, i: int) -> float:
-    """Return how a sheet's light is dimmed per metre, from what the water does to three bands."""
+    """Return the attenuation of a sheet's light per metre, from that of the three bands."""
     return dot(row3(sheets.table, i, BANDS), attenuation)
 
 
 @inline_borrowing_kernel
 def add_colour(seen: Vec, light: float, sheets: Sheets, i: int) -> Vec:
-    """Return red, green and blue with some more of a sheet's light."""
+    """Return red, green and blue with a sheet's light added."""
     return along(seen, row3(sheets.table, i, COLOUR), light)
 
 

@@ -1,4 +1,4 @@
-"""Fish nets: rays against twine.
+"""Fish nets: intersection of rays with twine, on flat, bulging or folded nets.
 
 The axes of the strands lie in the net plane (or in its bulging or folded surface, where the
 tangent plane at the crossing stands in for it). A ray that crosses the plane beside an axis at
@@ -6,7 +6,8 @@ lateral distance w meets that strand's cylinder where, in the cross-section of t
 (w + q tau)² + (z tau)² = r²; only the nearest strand of each family can be met, because the
 distance from an axis is w times the same cosine for all of them.
 
-Folds and slack: a height over a net's surface, and where rays cross it.
+Folds and slack are a height over the net's surface (`folded`); their crossing with a ray is found
+by stepping and bisection.
 """
 
 import math
@@ -76,7 +77,7 @@ def folded(u: float, v: float, folds: FloatArray, i: int) -> tuple[float, float,
 
 @inline_borrowing_kernel
 def fold_limits(folds: FloatArray, i: int) -> tuple[float, float, float]:
-    """Return what folds of net i can add at most: lowest (0 or less), highest, steepest slope."""
+    """Return the limits of the folds of net i: lowest (0 or less), highest, steepest slope."""
     low, high, steepest = 0.0, 0.0, 0.0
     for k in range(folds.shape[0]):
         if folds[k, NET] == i:
@@ -91,22 +92,22 @@ KAPPA_U, KAPPA_V, IS_HEXAGON, BAR, RADIUS, FOULING, GROWTH, MISSING = range(12, 
 SEED, HALF_U, HALF_V, OFFSET_U, OFFSET_V, FAMILIES, DIRECTIONS = range(20, 27)
 SPACING, ALBEDO, NET_COLUMNS = 32, 35, 38
 
-# Helix of the twine: a ply comes to the front every so many radii, and how deep its grooves are.
+# Helix of the twine: spacing of the plies along it, in radii, and depth of the grooves.
 _LAY = 2.2
 _GROOVE = 0.07
-# A knot (or a joint of knotless netting) is so much thicker than the twine.
+# Extra thickness of a knot (or a joint of knotless netting), relative to the twine.
 _KNOT = 0.45
 _GROWTH_ALBEDO = (0.42, 0.46, 0.26)
-# Least step along a ray that looks for a folded net, and halvings of the step that finds it.
+# Least step along a ray towards a folded net, and number of bisections of the last step.
 _STEP = 1e-3
 _MOST_STEPS = 200
 _HALVINGS = 16
-# A ray passes so many layers of a folded net before it is given up.
+# Greatest number of layers of a folded net along a ray.
 _MOST_LAYERS = 5
 
 
 class Strand(NamedTuple):
-    """Where a ray meets a strand.
+    """Intersection of a ray with a strand.
 
     Attributes
     ----------
@@ -151,7 +152,7 @@ def pack_net(net: Net, dome_from_scene: SE3) -> FloatArray:
 
 
 def _families(net: Net) -> tuple[list[float], float]:
-    """Direction of every family of parallel strands, and the distance between its axes."""
+    """Return the direction of every family of parallel strands, and the distance of its axes."""
     if net.mesh == "square":
         return [net.roll, net.roll + np.pi / 2.0], net.bar
     if net.mesh == "diamond":
@@ -182,7 +183,7 @@ def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int, lift: float) -> float:
 
 @inline_borrowing_kernel
 def _behind(o: Vec, d: Vec, t: float, nets: FloatArray, i: int, folds: FloatArray) -> float:
-    """Return how far a place on a ray is behind the folded net, along the net's normal."""
+    """Return the distance of a place on a ray behind the folded net, along the net's normal."""
     rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
     u, v = dot(rel, row3(nets, i, AXIS_U)), dot(rel, row3(nets, i, AXIS_V))
     bulge = 0.5 * (nets[i, KAPPA_U] * u * u + nets[i, KAPPA_V] * v * v)
@@ -193,7 +194,7 @@ def _behind(o: Vec, d: Vec, t: float, nets: FloatArray, i: int, folds: FloatArra
 def _next_crossing(
     o: Vec, d: Vec, nets: FloatArray, i: int, folds: FloatArray, begin: float
 ) -> float:
-    """Return where a ray crosses the net next after `begin`; infinite where it does not."""
+    """Return the next crossing of a ray with the net after `begin`; infinite if there is none."""
     low, high, steepest = fold_limits(folds, i)
     if low == 0.0 and high == 0.0:
         t = _crossing(o, d, nets, i, 0.0)
@@ -203,7 +204,7 @@ def _next_crossing(
     end = max(first, last) + _STEP
     if not end < 1e6:
         return np.inf
-    # No place is nearer to the net along the ray than its height over it allows.
+    # The height over the net limits the distance to it along the ray from below.
     share = 1.0 / (1.5 + steepest)
     side = _behind(o, d, t, nets, i, folds)
     for _ in range(_MOST_STEPS):
@@ -228,7 +229,7 @@ def _halved(
     i: int,
     folds: FloatArray,
 ) -> float:
-    """Return where a ray changes sides between two places: from there on it is on the other."""
+    """Return by bisection where a ray changes sides of the net between two places."""
     for _ in range(_HALVINGS):
         middle = 0.5 * (before + after)
         if side * _behind(o, d, middle, nets, i, folds) > 0.0:
@@ -303,7 +304,7 @@ def _nearest_axis(
 def _profile(
     place: float, knot: float, u: float, v: float, nets: FloatArray, i: int, tiles: Tiles
 ) -> tuple[float, float]:
-    """Return the strand's local radius and how much of it is growth, in clean radii."""
+    """Return the strand's local radius and the growth's part of it, in clean radii."""
     r = nets[i, RADIUS]
     phase = 2.0 * np.pi * place / (_LAY * r)
     swell = _KNOT * np.exp(-((knot / (1.6 * r)) ** 2))
@@ -322,7 +323,7 @@ def _profile(
 
 @inline_borrowing_kernel
 def _cylinder(w: float, q: float, z: float, r: float) -> float:
-    """First root of (w + q tau)² + (z tau)² = r²; infinite where there is none."""
+    """Return the first root of (w + q tau)² + (z tau)² = r²; infinite if there is none."""
     a = q * q + z * z
     half_b = w * q
     disc = half_b * half_b - a * (w * w - r * r)
@@ -381,7 +382,7 @@ def _meet_layer(
     for k in range(int(nets[i, FAMILIES])):
         w, place, knot, line, bar = _nearest_axis(u, v, nets, i, k, cell)
         c, s = nets[i, DIRECTIONS + 2 * k], nets[i, DIRECTIONS + 2 * k + 1]
-        # The strand runs in the fold's flank, and so does what is beside it; bulges are gentle.
+        # The strand and its neighbourhood follow the fold's flank; bulges are gentle.
         strand = unit(combine(eu, c, ev, s, out, c * slope_u + s * slope_v))
         side = cross(strand, flank)
         w *= dot(combine(eu, -s, ev, c, out, c * slope_v - s * slope_u), side)

@@ -1,4 +1,4 @@
-"""A net that moves: flat or part of a cage, where it is, how a vehicle stands to it, how it looks.
+"""A moving net, flat or part of a cage: its pose over time, posture of a vehicle to it, its scene.
 
 Frames: `world` is north, east, down. `net` is fixed to the net: its origin in the middle, x right
 and z up as a vehicle before the middle sees them, y away from the vehicle; it is the frame `scene`
@@ -25,7 +25,7 @@ _EDGES = np.array([(i, i + step) for step in (1, 2, 4) for i in range(8) if not 
 
 
 class NetPosture(NamedTuple):
-    """How a vehicle stands to the net in truth; see docs/conventions.md.
+    """True posture of a vehicle to the net; see docs/conventions.md.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class NetPosture(NamedTuple):
     pitch, yaw : float
         Of the tangent plane at that point, in radians.
     along, up : float
-        Where that point is on the net, in metres: along it to the right, and up.
+        Place of that point on the net, in metres: along it to the right, and up.
     """
 
     range: float
@@ -46,14 +46,14 @@ class NetPosture(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetWall:
-    """An upright net, flat or an upright cylinder, that sways, drifts and tilts as a whole.
+    """Upright net, flat or an upright cylinder, that sways, drifts and tilts as a whole.
 
     Attributes
     ----------
     position : (float, float, float)
         Middle of the net at rest, in the world, in metres.
     bearing : float
-        Direction in which one looks at the middle, in radians clockwise from north.
+        Viewing direction to the middle, in radians clockwise from north.
     curvature : float
         In 1/m: 0 is flat, positive a cage seen from outside (it recedes to both sides), negative
         one seen from inside.
@@ -102,8 +102,8 @@ class NetWall:
     def posture_at(self, world_from_dome: SE3, time_s: float) -> NetPosture:
         """Return the true posture of a vehicle, as `aqualvs.scanning.posture` defines it.
 
-        Range, pitch and yaw are those of the tangent plane at the nearest point; for a flat net
-        that is the net.
+        Range, pitch and yaw are those of the tangent plane at the nearest point, which is the
+        net itself if it is flat.
 
         Parameters
         ----------
@@ -150,12 +150,12 @@ class NetWall:
         return float(np.linalg.norm(start + share[:, None] * way, axis=1).min()) - radius
 
     def scene_at(self, world_from_dome: SE3, time_s: float, base: Scene) -> Scene:
-        """Return what a vehicle sees, for the renderer.
+        """Return the scene before a vehicle, for the renderer.
 
         Before a flat net the scene stays in place. A curved net is rendered as the paraboloid that
-        touches the cylinder where it is nearest, with the mesh, holes and folds of that place; it
+        touches the cylinder at the nearest point, with the mesh, holes and folds of that place; it
         leaves the cylinder by u⁴/(8 R³) at a distance u, and its mesh is stretched by u³/(6 R²).
-        The stains on a wall behind a curved net go along with the vehicle.
+        The stains on a wall behind a curved net move with the vehicle.
 
         Parameters
         ----------
@@ -164,8 +164,8 @@ class NetWall:
         time_s : float
             Time in seconds; render the scene at the same.
         base : Scene
-            What there is, in the frame of the net at rest; holes and folds of nets count along it
-            and up. Its `dome_from_scene` is not used.
+            Scene in the frame of the net at rest; holes and folds of nets are placed along it and
+            up. Its `dome_from_scene` is not used.
 
         Raises
         ------
@@ -208,7 +208,7 @@ class NetWall:
         distance : float
             From the nearest point, in metres.
         along, up : float
-            Where that point is on the net, in metres.
+            Place of that point on the net, in metres.
         yaw : float
             As `Posture.yaw`, in radians.
         time_s : float
@@ -232,7 +232,7 @@ class NetWall:
         return SE3(np.array([[-s, c, 0.0], [c, s, 0.0], [0.0, 0.0, -1.0]]), place)
 
     def _nearest(self, p: FloatArray) -> tuple[float, float]:
-        """Return where the nearest point is along the net, and its signed distance."""
+        """Return the place of the nearest point along the net, and its signed distance."""
         k = self.curvature
         if k == 0.0:
             return float(p[0]), -float(p[1])
@@ -273,7 +273,7 @@ def _sine(time_s: float, period: float, phase: float) -> float:
 
 
 def _slid(net: Net, along: float, up: float, curvature: float) -> Net:
-    """Return a net as it is around a place on it."""
+    """Return a net moved to a place on it."""
     return replace(
         net,
         curvature=(curvature, 0.0),

@@ -2,11 +2,9 @@
 
 A panel is a rectangle anywhere in `dome` with a texture on it. Every pixel's corners are traced
 through the housing once; rays inside a pixel are interpolated between them, as in
-`aqualvs.simulation.render`. A ray takes the mean of the texture over its own share of the pixel,
-exactly (the sum of a grid of cells over a rectangle is bilinear in its corners), so that no
-aliasing pulls an edge to one side.
-
-What a ray through a pixel brings home from printed panels, in compiled kernels.
+`aqualvs.simulation.render`. Compiled kernels give a ray the exact mean of the texture over its own
+share of the pixel (the sum of a grid of cells over a rectangle is bilinear in its corners), so that
+no aliasing shifts an edge.
 """
 
 from collections.abc import Sequence
@@ -43,7 +41,7 @@ _ZERO = (0.0, 0.0, 0.0)
 # Columns of the panel table.
 _ORIGIN, _RIGHT, _DOWN, _INTO = 0, 3, 6, 9
 COLUMNS = 12
-# A laser's light that ends nearer to a panel than this share of its way has met it there.
+# A laser's light that ends within this share of its way from a panel has met it there.
 _AT_END = 1e-6
 
 
@@ -59,7 +57,7 @@ class PanelTables(NamedTuple):
     shape : int array, shape (P, 2)
         Rows and columns.
     start : int array, shape (P,)
-        Where each panel's part of `sums` begins.
+        Start of each panel's part of `sums`.
     sums : array
         Sums of albedo, one panel after another.
 
@@ -83,7 +81,7 @@ class CornerRays(NamedTuple):
 
 
 class Lamp(NamedTuple):
-    """Place in `dome`, radiance of white that faces it, and how much of that it gives itself."""
+    """Lamp: place in `dome`, radiance of white that faces it, and the lamp's share of that."""
 
     place: Vec
     level: float
@@ -132,7 +130,7 @@ def _radiance(
     sheets: Sheets,
     lamp: Lamp,
 ) -> tuple[float, float]:
-    """Return room light and laser light that come along a ray, `step` pixels wide."""
+    """Return room light and laser light along a ray, `step` pixels wide."""
     o, d = _ray(rays, row, column, x, y)
     i, t = _nearest(o, d, panels)
     if i < 0:
@@ -168,7 +166,7 @@ def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> 
 
 @inline_borrowing_kernel
 def _meet(o: Vec, d: Vec, panels: PanelTables, i: int) -> float:
-    """Return how far along a ray a panel's plane is; infinite or NaN where it is parallel."""
+    """Return the distance to a panel's plane along a ray; infinite or NaN if parallel."""
     into = row3(panels.frames, i, _INTO)
     return dot(minus(row3(panels.frames, i, _ORIGIN), o), into) / dot(d, into)
 
@@ -192,7 +190,7 @@ def _covers(p: Vec, panels: PanelTables, i: int) -> bool:
 
 @inline_borrowing_kernel
 def _nearest(o: Vec, d: Vec, panels: PanelTables) -> tuple[int, float]:
-    """Return the first panel that a ray meets and how far off; -1 where none."""
+    """Return the first panel that a ray meets and its distance; -1 if none."""
     best, where = -1, np.inf
     for i in range(panels.frames.shape[0]):
         t = _meet(o, d, panels, i)
@@ -213,7 +211,7 @@ def _shift(
     u: float,
     v: float,
 ) -> tuple[float, float]:
-    """Return how many cells from (u, v) a neighbouring ray meets the panel's plane."""
+    """Return the offset from (u, v), in cells, of a neighbouring ray on the panel's plane."""
     o, d = _ray(rays, row, column, x, y)
     near = _cell_of(along(o, d, _meet(o, d, panels, i)), panels, i)
     return near[0] - u, near[1] - v
@@ -221,9 +219,9 @@ def _shift(
 
 @inline_borrowing_kernel
 def _mean(panels: PanelTables, i: int, u: float, v: float, half_u: float, half_v: float) -> float:
-    """Return the mean albedo over a rectangle around (u, v), as far as it lies on the panel."""
+    """Return the mean albedo over the part of a rectangle around (u, v) on the panel."""
     rows, columns = panels.shape[i]
-    # A rectangle of no size would divide nothing by nothing.
+    # Avoid 0 / 0 for a rectangle without area.
     half_u, half_v = max(half_u, 1e-6), max(half_v, 1e-6)
     left, right = max(u - half_u, 0.0), min(u + half_u, float(columns))
     top, low = max(v - half_v, 0.0), min(v + half_v, float(rows))
@@ -234,7 +232,7 @@ def _mean(panels: PanelTables, i: int, u: float, v: float, half_u: float, half_v
 
 @inline_borrowing_kernel
 def _sum_to(panels: PanelTables, i: int, u: float, v: float) -> float:
-    """Return the sum of the albedo over all that is left of u and above v."""
+    """Return the sum of the albedo left of u and above v."""
     rows, columns = panels.shape[i]
     c, r = min(int(u), columns - 1), min(int(v), rows - 1)
     a, b = u - c, v - r
@@ -282,7 +280,7 @@ class Panel:
         Of the frame with x to the right, y down, z into the panel and its origin at the outer
         corner of the top-left cell.
     texture : Texture
-        What is printed; from behind it is seen through, mirrored.
+        The print; from behind it is seen mirrored.
     """
 
     dome_from_panel: SE3
@@ -291,7 +289,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoomLight:
-    """Light that is on besides the lasers: even, and some more from a lamp far behind the camera.
+    """Light besides the lasers: an even part, and that of a lamp far behind the camera.
 
     Attributes
     ----------
@@ -316,12 +314,12 @@ class RoomLight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PanelScene:
-    """What is in front of the camera.
+    """Scene of panels in front of the camera.
 
     Attributes
     ----------
     panels : sequence of Panel
-        Where several meet a ray, the nearest is seen.
+        The nearest one on a ray is seen.
     light : RoomLight
         Light besides the lasers.
     sensor : Sensor
@@ -335,14 +333,14 @@ class PanelScene:
 
 @dataclass(slots=True)
 class PanelRenderer:
-    """Renders panels as one camera sees them.
+    """Renderer of panels for one camera.
 
     Attributes
     ----------
     camera : Camera
-        Behind its dome, in whatever medium it is, or bare.
+        Behind its dome, in any medium, or bare.
     sheets : Sheets or None
-        The lasers, see `panel_sheets`; None leaves them off.
+        The lasers, see `panel_sheets`; None switches them off.
     samples : int
         Rays along each side of a pixel.
     eye : SimulatedCamera
@@ -374,10 +372,10 @@ class PanelRenderer:
         return self.eye.picture(self.radiance(scene), clear, scene.sensor, t, rng)
 
     def radiance(self, scene: PanelScene) -> NDArray[np.float32]:
-        """Return what reaches the lens, float32 (height, width, 3), before blur and saturation.
+        """Return the radiance at the lens, float32 (height, width, 3), before blur.
 
-        1 is the sensor's full scale at gain 1; black where a ray meets no panel, or where the lens
-        model or the housing lets no light through.
+        It is not clipped: 1 is the sensor's full scale at gain 1. Black where a ray meets no
+        panel, or the lens model or the housing lets no light through.
         """
         if not scene.panels:
             raise OptionError("a picture of no panels; give one at least")

@@ -1,12 +1,12 @@
-"""Pictures of a scene as the rig's camera takes them.
+"""Renderer of a scene as the rig's camera takes it.
 
 Every pixel's corners are traced through the housing once; rays inside a pixel are interpolated
 between its four corners (the housing bends them by less than 1e-6 px from that inside a pixel),
-so any number of them costs no further refraction.
+so any number of them costs no further refraction. The picture is divided into tiles; each tile
+lists the ellipsoids and bubbles that it can show, and rays try only those (`tile_members`).
 
-Marine snow: particles that drift before the camera and flash where a laser sheet meets them.
-
-Which small things each part of the image can show, so that other rays need not try them.
+Marine snow is added after that: particles that drift before the camera and light up where a laser
+sheet meets them (`add_snow`).
 """
 
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ def add_snow(
 
 
 def _particles(count: int, t: float) -> tuple[FloatArray, FloatArray]:
-    """Positions and radii; each particle keeps its own drift through all frames."""
+    """Return positions and radii; each particle keeps its own drift through all frames."""
     rng = np.random.default_rng(20210126)
     start = rng.random((count, 3))
     own = 1.0 + 0.6 * rng.standard_normal((count, 3))
@@ -75,7 +75,7 @@ def _before_target(points: FloatArray, scene: Scene) -> BoolArray:
 
 
 def _pixels_per_radian(camera: Camera) -> float:
-    """Scale in the middle of the image, from two neighbouring rays."""
+    """Return the scale in the middle of the image, from two neighbouring rays."""
     width, height = camera.size_px
     pair = np.array([[width / 2.0, height / 2.0], [width / 2.0 + 1.0, height / 2.0]])
     directions = camera.rays(pair).directions
@@ -85,7 +85,7 @@ def _pixels_per_radian(camera: Camera) -> float:
 def _splat(
     radiance: NDArray[np.float32], pixel: FloatArray, size: float, light: FloatArray
 ) -> None:
-    """Add a round blob that keeps the particle's light when it is smaller than a pixel."""
+    """Add a round blob that keeps the light of particles smaller than a pixel."""
     sigma = max(0.6 * size, _SMALLEST_PX)
     half = int(np.ceil(3.0 * sigma))
     x0, y0 = (int(value) for value in np.rint(pixel))
@@ -102,25 +102,25 @@ def _splat(
     )
 
 
-# Side of a square part of the image, in pixels.
+# Side of a tile, in pixels.
 TILE = 32
-# The outline of a sphere is sampled at points of a box around it; this covers what lies between.
+# Margin of the outline of a sphere, which is sampled at points of a box around it.
 _MARGIN_PX = 4.0
-# A thing this far off, in metres, that cannot be projected anywhere is out of sight.
+# Distance, in metres, beyond which a body that cannot be projected is out of sight.
 _NEAR = 0.2
 
 
 class TileMembers(NamedTuple):
-    """Rows of the tables that each tile can show, as one list with its starts.
+    """Rows of the tables that each tile can show, as one array with the start of each tile.
 
     Attributes
     ----------
     n_columns : int
-        Tiles beside each other.
+        Number of tiles in a row.
     ellipsoids, bubbles : int arrays
         Rows, tile after tile.
     ellipsoid_start, bubble_start : int arrays, shape (n_tiles + 1,)
-        Where each tile's part begins.
+        Start of each tile's part.
     """
 
     n_columns: int
@@ -131,10 +131,10 @@ class TileMembers(NamedTuple):
 
 
 def tile_members(camera: Camera, size_px: tuple[int, int], surfaces: Surfaces) -> TileMembers:
-    """List for every tile the ellipsoids and bubbles whose outline can reach it.
+    """Return for every tile the ellipsoids and bubbles whose outline can reach it.
 
-    A thing that can be projected in part only (near the dome, or at the edge of the lens model)
-    is listed everywhere: the answer may be slow but is never wrong.
+    A body that can be projected in part only (near the dome, or at the edge of the lens model) is
+    listed everywhere: slower, but never wrong.
     """
     columns, rows = (-(-side // TILE) for side in size_px)
     e, b = surfaces.ellipsoids, surfaces.bubbles
@@ -186,7 +186,7 @@ class Picture:
     image : uint8 array, shape (height, width, 3)
         Red, green, blue.
     lit : LitPoints
-        Where the middles of the laser sheets meet surfaces that the camera sees.
+        Points where the middles of the laser sheets meet surfaces that the camera sees.
     """
 
     image: NDArray[np.uint8]
@@ -195,7 +195,7 @@ class Picture:
 
 @dataclass(slots=True)
 class Renderer:
-    """Renders scenes for one rig in one water.
+    """Renderer of scenes for one rig in one water.
 
     Attributes
     ----------
@@ -206,9 +206,9 @@ class Renderer:
     samples : int
         Rays along each side of a pixel: 2 means four rays a pixel.
     threads : int
-        Bands of rows that are rendered at the same time; the picture does not depend on it.
+        Number of bands of rows rendered in parallel; the picture does not depend on it.
     camera : SimulatedCamera
-        Sensor and processing; where the lens is, the rig says.
+        Sensor and processing; the rig has the place of the lens.
 
     Raises
     ------
@@ -231,7 +231,7 @@ class Renderer:
     def render(
         self, scene: Scene, t: float = 0.0, rng: np.random.Generator | None = None
     ) -> Picture:
-        """Return the picture at time `t` and its truth; without `rng` there is no noise."""
+        """Return the picture at time `t` and its truth; without `rng` it has no noise."""
         surfaces, sheets = self._pack(scene, t)
         light = self._radiance(scene, t, surfaces, sheets)
         image = self.camera.picture(light, scene.water, scene.sensor, t, rng)
@@ -240,7 +240,7 @@ class Renderer:
     def radiance(
         self, scene: Scene, t: float = 0.0, where: BoolArray | None = None
     ) -> NDArray[np.float32]:
-        """Return what reaches the lens at time `t`, before blur, noise and saturation.
+        """Return the radiance at the lens at time `t`, before blur, noise and saturation.
 
         Parameters
         ----------
@@ -249,7 +249,7 @@ class Renderer:
         t : float
             In seconds.
         where : bool array, shape (height, width), optional
-            Pixels that must be traced; others may lack all light but that of marine snow.
+            Pixels to be traced; others may lack all light except that of marine snow.
 
         Returns
         -------
@@ -304,7 +304,7 @@ class CornerRays(NamedTuple):
     valid: BoolArray
 
     def only(self, where: BoolArray) -> "CornerRays":
-        """Return the same rays, invalid but at the corners of some pixels (height, width)."""
+        """Return the same rays, valid only at the corners of some pixels (height, width)."""
         wanted = np.zeros_like(self.valid)
         for rows in (slice(None, -1), slice(1, None)):
             for columns in (slice(None, -1), slice(1, None)):
@@ -324,7 +324,7 @@ def corner_rays(rig: Rig) -> CornerRays:
 
 @inline_borrowing_kernel
 def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> Vec:
-    """Bilinear value between the corners of a pixel, x and y in 0..1."""
+    """Return the bilinear value between the corners of a pixel, x and y in 0..1."""
     top = combine(
         row3(corners[row], column, 0), 1.0 - x, row3(corners[row], column + 1, 0), x, _ZERO, 0.0
     )

@@ -1,10 +1,8 @@
-"""A scenario: what is before the vehicle and how the vehicle moves, over the time of a dive.
+"""Scenarios: the scene before the vehicle and the vehicle's motion over the time of a dive.
 
-Fish and bubbles at random, so placed that the camera meets them.
-
-How the vehicle moves before its target: smooth functions of time.
-
-Scenario files: short YAML with the unit in every key.
+The posture follows smooth functions of time (`Course`, `Trajectory`). Fish and bubbles are placed
+at random such that the camera meets them. A scenario file is short YAML with the unit in every key
+(`read_scenario`).
 """
 
 import difflib
@@ -42,18 +40,18 @@ _SIDE, _HEIGHT = 0.20, 0.13
 def random_fish(
     rng: np.random.Generator, count: int, duration: float, behind: float
 ) -> tuple[Fish, ...]:
-    """Return fish that cross the view some time in the dive.
+    """Return fish that cross the view at some time of the dive.
 
     Parameters
     ----------
     rng : Generator
-        Source of chance.
+        Random number generator.
     count : int
-        How many.
+        Number of fish.
     duration : float
         Of the dive, in seconds.
     behind : float
-        Room behind the target plane, in metres; fish keep clear of a wall there.
+        Free room behind the target plane, in metres, for example before a wall.
     """
     return tuple(_fish(rng, duration, behind) for _ in range(count))
 
@@ -76,7 +74,7 @@ def _fish(rng: np.random.Generator, duration: float, behind: float) -> Fish:
 def random_bubbles(
     rng: np.random.Generator, count: int, duration: float, behind: float
 ) -> tuple[Bubble, ...]:
-    """Return bubbles that rise through the view some time in the dive.
+    """Return bubbles that rise through the view at some time of the dive.
 
     Parameters
     ----------
@@ -118,8 +116,8 @@ def dome_from_target(
     Returns
     -------
     SE3
-        y of the target frame is n; its z is as near to the dome's z as that allows; without slide
-        its origin is the foot of the perpendicular from the dome's centre.
+        y of the target frame is n; its z is as near to the dome's z as possible; without slide its
+        origin is the foot of the perpendicular from the dome's centre.
 
     Raises
     ------
@@ -144,7 +142,7 @@ def dome_from_target(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """One quantity over time: through values, with a sway on top.
+    """One quantity over time: interpolated values, with a sway on top.
 
     Attributes
     ----------
@@ -175,7 +173,7 @@ class Course:
         if n == 1:
             return float(self.values[0])
         if self.mode == "steps":
-            # The small addition keeps frame times such as 0.4 s on the right side of a step.
+            # The small addition keeps frame times such as 0.4 s after a step despite rounding.
             return float(self.values[min(int(share * n + 1e-9), n - 1)])
         return float(PchipInterpolator(np.linspace(0.0, 1.0, n), self.values)(share))
 
@@ -211,22 +209,22 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A dive before it is rendered.
+    """Scenario of a dive: scene and motion, before rendering.
 
     Attributes
     ----------
     name : str
-        How reports call it.
+        Name in reports.
     duration : float
         In seconds.
     fps : float
         Frames a second.
     seed : int
-        Chooses noise and everything else that is random.
+        Seed of noise and everything else that is random.
     trajectory : Trajectory
         Posture of the vehicle over time.
     target : {"net", "wall", "none"}
-        What the target plane is; "none" where nothing stands in it.
+        Content of the target plane; "none" if it is empty.
     walls, nets, fish, bubbles, boxes, water, sensor, lasers_on
         As in `Scene`; they move with the target.
     """
@@ -256,7 +254,7 @@ class Scenario:
         return (i / self.fps for i in range(self.n_frames))
 
     def scene_at(self, t: float) -> Scene:
-        """Return the scene as the vehicle sees it at time `t`; render it at the same `t`."""
+        """Return the scene before the vehicle at time `t`; render it at the same `t`."""
         return self._scene(self.trajectory.pose_at(t, self.duration))
 
     def _scene(self, pose: SE3) -> Scene:
@@ -282,13 +280,13 @@ Triple: TypeAlias = tuple[Finite, Finite, Finite]
 
 
 class _Strict(BaseModel):
-    """Every model refuses keys that it does not know."""
+    """Base of the schemas: refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class CourseFile(_Strict):
-    """One quantity over the dive; see `trajectory.Course`."""
+    """Schema of one quantity over the dive; see `Course`."""
 
     values: Annotated[list[Finite], Field(min_length=1)]
     mode: Literal["smooth", "steps"] = "smooth"
@@ -300,7 +298,7 @@ Motion: TypeAlias = Finite | list[Finite] | CourseFile
 
 
 class MotionFile(_Strict):
-    """Posture over the dive: numbers, lists of numbers to pass through, or `CourseFile`."""
+    """Schema of the posture over the dive: numbers, lists of numbers, or `CourseFile`."""
 
     range_mm: Motion = 600.0
     pitch_deg: Motion = 0.0
@@ -310,7 +308,7 @@ class MotionFile(_Strict):
 
 
 class FoldFile(_Strict):
-    """A fold across the net, or a row of them; see `scene.Fold`."""
+    """Schema of a fold across the net, or a row of them; see `scene.Fold`."""
 
     direction_deg: Finite = 0.0
     place_mm: Finite = 0.0
@@ -320,7 +318,7 @@ class FoldFile(_Strict):
 
 
 class NetFile(_Strict):
-    """A net in the target plane; see `scene.Net`."""
+    """Schema of a net in the target plane; see `scene.Net`."""
 
     mesh: Mesh = "diamond"
     bar_mm: Positive = 25.0
@@ -337,7 +335,7 @@ class NetFile(_Strict):
 
 
 class WallFile(_Strict):
-    """A wall; `behind_mm` 0 puts it in the target plane; see `scene.Wall`."""
+    """Schema of a wall; `behind_mm` 0 puts it in the target plane; see `scene.Wall`."""
 
     behind_mm: NotNegative = 0.0
     yaw_deg: Annotated[float, Field(gt=-80.0, lt=80.0)] = 0.0
@@ -347,7 +345,7 @@ class WallFile(_Strict):
 
 
 class BoxFile(_Strict):
-    """A box, its position from the target plane's middle; see `scene.Box`."""
+    """Schema of a box, its position from the target plane's middle; see `scene.Box`."""
 
     centre_mm: Triple
     size_mm: tuple[Positive, Positive, Positive] = (300.0, 200.0, 300.0)
@@ -355,7 +353,7 @@ class BoxFile(_Strict):
 
 
 class WaterFile(_Strict):
-    """Water; see `scene.WaterOptics`."""
+    """Schema of the water; see `scene.WaterOptics`."""
 
     attenuation_per_m: tuple[NotNegative, NotNegative, NotNegative] = WaterOptics().attenuation
     veil: tuple[NotNegative, NotNegative, NotNegative] = WaterOptics().veil
@@ -369,7 +367,7 @@ class WaterFile(_Strict):
 
 
 class SensorFile(_Strict):
-    """Sensor; see `scene.Sensor`."""
+    """Schema of the sensor; see `scene.Sensor`."""
 
     gain: Positive = 1.0
     gamma: Positive = Sensor().gamma
@@ -379,7 +377,7 @@ class SensorFile(_Strict):
 
 
 class ScenarioFile(_Strict):
-    """The whole file. Without `net` and without a wall in the target plane there is no target."""
+    """Schema of the whole file; the target is `net`, a wall in the target plane, or none."""
 
     duration_s: Positive = 4.0
     fps: Positive = 25.0
@@ -418,7 +416,7 @@ class ScenarioFile(_Strict):
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Read a scenario file; the scenario is called as the file.
+    """Read a scenario file; the scenario has the file's name.
 
     Raises
     ------

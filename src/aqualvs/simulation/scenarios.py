@@ -1,12 +1,11 @@
-"""Built-in scenarios by name, and how a name or a path becomes a scenario.
+"""Built-in scenarios by name, example rigs and random scenes.
 
-Rigs to simulate with, in round numbers.
+`load_scenario` takes a name or the path of a scenario file. `random_scene` draws scenes for
+statistics over conditions rather than over one dive.
 
-`example_rig` resembles the rig of the paper: a lens strongly off the dome's centre and three
-lasers, one nearly level below, one nearly upright on the left, one diagonal on the right.
-`bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome.
-
-Scenes at random, for statistics over conditions rather than over one dive.
+The rigs are in round numbers. `example_rig` resembles the rig of the paper: a lens strongly off the
+dome's centre and three lasers, one nearly level below, one nearly upright on the left, one diagonal
+on the right. `bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome.
 """
 
 from collections.abc import Mapping
@@ -85,8 +84,8 @@ def _pose(rotation_deg: Vec, lens_mm: Vec) -> SE3:
 
 Difficulty: TypeAlias = Literal["clean", "usual", "hard"]
 
-# By difficulty: most fouling, most fish, most bubbles, chance of a wall behind, chance of glare,
-# spread of the attenuation (factor on clear water).
+# By difficulty: greatest fouling, numbers of fish and bubbles, probability of a wall behind and of
+# glare, spread of the attenuation (factor on clear water).
 _LIMITS: dict[str, tuple[float, int, int, float, float, float]] = {
     "clean": (0.0, 0, 0, 0.0, 0.0, 1.0),
     "usual": (0.3, 1, 12, 0.5, 0.15, 1.6),
@@ -95,18 +94,18 @@ _LIMITS: dict[str, tuple[float, int, int, float, float, float]] = {
 
 
 def random_scene(rng: np.random.Generator, difficulty: Difficulty = "usual") -> Scene:
-    """Return a net before the vehicle with everything about it left to chance.
+    """Return a random scene of a net before the vehicle.
 
     Mesh 15-50 mm, twine 1-4 mm, range 0.3-1.0 m, roll 0-90 deg, yaw and pitch within 20 deg, all
     uniform; fouling up to 60 %, fish, bubbles, a wall behind, turbidity, caustics and glare as
-    the difficulty allows.
+    allowed by the difficulty.
 
     Parameters
     ----------
     rng : Generator
-        Source of chance; the same state gives the same scene.
+        Random number generator; the same state gives the same scene.
     difficulty : {"clean", "usual", "hard"}
-        A clean net in open water; what a dive usually meets; everything at once.
+    A clean net in open water; usual conditions of a dive; everything at once.
 
     Raises
     ------
@@ -141,7 +140,7 @@ def _net(rng: np.random.Generator, difficulty: str) -> Net:
     return Net(
         mesh=meshes[int(rng.integers(len(meshes)))],
         bar=bar,
-        # A mesh of thick twine leaves openings of at least two thirds of the bar.
+        # Limit the twine so that openings are at least two thirds of the bar.
         twine=min(twine, bar / 3.0),
         roll=float(np.deg2rad(rng.uniform(0.0, 90.0))),
         hanging_ratio=float(rng.uniform(0.5, 0.85)),

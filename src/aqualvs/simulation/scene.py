@@ -1,4 +1,4 @@
-"""What the simulated vehicle looks at: surfaces, water, lasers and sensor, in SI units.
+"""Scene before the simulated vehicle: surfaces, water and sensor, in SI units.
 
 Surfaces live in the frame `scene`: x right, y away from the vehicle, z up. The target (net or
 wall) is the plane y = 0, and `Scene.dome_from_scene` places all of it before the vehicle.
@@ -21,7 +21,7 @@ Target: TypeAlias = Literal["net", "wall", "none"]
 
 
 class Label(IntEnum):
-    """What a lit point lies on; the lower-case names are `labels` in truth files."""
+    """Kind of surface of a lit point; the lower-case names are `labels` in truth files."""
 
     NONE = 0
     NET = 1
@@ -33,14 +33,14 @@ class Label(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wall:
-    """A plane with a procedural texture, parallel to the target plane unless it is turned.
+    """Wall: a plane with a procedural texture, parallel to the target plane unless turned.
 
     Attributes
     ----------
     depth : float
-        Where the wall meets the scene's y axis, in metres; 0 is the target plane.
+        Place of the wall on the scene's y axis, in metres; 0 is the target plane.
     yaw, pitch : float
-        How the wall is turned against the target plane, in radians; signs as for postures.
+        Turn of the wall against the target plane, in radians; signs as for postures.
     albedo : (float, float, float)
         Mean diffuse reflectance.
     contrast : float
@@ -59,7 +59,7 @@ class Wall:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fold:
-    """A smooth ridge across a net, or an endless row of them.
+    """Fold: a smooth ridge across a net, or an endless row of them.
 
     Over the distance s from its crest the net stands out by height * cos²(pi s / (2 width)) up to
     s = width, and not beyond. With a period of twice the width a row of folds is a sine wave, as
@@ -68,10 +68,10 @@ class Fold:
     Attributes
     ----------
     direction : float
-        Way from the crest into the fold's flank, in radians from x towards z; the crest runs
-        square to it.
+        Direction from the crest into the fold's flank, in radians from x towards z; the crest
+        is at right angles to it.
     place : float
-        Where the crest is along that way, from the target's origin, in metres.
+        Place of the crest along that direction, from the target's origin, in metres.
     height : float
         In metres; positive away from the vehicle, as curvature.
     width : float
@@ -93,7 +93,7 @@ class Net:
 
     The twine is a true cylinder around an axis in that plane: lit points lie within one twine
     radius (plus growth) of the net plane, on the side that faces the vehicle. Where the net leaves
-    the plane, its mesh is stretched, so that it stays as it is seen along the plane's normal.
+    the plane, its mesh is stretched: seen along the plane's normal it stays unchanged.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Net:
     curvature : (float, float)
         Along x and z in 1/m; positive bulges away from the vehicle.
     folds : tuple of Fold
-        What the net does beside that; heights add up.
+        Folds on top of that; heights add up.
     half_size : (float, float)
         Half extent along x and z in metres; infinite by default.
     offset : (float, float)
@@ -126,7 +126,7 @@ class Net:
     albedo : (float, float, float)
         Diffuse reflectance of the clean twine.
     seed : int
-        Chooses which bars are missing and where growth sits.
+        Seed of missing bars and growth.
     """
 
     mesh: Mesh = "diamond"
@@ -148,7 +148,7 @@ class Net:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fish:
-    """A fish: an ellipsoid with tail and eye that swims straight on and beats its tail.
+    """Fish: an ellipsoid with tail and eye that swims straight on and beats its tail.
 
     Attributes
     ----------
@@ -169,13 +169,13 @@ class Fish:
     beat: float = 1.5
 
     def at(self, t: float) -> "Fish":
-        """Return the fish where it is `t` seconds on."""
+        """Return the fish `t` seconds later."""
         return replace(self, position=_moved(self.position, self.velocity, t))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bubble:
-    """A bubble: a bright rim, a clear middle and glints of sun and lasers.
+    """Bubble with a bright rim, a clear middle and glints of sun and lasers.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ class Bubble:
     radius: float = 0.004
 
     def at(self, t: float) -> "Bubble":
-        """Return the bubble where it is `t` seconds on."""
+        """Return the bubble `t` seconds later."""
         return replace(self, position=_moved(self.position, self.velocity, t))
 
 
@@ -218,20 +218,20 @@ class Box:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterOptics:
-    """How water dims, veils, glows and blurs.
+    """Optical properties of water: attenuation, veil, scatter, blur.
 
     Attributes
     ----------
     attenuation : (float, float, float)
         Beam attenuation per metre for red, green and blue; the lasers use the green one.
     veil : (float, float, float)
-        Radiance of endless water: what the veil tends to with distance.
+        Radiance of endless water, the limit of the veil with distance.
     ambient : (float, float, float)
         Daylight that reaches a surface; a white one has this radiance.
     sheet_scatter : float
-        Light that a laser sheet sends sideways to the camera, per metre and steradian.
+        Light that the water scatters from a laser sheet to the camera, per metre and steradian.
     forward_scatter : float
-        Fraction of the light that arrives in a halo instead of in focus.
+        Fraction of the light that arrives in a halo, out of focus.
     halo_px : float
         Standard deviation of that halo, in pixels.
     caustics : float
@@ -255,12 +255,12 @@ class WaterOptics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
-    """From radiance to grey levels.
+    """Sensor of the ideal camera: from radiance to grey levels.
 
     Attributes
     ----------
     gain : float
-        Exposure: multiplies radiance before the full scale of 1 cuts it off.
+        Exposure: factor on the radiance before it is clipped at the full scale of 1.
     gamma : float
         Grey level = 255 * radiance**(1 / gamma).
     read_noise : float
@@ -280,7 +280,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Everything in front of the camera at one instant (moving things carry their velocity).
+    """Scene in front of the camera at one instant; moving bodies have their velocity.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ class Scene:
     walls, nets, fish, bubbles, boxes
         Surfaces.
     target : {"net", "wall", "none"}
-        What the plane y = 0 is, for the truth files.
+        Content of the plane y = 0, for the truth files.
     water : WaterOptics
         Optical properties of the water.
     sensor : Sensor
@@ -310,7 +310,7 @@ class Scene:
     lasers_on: bool = True
 
     def at(self, t: float) -> "Scene":
-        """Return the scene with fish and bubbles where they are `t` seconds on."""
+        """Return the scene with fish and bubbles moved on by `t` seconds."""
         return replace(
             self,
             fish=tuple(fish.at(t) for fish in self.fish),

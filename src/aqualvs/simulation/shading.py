@@ -1,4 +1,4 @@
-"""What one ray brings home: daylight, lasers, veil, glow of the sheets, bubbles."""
+"""Radiance along one ray: daylight, lasers, veil, glow of the sheets, bubbles."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ from aqualvs.simulation.surfaces import (
 )
 from aqualvs.simulation.textures import Tiles, sample
 
-# Light comes down steeply, leaning towards the target.
+# Daylight comes down steeply, inclined towards the target.
 _UP = (0.10, -0.42, 0.90)
 _SHADOW_MARGIN = 3e-4
 _DARK = (0.0, 0.0, 0.0)
@@ -38,7 +38,7 @@ _EVERYWHERE = 1e3
 
 
 class Light(NamedTuple):
-    """The numbers of `WaterOptics` that rays need.
+    """Numbers of `WaterOptics` for the kernels of rays.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Light(NamedTuple):
 
 
 def pack_light(scene: Scene, t: float) -> Light:
-    """Return the water of a scene as kernels need it."""
+    """Return the water of a scene for kernels."""
     water = scene.water
     colours = np.array([water.attenuation, water.veil, water.ambient], dtype=np.float64)
     return Light(
@@ -67,7 +67,7 @@ def pack_light(scene: Scene, t: float) -> Light:
 
 
 class Members(NamedTuple):
-    """Which ellipsoids and bubbles a ray may meet.
+    """Ellipsoids and bubbles that a ray may meet.
 
     Attributes
     ----------
@@ -118,14 +118,14 @@ def radiance(
 
 @inline_borrowing_kernel
 def _through(source: float, channel: int, path: float, veil: float, light: Light) -> float:
-    """Dim by the water on the way and add the veil that it scatters in."""
+    """Attenuate by the water on the way and add the veil that it scatters in."""
     left = np.exp(-light.colours[0, channel] * path)
     return float(source * left + light.colours[1, channel] * veil * (1.0 - left))
 
 
 @inline_borrowing_kernel
 def _veil(d: Vec, light: Light) -> float:
-    """Brightness of the veil by direction: lighter above, and the sun's glare."""
+    """Return the brightness of the veil by direction: lighter above, and the sun's glare."""
     veil = 1.0 + 0.55 * d[2] + 0.12 * d[0]
     if light.glare > 0.0:
         right, up = d[0] / d[1] - 0.22, d[2] / d[1] - 0.30
@@ -136,7 +136,7 @@ def _veil(d: Vec, light: Light) -> float:
 
 @inline_borrowing_kernel
 def _daylight(p: Vec, normal: Vec, light: Light, tiles: Tiles) -> float:
-    """Diffuse light from above, with the moving network that waves focus."""
+    """Return diffuse light from above, with the moving network focused by waves."""
     sun = 0.55 + 0.45 * max(dot(normal, _UP), 0.0) * 1.6
     if light.caustics > 0.0:
         u, v = (p[0] + 0.35 * p[2]) / 0.0016, (0.5 * p[1] - 0.7 * p[2]) / 0.0016
@@ -169,7 +169,7 @@ def _laser_light(
 
 @inline_borrowing_kernel
 def _from_source(p: Vec, off: float, sigma: float, sheets: Sheets, i: int) -> tuple[Vec, float]:
-    """Direction and length of the light's way; it leaves the source as far off in its thickness.
+    """Return direction and length of the light's way from its place in the source's thickness.
 
     Behind a window it is the way through the water, from the window on.
     """
@@ -195,7 +195,7 @@ def _shadowed(p: Vec, from_source: Vec, length: float, s: Surfaces, everything: 
 
 @inline_borrowing_kernel
 def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> Vec:
-    """Light that the water in the sheets scatters into the ray, before it ends at `reach`."""
+    """Return the light that the water in the sheets scatters into the ray before `reach`."""
     glow = _DARK
     for i in range(sheets.table.shape[0]):
         t, slope = crossing_sheet(o, d, sheets, i)
@@ -216,7 +216,7 @@ def _sheet_glow(o: Vec, d: Vec, reach: float, sheets: Sheets, light: Light) -> V
 def crossing_sheet(o: Vec, d: Vec, sheets: Sheets, i: int) -> tuple[float, float]:
     """Return where a ray crosses a sheet, and its cosine to the sheet's normal there.
 
-    For a bent sheet one step of Newton's method from the plane that fits it: 0.2 mm off at most.
+    For a bent sheet, by one Newton step from the plane that fits it: the error is 0.2 mm at most.
     """
     optics = sheets.optics
     normal = row3(optics, i, START)
@@ -242,7 +242,7 @@ def _over_bubble(
     sheets: Sheets,
     light: Light,
 ) -> Vec:
-    """Lay a bubble over what is behind it: totally reflecting rim, glints of sun and lasers."""
+    """Return the light with a bubble in front: totally reflecting rim, glints of sun and lasers."""
     p = along(o, d, t)
     normal = scaled(minus(p, row3(s.bubbles, row, 0)), 1.0 / s.bubbles[row, 3])
     facing = max(-dot(d, normal), 0.0)

@@ -1,4 +1,4 @@
-"""All surfaces of a scene as tables in `dome`, and the kernels that cast rays at them."""
+"""Surfaces of a scene as tables in `dome`, and kernels that intersect rays with them."""
 
 from typing import NamedTuple
 
@@ -37,7 +37,7 @@ class Surfaces(NamedTuple):
     holes : array, shape (n, 4)
         Index of the net, u, v and radius.
     folds : array, shape (n, columns)
-        See `folds`; the first column is the index of the net.
+        See `net.pack_fold`; the first column is the index of the net.
     tiles : Tiles
         Noise for textures.
     """
@@ -53,17 +53,17 @@ class Surfaces(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """The first opaque surface on a ray.
+    """Intersection of a ray with the first opaque surface.
 
     Attributes
     ----------
     t : float
-        Distance along the ray in metres; infinite where the ray meets nothing.
+        Distance along the ray in metres; infinite if the ray meets nothing.
     kind, row : int
         `Label` of the surface and its place in the table.
     normal : (float, float, float)
-        Unit normal towards the ray's origin; only set for nets and boxes, where it falls out of
-        the intersection.
+        Unit normal towards the ray's origin; only set for nets and boxes, whose intersection
+        gives it.
     """
 
     t: float
@@ -98,7 +98,7 @@ def _table(rows: list[FloatArray], columns: int) -> FloatArray:
 
 
 def _turned(yaw: float, pitch: float) -> FloatArray:
-    """Axes (columns) of a plane whose far normal points right by yaw and up by pitch."""
+    """Return axes (columns) of a plane whose far normal points right by yaw and up by pitch."""
     normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
     normal /= np.linalg.norm(normal)
     up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
@@ -114,7 +114,7 @@ def _pack_wall(wall: Wall, pose: SE3) -> FloatArray:
 
 
 def _pack_fish(fish: Fish, pose: SE3, t: float) -> list[FloatArray]:
-    """Body, tail and eye as ellipsoids; the fish points where it swims."""
+    """Return body, tail and eye as ellipsoids; the fish points in its swimming direction."""
     velocity = np.array(fish.velocity)
     if not np.any(velocity[:2]):
         velocity = np.array([1.0, 0.0, 0.0])
@@ -201,7 +201,7 @@ def meet_box(o: Vec, d: Vec, boxes: FloatArray, i: int) -> tuple[float, Vec]:
 
 @inline_borrowing_kernel
 def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: int) -> Hit:
-    """Return the first opaque surface on a ray; of the ellipsoids try members[first:last]."""
+    """Return the first opaque surface on a ray, with the ellipsoids members[first:last]."""
     t, kind, index, normal = np.inf, NONE, 0, (0.0, 0.0, 0.0)
     for i in range(s.walls.shape[0]):
         reach = meet_wall(o, d, s.walls, i)
@@ -258,7 +258,7 @@ def normal_and_albedo(o: Vec, d: Vec, hit: Hit, s: Surfaces) -> tuple[Vec, Vec]:
 
 @inline_borrowing_kernel
 def _wall_albedo(p: Vec, walls: FloatArray, i: int, tiles: Tiles) -> Vec:
-    """Stains of three sizes, and the joints of tiles."""
+    """Return the albedo of a wall: stains of three sizes, and the joints of tiles."""
     rel = minus(p, row3(walls, i, _ORIGIN))
     u, v = dot(rel, row3(walls, i, _AXIS_U)), dot(rel, row3(walls, i, _AXIS_V))
     broad = sample(tiles.smooth, u / 0.0031 + 97.3, v / 0.0031 + 11.9)

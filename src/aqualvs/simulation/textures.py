@@ -1,9 +1,10 @@
-"""Periodic noise tiles that kernels look up instead of computing noise for every ray.
+"""Textures: printed panels, and periodic noise tiles for natural surfaces.
 
-What is printed on panels: boards, walls with markers, mottled grounds.
+The texture of a panel (board, wall with markers, mottled ground) is a grid of equal square cells of
+one albedo each, so that every printed edge lies on an edge of the grid: the mean over an area is
+exact, and no raster adds jagged edges of its own.
 
-A texture is a grid of equal square cells of one albedo each, so that every printed edge lies on an
-edge of the grid: an area's mean over it is exact, and no raster adds jaggies of its own.
+Kernels look noise up in periodic tiles instead of computing it for every ray (`noise_tiles`).
 """
 
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ _WHITE_MASK = 255
 
 
 class Tiles(NamedTuple):
-    """Noise that repeats seamlessly.
+    """Tiles of noise that repeat seamlessly.
 
     Attributes
     ----------
@@ -57,7 +58,7 @@ def noise_tiles() -> Tiles:
 
 
 def _fractal(rng: np.random.Generator, exponent: float, low: float) -> NDArray[np.float64]:
-    """Gaussian noise with amplitude 1/f^exponent above `low` cycles a tile."""
+    """Return Gaussian noise with amplitude 1/f^exponent above `low` cycles a tile."""
     f = np.fft.fftfreq(TILE_SIZE) * TILE_SIZE
     radius = np.hypot(f[:, None], f[None, :])
     spectrum = np.fft.fft2(rng.standard_normal((TILE_SIZE, TILE_SIZE)))
@@ -74,7 +75,7 @@ def _uniform(field: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @inline_borrowing_kernel
 def sample(tile: NDArray[np.float32], x: float, y: float) -> float:
-    """Bilinear value of a 512-square tile at (x, y) in texels, repeated without end."""
+    """Return the bilinear value of a periodic 512-square tile at (x, y) in texels."""
     fx, fy = np.floor(x), np.floor(y)
     i, j = int(fx) & _MASK, int(fy) & _MASK
     i1, j1 = (i + 1) & _MASK, (j + 1) & _MASK
@@ -122,7 +123,7 @@ class Texture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CharucoPrint:
-    """A ChArUco board as it is printed (OpenCV's current pattern).
+    """Printed ChArUco board (OpenCV's current pattern).
 
     Attributes
     ----------
@@ -202,11 +203,11 @@ def marker_texture(ground: FloatArray, cell: float, prints: MarkerPrint) -> Text
     Parameters
     ----------
     ground : array, shape (rows, columns)
-        Albedo of what the markers are glued to; it is not changed.
+        Albedo of the ground under the markers; not changed.
     cell : float
         Side of a cell, in metres.
     prints : MarkerPrint
-        What is glued on.
+        Markers to put on it.
 
     Raises
     ------
@@ -232,7 +233,7 @@ def marker_texture(ground: FloatArray, cell: float, prints: MarkerPrint) -> Text
 def mottled(
     shape: tuple[int, int], albedo: float, contrast: float, *, scale: float = 1.0, shift: int = 0
 ) -> FloatArray:
-    """Return an uneven ground (rows, columns): concrete, plywood.
+    """Return the albedo (rows, columns) of an uneven ground, such as concrete or plywood.
 
     Parameters
     ----------
@@ -245,7 +246,7 @@ def mottled(
     scale : float
         Cells over which a texel of the noise is stretched.
     shift : int
-        Another place in the noise, so that panels differ.
+        Offset in the noise, so that panels differ.
     """
     tile = noise_tiles().smooth
     rows, columns = (((np.arange(n) / scale).astype(int) + shift) % len(tile) for n in shape)

@@ -1,6 +1,7 @@
-"""One row of truth for every frame.
+"""Truth of simulated pictures: lit points of the laser sheets, and one row of `truth.csv` a frame.
 
-The truth of the stripes: where the middles of the laser sheets meet what the camera sees.
+A lit point is where the middle of a laser sheet meets a surface that the camera sees
+(`find_lit_points`).
 """
 
 from collections.abc import Sequence
@@ -26,16 +27,16 @@ from aqualvs.simulation.lasers import (
 from aqualvs.simulation.scene import Label, Scene, Target
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 
-# A point is seen when the camera's ray to it ends no farther than this before it. The twine's
-# grooves and growth, which depend a little on the ray's direction, stay within it.
+# A point is seen if the camera's ray to it ends no farther than this before it. The twine's
+# grooves and growth, which depend slightly on the ray's direction, stay within this distance.
 _SEEN_WITHIN = 5e-4
-# Below this fraction of the fan's power a stripe has faded out.
+# Fraction of the fan's power below which a stripe has faded out.
 _FAN_FLOOR = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class LitPoints:
-    """Points on the middles of the stripes that the camera sees, N of them, ordered by laser.
+    """N points on the middles of the stripes that the camera sees, ordered by laser.
 
     Attributes
     ----------
@@ -74,7 +75,7 @@ def light_sheets(
 
 
 def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
-    """Trace every sheet's middle from its source, project what it meets, drop what is hidden."""
+    """Trace every sheet's middle from its source; return the lit points that the camera sees."""
     found = [_lit_by(i, rig, surfaces, sheets) for i in range(len(sheets.table))]
     points = np.concatenate([np.empty((0, 3)), *(p for p, _ in found)])
     label = np.concatenate([np.empty(0, dtype=np.int32), *(kind for _, kind in found)])
@@ -92,7 +93,7 @@ def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
 def _lit_by(
     i: int, rig: Rig, surfaces: Surfaces, sheets: Sheets
 ) -> tuple[FloatArray, NDArray[np.int32]]:
-    """Points and labels that sheet i lights; bubbles cast no shadow, so both may be on one ray."""
+    """Return points and labels lit by sheet i; a bubble and what is behind it may both be lit."""
     origins, directions, way = fan_rays(rig, sheets, i)
     reach, kind, bubble = cast(origins, directions, surfaces)
     strong = (sheets.fan[i] > _FAN_FLOOR) & np.isfinite(way)
@@ -108,12 +109,12 @@ def _lit_by(
 
 
 class Reach(NamedTuple):
-    """What rays meet, shape (n,) each.
+    """First intersections of n rays, shape (n,) each.
 
     Attributes
     ----------
     solid : array
-        Distance of the first opaque surface in metres; infinite where there is none.
+        Distance of the first opaque surface in metres; infinite if there is none.
     kind : int array
         Its `Label`.
     bubble : array
@@ -126,7 +127,7 @@ class Reach(NamedTuple):
 
 
 def cast(origins: FloatArray, directions: FloatArray, surfaces: Surfaces) -> Reach:
-    """Return what rays, origins and unit directions of shape (n, 3) in `dome`, meet first."""
+    """Return first intersections of rays, origins and unit directions (n, 3) in `dome`."""
     n = len(origins)
     reach = Reach(np.empty(n), np.empty(n, dtype=np.int64), np.empty(n))
     everything = (np.arange(len(surfaces.ellipsoids)), np.arange(len(surfaces.bubbles)))
@@ -168,7 +169,7 @@ lie on the front of the twine, up to a twine radius before the net plane); empty
 do not span a plane. The `pts` columns count visible lit points by what they lie on.
 """
 
-# Lit points whose second spread is below this fraction of their first lie on one line.
+# Ratio of the second to the first spread of lit points below which they lie on one line.
 _FLAT = 0.02
 _AIR = 1.1
 _LABELS: dict[Target, Label] = {"net": Label.NET, "wall": Label.WALL}
@@ -192,7 +193,7 @@ def truth_row(frame: int, t: float, scene: Scene, rig: Rig, lit: LitPoints) -> l
 
 
 def _posture(plane: Plane) -> list[Cell]:
-    """Range in mm, pitch and yaw in degrees (docs/conventions.md)."""
+    """Return range in mm, pitch and yaw in degrees (docs/conventions.md)."""
     nx, ny, nz = plane.normal.tolist()
     pitch, yaw = np.arctan2(nz, ny), np.arctan2(nx, ny)
     return [1e3 * plane.offset, float(np.rad2deg(pitch)), float(np.rad2deg(yaw))]
@@ -201,7 +202,7 @@ def _posture(plane: Plane) -> list[Cell]:
 def visible_fit(lit: LitPoints, label: Label) -> tuple[Plane, float] | None:
     """Return the least-squares plane through the lit points of a label and its largest residual.
 
-    None where the points are fewer than three or on one line. The residual is in metres.
+    None if there are fewer than three points or all are on one line. The residual is in metres.
     """
     points: FloatArray = lit.points_in_dome[lit.label == label]
     if len(points) < 3:

@@ -21,13 +21,13 @@ Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """How a video is compressed.
+    """Compression of a video.
 
     Attributes
     ----------
     codec : {"h264", "lossless", "mjpeg"}
         H.264 with chroma at half resolution (4:2:0), as ROVs record; lossless H.264 in RGB; or
-        every frame as a JPEG of its own (4:2:0, full range), as USB cameras send it.
+        every frame as a separate JPEG (4:2:0, full range), as from USB cameras.
     crf : int
         Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
     bit_rate : int or None
@@ -57,14 +57,14 @@ class Recording:
             raise OptionError(f"JPEG quality is {self.jpeg_quality}; it must lie between 1 and 100")
 
 
-# First of these that the installed PyAV carries.
+# Lossy encoders, in the order of preference.
 _LOSSY = ("libx264", "libopenh264", "mpeg4")
 _FALLBACK_BIT_RATE = 6_000_000
 _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 
 
 class VideoWriter(Closing):
-    """Writes RGB frames; use it as a context manager, so that the file is always closed well.
+    """Writer of RGB frames to a video file; use it as a context manager to close the file.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class VideoWriter(Closing):
     fps : float
         Frames a second.
     recording : Recording
-        How the frames are compressed.
+        Compression of the frames.
 
     Raises
     ------
@@ -120,7 +120,7 @@ class VideoWriter(Closing):
         Raises
         ------
         OutputError
-            If the disk refuses it.
+            If it cannot be written.
         """
         if self._recording.codec == "mjpeg":
             self._mux([self._jpeg_packet(image)])
@@ -130,7 +130,7 @@ class VideoWriter(Closing):
         self._n_frames += 1
 
     def close(self) -> None:
-        """Write what the encoder still holds and close the file."""
+        """Flush the encoder and close the file."""
         try:
             if self._recording.codec != "mjpeg":
                 self._encode(None)
@@ -138,7 +138,7 @@ class VideoWriter(Closing):
             self._container.close()
 
     def _jpeg_packet(self, image: NDArray[np.uint8]) -> "av.Packet[Any]":
-        """Return a frame as a JPEG with the standard tables, as USB cameras make it."""
+        """Return a frame as a JPEG with the standard tables, as from USB cameras."""
         packet = av.Packet(jpeg(image, self._recording.jpeg_quality))
         packet.stream = self._stream
         packet.time_base = 1 / cast(Fraction, self._stream.average_rate)

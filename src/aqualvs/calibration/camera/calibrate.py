@@ -1,9 +1,10 @@
-"""`calibrate camera`: intrinsics from views of a board in air, without the dome.
+"""Calibration of the camera: intrinsics from views of a board in air, without the dome.
 
-OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) starts it; the robust bundle of
-`calibrate dome` finishes it, which adds the covariance and names what does not fit.
-
-Refusals of `calibrate camera`, and where in the picture its intrinsics are to be trusted.
+OpenCV's calibration (Zhang 2000, doi:10.1109/34.888718) gives the starting values. The robust
+bundle adjustment of `solver.bundle`, which `calibrate dome` uses too, refines them, estimates their
+covariance and names the views that do not fit. The checks refuse views that are too few or too much
+alike and intrinsics that do not explain them. The result names the areas of the picture with no
+corners or uncertain intrinsics.
 """
 
 from collections.abc import Sequence
@@ -39,21 +40,21 @@ COVERAGE_CELLS = (6, 8)
 """Rows and columns of the coverage grid."""
 _MIN_VIEWS = 3
 _MIN_POINTS = 60
-# Corners noisier than this mean that something else is wrong than noise.
+# Corners noisier than this indicate an error other than noise.
 _MAX_NOISE_PX = 1.0
 # Focal lengths (share) and image centre (share of the width) known worse than this are of no use.
 _MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.01, 0.02
-# Views whose boards lean less than this from each other are parallel.
+# Angle between boards below which they count as parallel.
 _PARALLEL = np.deg2rad(5.0)
 
 
 def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
-    """Refuse views that are too few, or are not of this size.
+    """Refuse too few views, or views of another picture size.
 
     Raises
     ------
     CalibrationError
-        With what there is and what it takes.
+        With what is given and what is needed.
     """
     if len(views) < _MIN_VIEWS:
         raise CalibrationError(
@@ -84,7 +85,7 @@ def check_camera_solution(
     ----------
     solution : Solution
     covariance : array, shape (P, P)
-        Of the intrinsics, by corners: focal lengths and image centre first.
+        Of the intrinsics, as if corners were independent: focal lengths and image centre first.
     views : sequence of View
 
     Raises
@@ -161,20 +162,20 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
 # A view is bad if it is this many times noisier than the typical one, and noisier than this.
 _BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
 _MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
-# Every so-many-th view is held back; a camera needs the rest.
+# One view out of this number is held back; least number of views and of corners in one for that.
 _HELD_BACK_EVERY, _MIN_HELD_BACK, _CAMERA_MIN_POINTS = 4, 8, 12
 _MANY_OUTLIERS = 0.05
 _WEAK_PIXEL_PX = 1.0
 _THIN_COVERAGE = 0.6
-# Variance by views over that by corners that is worth a word: sigmas half as large again.
+# Ratio of the variance by views to that by corners that is reported: sigmas 1.5 times as large.
 _SHARED_ERRORS = 2.25
-# Uncertainty of the focal length (share) that is worth a word: ranges are off by as much.
+# Relative uncertainty of the focal length that is reported: ranges have the same error.
 _WEAK_FOCAL = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class CameraCalibration:
-    """Intrinsics, and how far to trust them.
+    """Result of a camera calibration: intrinsics with their uncertainty.
 
     Attributes
     ----------
@@ -182,25 +183,25 @@ class CameraCalibration:
     size_px : (int, int)
         Image width and height.
     uncertainty : RigUncertainty
-        Of the intrinsics, from how the views disagree (`view_covariance`).
+        Of the intrinsics, from the disagreement of the views (`solver.covariance`).
     inflation : float
-        How many times larger that variance is than if the errors of corners were independent.
+        Ratio of that variance to the variance for independent errors of corners.
     views : tuple of ViewFit
         Poses are `cam_from_target`.
     left_out : dict
-        Names of views that were not used, and why.
+        Names of views that were not used, with the reason.
     noise_px : float
         Typical standard deviation of a corner's coordinate.
     coverage : int array, shape (6, 8)
-        How many corners fell into each cell of the picture.
+        Number of corners in each cell of the picture.
     held_back_rms_px : float
-        How well a model from three views in four predicts corners of the fourth; NaN where there
-        are too few views.
+        Root mean square error of a model from three views in four for the corners of the
+        fourth; NaN where there are too few views.
     bend_height : float
-        How far apart the highest and the lowest corner of a bent board are, in metres; 0 for a
-        board that is flat as far as the views tell.
+        Height difference between the highest and the lowest corner of a bent board, in metres;
+        0 for a board whose views show no bend.
     findings : tuple of str
-        In plain words: what is worth knowing.
+        Remarks for the user, in plain words.
     n_iterations : int
     """
 
@@ -224,7 +225,7 @@ class CameraCalibration:
 
     @property
     def n_points(self) -> int:
-        """Number of corners that were believed."""
+        """Number of inlier corners."""
         return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
 
 
@@ -245,7 +246,7 @@ def camera(
         Image width and height.
     model : LensModel
     n_coefficients : int, optional
-        Number of distortion coefficients; by default as many as the views show to be there.
+        Number of distortion coefficients; by default as many as the views support.
 
     Returns
     -------
@@ -255,7 +256,7 @@ def camera(
     ------
     CalibrationError
         If the views are too few or too much alike to determine the intrinsics, or do not show the
-        board they are said to.
+        given board.
     """
     check_camera_views(views, size_px)
     bundle, solution = fitted_camera(views, size_px, model, n_coefficients)
@@ -286,7 +287,7 @@ def _bent(
         if fit is None:
             break
         if n_coefficients is None:
-            # What the bend did to the pictures may have passed for distortion.
+            # Without a bend, distortion may have taken up its effect.
             straight, settled = with_supported_coefficients(fit.bundle, fit.solution)
             if straight.free != flat.free:
                 flat = replace(straight, views=flat.views)
@@ -298,7 +299,7 @@ def _bent(
 def _without_bad_views(
     bundle: Bundle, solution: Solution[BundleState]
 ) -> tuple[Bundle, Solution[BundleState], dict[str, str]]:
-    """Leave out views that fit far worse than the others, and solve again."""
+    """Leave out views that fit much worse than the others, and solve again."""
     typical = CORNER_SIGMA_PX * solution.scales[CORNERS]
     bad: dict[int, str] = {}
     for i, target in enumerate(bundle.views):

@@ -1,10 +1,11 @@
-"""The problem of `calibrate camera`: where it starts, and how many coefficients the lens takes.
+"""The least-squares problem of `calibrate camera`: initial guess, lens model and bend of the board.
 
-A board that is not quite flat: its bend as parameters, where the views ask for it.
+The number of distortion coefficients is chosen by an information criterion (`fitted_camera`).
 
-The board's surface is a polynomial of second, or second and third, degree over its corners, the
-same in all views. Poses and lens take up a part of what a bent board does to the corners, so the
-bend is solved together with them.
+A board that is not quite flat is a polynomial surface of second, or second and third, degree over
+its corners, the same in all views. Poses and lens take up a part of what a bent board does to the
+corners, so the bend is solved together with them, and only if the views show it to be significant
+(`bend_is_significant`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,9 +42,9 @@ BEND_DEGREES = (2, 3)
 """Degrees of a bend's polynomial, each with the terms of those before it."""
 # Exponents of x and y in each term, by degree.
 _TERMS = {2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
-# A flat board passes for bent in one calibration of so many.
+# Probability that a flat board is taken for bent.
 _CHANCE = 1e-3
-# Views beyond the number of terms, from which on their scatter can be told.
+# Views needed beyond the number of terms to estimate their scatter.
 _SPARE_VIEWS = 3
 
 
@@ -54,9 +55,9 @@ class BoardBend:
     Attributes
     ----------
     centre : array, shape (2,)
-        Where x and y count from, in `board`, metres.
+        Origin of x and y, in `board`, metres.
     half_size : float
-        What they are counted in, in metres: half of the corners' longer extent.
+        Unit of x and y, in metres: half of the corners' longer extent.
     exponents : tuple of (int, int)
         i and j of every term.
     coefficients : array, shape (K,)
@@ -90,7 +91,7 @@ class BoardBend:
         return replace(view, points=points)
 
     def height(self, views: Sequence[View]) -> float:
-        """Return how far apart the highest and the lowest corner are, from the best plane, metres.
+        """Return the height difference of the corners over their best plane, in metres.
 
         Parameters
         ----------
@@ -112,7 +113,7 @@ class _BentState:
 
 @dataclass(frozen=True, slots=True)
 class _BentBundle:
-    """A bundle whose boards share a bend; see `least_squares.solve`.
+    """A bundle whose boards share a bend: a problem of `least_squares.solve`.
 
     Columns: those of the bundle, then the bend's coefficients.
     """
@@ -175,10 +176,10 @@ class BentFit:
 def bend_is_significant(
     bundle: Bundle, solution: Solution[BundleState], degree: int, n_solved: int
 ) -> bool:
-    """Whether further terms of a bend are more than the scatter of the views makes of none.
+    """Return whether further terms of a bend exceed the scatter of the views.
 
-    From the slopes at the solution, without solving again: Rao's score, by Wald's test with the
-    covariance by views.
+    From the derivatives at the solution, without solving again: Rao's score, in Wald's test with
+    the covariance by views.
 
     Parameters
     ----------
@@ -189,7 +190,7 @@ def bend_is_significant(
     degree : int
         Of the terms in question, one of `BEND_DEGREES`.
     n_solved : int
-        How many of the terms up to that degree are in the points already.
+        Number of the terms up to that degree that the points include already.
     """
     bend = BoardBend.flat([target.view for target in bundle.views], degree)
     n, n_terms = len(bundle.views), len(bend.exponents) - n_solved
@@ -214,7 +215,7 @@ def fit_bend(flat: Bundle, start: BundleState, degree: int) -> BentFit | None:
     flat : Bundle
         Of views whose poses are free, with the points of the flat board.
     start : BundleState
-        Where the solve starts.
+        Initial guess.
     degree : int
         Of the polynomial, one of `BEND_DEGREES`.
 
@@ -240,9 +241,9 @@ def fit_bend(flat: Bundle, start: BundleState, degree: int) -> BentFit | None:
 # Fields of view, in radians across the picture, that a lens is tried with where OpenCV finds none.
 _FIELDS = tuple(np.deg2rad([30.0, 50.0, 70.0, 95.0]))
 _FISHEYE_FIELDS = tuple(np.deg2rad([60.0, 100.0, 140.0, 180.0]))
-# A start that leaves less than this needs no rival.
+# An initial guess that leaves less than this needs no alternative.
 _GOOD_NOISE_PX = 1.0
-# Share of a coefficient's effect that is its own, below which it adds nothing.
+# Share of a coefficient's effect that no other has, below which it adds nothing.
 _REDUNDANT = 1e-7
 # Numbers of coefficients, each with those before it; fisheye lenses have all four or none.
 _STEPS = {LensModel.OPENCV: (4, 5, 8), LensModel.FISHEYE: (4,)}
@@ -254,16 +255,16 @@ def fitted_camera(
     model: LensModel,
     n_coefficients: int | None,
 ) -> tuple[Bundle, Solution[BundleState]]:
-    """Solve the camera, with as many distortion coefficients as the views show to be there.
+    """Solve the camera, with as many distortion coefficients as the views support.
 
-    More coefficients are taken only while they lower the cost by more than the information
-    criterion of Schwarz (1978, doi:10.1214/aos/1176344136) asks for: superfluous ones would spoil
-    the picture's corners, where no board was seen.
+    Coefficients are added only while they lower the cost by more than the information criterion
+    of Schwarz (1978, doi:10.1214/aos/1176344136) requires: superfluous ones would distort the
+    picture's corners, where no board was seen.
 
     Raises
     ------
     CalibrationError
-        If no camera can have taken the views.
+        If no camera model explains the views.
     """
     first = _STEPS[model][0] if n_coefficients is None else n_coefficients
     bundle, solution = _first_fit(views, size_px, model, first)
@@ -275,7 +276,7 @@ def fitted_camera(
 def with_supported_coefficients(
     bundle: Bundle, solution: Solution[BundleState]
 ) -> tuple[Bundle, Solution[BundleState]]:
-    """Solve with as many distortion coefficients as the views show to be there."""
+    """Solve with as many distortion coefficients as the views support."""
     steps = _STEPS[solution.state.rig.lens.model]
     if len(solution.state.rig.lens.distortion) != steps[0]:
         bundle, solution = with_coefficients(bundle, solution, steps[0])
@@ -297,9 +298,9 @@ def with_coefficients(
 
 
 def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:
-    """Return by how much further coefficients would lower the sum of squares, in sigmas squared.
+    """Return the decrease of the sum of squares by further coefficients, in sigmas squared.
 
-    Rao's score test: from the slopes at the solution, without solving again.
+    Rao's score test: from the derivatives at the solution, without solving again.
     """
     wider, state = _resized(bundle, solution.state, n)
     blocks = wider.blocks(state)
@@ -314,7 +315,7 @@ def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int
     slope = gradient[new] - by_old @ gradient[old]
     size = np.sqrt(np.diag(information)[new])
     values, vectors = np.linalg.eigh(left / np.outer(size, size))
-    # Combinations that do what others can do already are left to rounding.
+    # Combinations whose effect others have already are known to rounding only.
     told = values > _REDUNDANT
     along = (vectors.T @ (slope / size))[told]
     return float(np.sum(along**2 / values[told]))
@@ -331,7 +332,7 @@ def _distorts(bundle: Bundle, solution: Solution[BundleState]) -> bool:
 def _price(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:
     more = abs(n - len(solution.state.rig.lens.distortion))
     values = sum(2 * int(np.count_nonzero(i)) for i in solution.inliers[: len(bundle.views)])
-    # Errors that the corners of a view share make chance gains so many times larger.
+    # Errors that the corners of a view share make chance gains larger by this factor.
     inflation = max(shared_covariance(bundle, solution).inflation, 1.0)
     return more * inflation * float(np.log(values))
 
@@ -431,15 +432,15 @@ def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bund
 
 
 def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return how uncertain (N,) the intrinsics leave the pixels of fixed directions, in pixels.
+    """Return the uncertainty (N,) of the pixels of fixed directions, in pixels.
 
     Parameters
     ----------
     lens : Lens
     covariance : array, shape (P, P)
-        Of its numbers.
+        Of its parameters.
     pixels : array, shape (N, 2)
-        Where; NaN comes back where the lens model does not hold.
+        Places; the result is NaN where the lens model does not hold.
     """
     directions, _ = lens.directions(pixels)
     _, _, _, by_number = lens.pixels_with_parameter_jacobian(directions)

@@ -1,18 +1,15 @@
-"""Find a ChArUco board: a few markers say where it is, then corner leads to corner.
+"""Detection of ChArUco boards and chessboards: inner corners, each found with its neighbours' help.
 
-Reading a marker is slow, and near the picture's border or under a laser stripe many cannot be
-read. So markers are read in the middle of the picture first, and only until enough of them agree;
-all other corners are found from their neighbours and borne out by the picture.
+ChArUco boards: reading a marker is slow, and near the picture's border or under a laser stripe many
+markers cannot be read. Markers are therefore read with OpenCV (number and rough corners) in the
+middle of the picture first, and only until enough of them agree. All other corners are predicted
+from their neighbours by an affine map and confirmed in the picture.
 
-Markers as OpenCV reads them: numbers and rough corners.
+Chessboards: OpenCV's finders give rough corners. Their grid may be wrong, for example one row off
+onto the paper's border. Every grid is tested on the picture, and further finders are tried until
+one passes the test; the corners are then put in the board's order. The whole board must be seen.
 
-The inner corners of a board as a grid: predict from neighbours, grow, find the odd ones out.
-
-Find a plain chessboard, all of it, and put its corners in the board's order.
-
-OpenCV's finders say roughly where the corners are. What they find may be a wrong grid, one row off
-onto the paper's border for example; every grid is tested on the picture, and other finders are
-tried until one stands the test.
+Both refine corners with `saddle_corners` and reject those that their neighbours contradict.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,7 +28,7 @@ _WIDEST_WINDOW = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Markers:
-    """Markers as OpenCV reads them, not refined.
+    """Markers as read by OpenCV, not refined.
 
     Attributes
     ----------
@@ -61,7 +58,7 @@ def read_markers(
     dictionary : str
         Name of the markers' dictionary.
     n_first : int or None
-        Read only the first so many markers of the dictionary, which is faster.
+        Read only the first `n_first` markers of the dictionary, which is faster.
     window_px : int or None
         Odd width of the only local threshold; None tries several.
     """
@@ -84,11 +81,11 @@ def read_markers(
     )
 
 
-# Neighbours that predict a corner: up to this many squares away.
+# Greatest distance, in squares, of the neighbours that predict a corner.
 _REACH = 2
 # An affine map needs three neighbours; a fourth guards it.
 _MIN_NEIGHBOURS = 4
-# Nearer neighbours say more, because the map is affine only nearby.
+# Nearer neighbours get more weight, because the map is affine only locally.
 _FALL = 0.7
 
 
@@ -101,9 +98,9 @@ class Grid:
     pixels : array, shape (rows, columns, 2)
         In `image`.
     known : bool array, shape (rows, columns)
-        Which were found.
+        True for corners that were found.
     notes : tuple of str
-        What a user should know of how they were found.
+        Remarks for the user on the detection.
     """
 
     pixels: FloatArray
@@ -113,14 +110,14 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where the neighbours of each grid point say that it is.
+    """Places of the grid points as predicted from their neighbours.
 
     Attributes
     ----------
     pixels : array, shape (rows, columns, 2)
         In `image`; NaN where not valid.
     axes : array, shape (rows, columns, 2, 2)
-        One square's side along the board's x (`[..., 0]`) and y (`[..., 1]`), in pixels.
+        Side of a square along the board's x (`[..., 0]`) and y (`[..., 1]`), in pixels.
     valid : bool array, shape (rows, columns)
         False where too few neighbours are known, or all on one line.
     """
@@ -131,7 +128,7 @@ class Prediction:
 
 
 def nothing_known(board: Board) -> Grid:
-    """Return the grid of a board of which no corner was found."""
+    """Return the grid of a board without any corner found."""
     shape = board.corner_grid[::-1]
     return Grid(np.zeros((*shape, 2)), np.zeros(shape, dtype=bool))
 
@@ -144,7 +141,7 @@ def predict(pixels: FloatArray, known: BoolArray) -> Prediction:
     pixels : array, shape (rows, columns, 2)
         Corners in `image`.
     known : bool array, shape (rows, columns)
-        Which of them are known; others are ignored, even if NaN.
+        True for known corners; others are ignored, even if NaN.
     """
     rows, columns = known.shape
     weight = np.pad(known.astype(np.float64), _REACH)
@@ -170,7 +167,7 @@ def predict(pixels: FloatArray, known: BoolArray) -> Prediction:
 
 
 def _spread_both_ways(normal: FloatArray) -> BoolArray:
-    """Whether the neighbours of a point do not all lie on one line."""
+    """Return whether the neighbours of a point span a plane."""
     mass = np.maximum(normal[..., 0, 0], 1e-12)
     mean = normal[..., 0, 1:] / mass[..., None]
     spread = normal[..., 1:, 1:] / mass[..., None, None]
@@ -180,7 +177,7 @@ def _spread_both_ways(normal: FloatArray) -> BoolArray:
 
 
 def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
-    """Return which known points their neighbours contradict.
+    """Return the mask of known points that contradict their neighbours.
 
     Parameters
     ----------
@@ -199,7 +196,7 @@ def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
 # OpenCV's finders look at every pixel; above this size a smaller picture finds the same board.
 _MAX_WIDTH_PX = 1400
 _MISFIT_SHARE = 0.12
-# Share of the corners that the picture must bear out, so that no other finder is asked.
+# Share of the corners that must be confirmed by the picture to stop trying finders.
 _ENOUGH = 0.8
 
 _Finder = Callable[[GreyImage, tuple[int, int]], tuple[bool, cv2.typing.MatLike]]
@@ -213,7 +210,7 @@ def _quads(flags: int) -> _Finder:
     return lambda image, grid: cv2.findChessboardCorners(image, grid, flags=flags)
 
 
-# In the order in which they are tried; the first is the best, and the fastest.
+# In the order of use; the first is the best and the fastest.
 _FINDERS: tuple[tuple[str, _Finder], ...] = (
     ("findChessboardCornersSB", _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE)),
     (
@@ -230,7 +227,7 @@ _FINDERS: tuple[tuple[str, _Finder], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class _Attempt:
-    """A grid as the picture bears it out; `first_is_light` as it lies in the picture."""
+    """A grid confirmed by the picture; `first_is_light` refers to the picture's orientation."""
 
     grid: Grid
     first_is_light: bool
@@ -246,8 +243,8 @@ def find_chessboard(image: GreyImage, board: Board) -> Grid:
     Returns
     -------
     Grid
-        Nothing known where the board is not seen whole. Corners that the picture does not bear
-        out, under a laser stripe for example, are not known.
+        No corner known if the board is not seen whole. Corners that the picture does not
+        confirm, under a laser stripe for example, are not known.
 
     Notes
     -----
@@ -283,7 +280,7 @@ def _other_print(board: Board) -> str:
 
 
 def _rough_grids(image: GreyImage, grid: tuple[int, int]) -> Iterator[tuple[str, FloatArray]]:
-    """Yield corners (rows, columns, 2) as OpenCV's finders have them, each with its name."""
+    """Yield corners (rows, columns, 2) found by each of OpenCV's finders, with its name."""
     scale = min(1.0, _MAX_WIDTH_PX / image.shape[1])
     small = image
     if scale < 1.0:
@@ -307,14 +304,14 @@ def _right_handed(pixels: FloatArray) -> FloatArray:
 
 
 def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
-    """Refine a grid and the ring of corners around it, and shift it to where most are."""
+    """Refine a grid and the ring of corners around it; shift it to where most are confirmed."""
     rows, columns = rough.shape[:2]
     pixels = np.pad(rough, ((1, 1), (1, 1), (0, 0)))
     known = np.pad(np.ones((rows, columns), dtype=bool), 1)
     first_is_light = _diagonal_is_light(image, rough)
     light = (np.indices(known.shape).sum(axis=0) % 2 == 1) != first_is_light
     seen = np.zeros_like(known)
-    # The second time from neighbours that were seen, not from where the finder has them.
+    # The second pass starts from neighbours that were seen, not from the finder's corners.
     for first in (True, False):
         expected = predict(pixels, known if first else seen)
         starts = np.where((known & first)[..., None], pixels, expected.pixels)
@@ -324,7 +321,7 @@ def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
         )
         pixels[tried], seen[tried] = fits.pixels, fits.valid
         seen &= ~misfits(pixels, seen, share=_MISFIT_SHARE)
-    # The middle first: it stays where the others are no better.
+    # The middle first: it wins ties.
     shifts = sorted(np.ndindex(3, 3), key=lambda s: abs(s[0] - 1) + abs(s[1] - 1))
     dy, dx = max(shifts, key=lambda s: np.count_nonzero(seen[s[0] :, s[1] :][:rows, :columns]))
     window = np.s_[dy : dy + rows, dx : dx + columns]
@@ -333,7 +330,7 @@ def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
 
 
 def _diagonal_is_light(image: GreyImage, pixels: FloatArray) -> bool:
-    """Whether the squares with an even sum of row and column are light, that of (0, 0) included."""
+    """Return whether squares with an even sum of row and column, (0, 0) included, are light."""
     centres = 0.25 * (pixels[1:, 1:] + pixels[:-1, 1:] + pixels[1:, :-1] + pixels[:-1, :-1])
     x, y = np.rint(centres).astype(np.int64).reshape(-1, 2).T
     height, width = image.shape
@@ -343,10 +340,10 @@ def _diagonal_is_light(image: GreyImage, pixels: FloatArray) -> bool:
 
 
 def _in_board_order(found: _Attempt) -> tuple[Grid, bool]:
-    """Turn a grid so that the first square is dark, and say whether it is light all the same."""
+    """Turn a grid so that the first square is dark; return whether it is light nevertheless."""
     pixels, known = found.grid.pixels, found.grid.known
     rows, columns = known.shape
-    # Over which number of squares the first one moves in each quarter turn.
+    # Number of squares by which the first one moves in each quarter turn.
     over = {0: 0, 2: rows + columns}
     if rows == columns:
         over |= {1: columns, 3: rows}
@@ -363,41 +360,41 @@ def _inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
     return inside
 
 
-# Parts of the picture, about its centre, in which markers are looked for in turn.
+# Parts of the picture, about its centre, that are searched for markers in turn.
 _CROPS = (0.25, 0.5, 1.0)
-# Pairs of markers that agree, enough to find the other corners from.
+# Number of agreeing pairs of markers that suffices to find the other corners.
 _ENOUGH_AGREED = 8
 # Window of the local threshold for a quick look at a part, as a share of the picture's width.
 _QUICK_WINDOW = 0.01
-# Markers so many squares apart must agree on how they lie, to this share of their distance: blur
-# makes them look a seventh too small, and on a tilted board squares grow. One square off, as on a
-# board of other make, is a third or more.
+# Markers up to this many squares apart must agree on their offset, to this share of their distance:
+# blur makes them look a seventh too small, and on a tilted board squares grow. An error of one
+# square, as on a board of another pattern, is a third or more.
 _NEIGHBOUR_SQUARES = 3
 _AGREEMENT = 0.25
-# A marker supports the grid whose corner it sees this near, in sides, and contradicts it from so
-# far; most must support it, and but a few, which were misread, may contradict it.
+# A marker supports the grid if their corners are this near, in sides, and contradicts it beyond
+# the second distance. Most must support it; only a few, misread ones, may contradict it.
 _SUPPORT = 0.25
 _SUPPORTED_SHARE = 0.6
 _CONTRADICTION = 0.5
 _CONTRADICTED_SHARE = 0.05
-# A corner that the picture did not bear out is tried again when more neighbours are known.
+# A corner that the picture did not confirm is tried again when more neighbours are known.
 _MAX_TRIES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Seeds:
-    """Corners that markers agree on.
+    """Corners on which neighbouring markers agree.
 
     Attributes
     ----------
     corners : int array, shape (K,)
-        Which inner corners of the board.
+        Indices of inner corners of the board.
     pixels : array, shape (K, 2)
-        About where they are, in `image`.
+        Their approximate places, in `image`.
     axes : array, shape (K, 2, 2)
-        A square's sides along the board's x and y there, as columns, in pixels.
+        Sides of a square along the board's x and y there, as columns, in pixels.
     n_agreed : int
-        How many pairs of markers agree across rows.
+        Number of pairs of markers that agree across rows.
     """
 
     corners: IntArray
@@ -412,7 +409,7 @@ def find_charuco(image: GreyImage, board: Board) -> Grid:
     Returns
     -------
     Grid
-        Nothing known where no two markers agree on a corner.
+        No corner known if no two markers agree on one.
     """
     quick_px = 2 * max(round(0.5 * _QUICK_WINDOW * image.shape[1]), 1) + 1
     for part, offset in _parts(image):
@@ -435,16 +432,16 @@ def _parts(image: GreyImage) -> Iterator[tuple[GreyImage, FloatArray]]:
 
 
 def _by_markers(markers: Markers, board: Board) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return what each marker says of the corners of its square, by its own homography.
+    """Return the corners of each marker's square, predicted by the marker's own homography.
 
     Returns
     -------
     places : int array, shape (K, 4, 2)
         Column and row of the square's corners in the grid; outside it at the board's edge.
     pixels : array, shape (K, 4, 2)
-        Where they should be.
+        Predicted places.
     axes : array, shape (K, 2, 2)
-        The square's sides along the board's x and y, as columns, in pixels.
+        Sides of the square along the board's x and y, as columns, in pixels.
     """
     squares = board.marker_squares()
     near, far = board.margin_share, 1.0 - board.margin_share
@@ -462,11 +459,11 @@ def _by_markers(markers: Markers, board: Board) -> tuple[IntArray, FloatArray, F
 
 
 def agreed_corners(markers: Markers, board: Board) -> Seeds:
-    """Return the corners of those markers that agree with their neighbours.
+    """Return the corners of markers that agree with their neighbours.
 
-    Markers whose squares are near each other on the board must be as near in the picture. One that
-    was read wrongly, or on a board of another make, contradicts more neighbours than it has
-    friends.
+    Markers whose squares are near each other on the board must be as near in the picture. A marker
+    that was misread, or is on a board of another pattern, contradicts more neighbours than it
+    agrees with.
     """
     n_x, n_y = board.corner_grid
     places, pixels, axes = _by_markers(markers, board)
@@ -489,7 +486,7 @@ def agreed_corners(markers: Markers, board: Board) -> Seeds:
 def _neighbours(
     squares: IntArray, centres: FloatArray, axes: FloatArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return which pairs (K, K) of near markers agree on how they lie, and which do not."""
+    """Return the masks (K, K) of near markers that agree on their offset, and that do not."""
     step = squares[None, :] - squares[:, None]
     distance = np.max(np.abs(step), axis=-1)
     near = distance <= _NEIGHBOUR_SQUARES
@@ -503,7 +500,7 @@ def _neighbours(
 
 
 def _grow(image: GreyImage, board: Board, seeds: Seeds) -> Grid:
-    """Refine the seeds, then go from known corners to their neighbours until none is new."""
+    """Refine the seeds, then proceed from known corners to neighbours until none is new."""
     shape = board.corner_grid[::-1]
     pixels, known = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
     tries = np.zeros(shape, dtype=np.int64)
@@ -529,9 +526,10 @@ def _grow(image: GreyImage, board: Board, seeds: Seeds) -> Grid:
 
 
 def _supported(grid: Grid, markers: Markers, board: Board) -> bool:
-    """Whether most markers that were read lie where the grid has them, or would have them.
+    """Return whether most markers lie where the grid predicts them.
 
-    On a board of another make, with other counts of squares say, some rows agree by chance.
+    On a board of another pattern, for example with other counts of squares, some rows agree by
+    chance.
     """
     n_x, n_y = board.corner_grid
     places, pixels, axes = _by_markers(markers, board)

@@ -1,6 +1,7 @@
-"""From pictures to views: find a board or markers, to a few hundredths of a pixel.
+"""Detection of a board or of markers in a picture, to a few hundredths of a pixel.
 
-Why a target was not found: what the picture shows instead, and what may help.
+The result is a `View`, or a clause that says why there is none: what the picture shows instead
+(other markers, another board) and what may help.
 """
 
 from collections.abc import Iterator
@@ -20,25 +21,25 @@ from aqualvs.calibration.detection.saddle_corners import GreyImage
 from aqualvs.calibration.detection.tag_corners import refine_tags
 from aqualvs.calibration.targets.targets import DICTIONARIES, Board, BoardKind, MarkerSet, View
 
-# One marker of a small dictionary is easily read into clutter.
+# A single marker of a small dictionary is often a false detection in clutter.
 _ENOUGH = 4
 # The small dictionaries are the first markers of their large ones, ArUco's 36H12 aside.
 _LARGEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
-# Squares more or fewer, each way, that a board file may give by mistake.
+# Difference in the number of squares, each way, that a board file may have by mistake.
 _OTHER_COUNTS = 3
 
 
 def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: int) -> str:
-    """Return one clause on why there is no view of a board.
+    """Return one clause on the reason why there is no view of a board.
 
     Parameters
     ----------
     image : uint8 array, shape (height, width)
         Grey picture.
     board : Board
-        What was looked for.
+        The target.
     n_corners, min_corners : int
-        How many corners were found and needed.
+        Numbers of corners found and needed.
     """
     if n_corners > 0:
         return (
@@ -65,7 +66,7 @@ def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: in
 
 
 def _other_boards(board: Board) -> Iterator[tuple[Board, str]]:
-    """Boards that a slip in the file may have meant, with the remedy."""
+    """Return boards that a mistake in the file may have meant, with the remedy."""
     if board.squares[1] % 2 == 0:
         other = replace(board, legacy_pattern=not board.legacy_pattern)
         yield other, f"write 'legacy_pattern: {str(other.legacy_pattern).lower()}'"
@@ -76,7 +77,7 @@ def _other_boards(board: Board) -> Iterator[tuple[Board, str]]:
 
 
 def _wider(board: Board, n_x: int) -> Board:
-    # A board of too many markers cannot be; fewer rows do for the comparison.
+    # The dictionary limits the number of markers; fewer rows suffice for the comparison.
     most = 2 * board.n_markers // n_x
     return replace(board, squares=(n_x, max(3, min(board.squares[1], most))))
 
@@ -84,18 +85,18 @@ def _wider(board: Board, n_x: int) -> Board:
 def why_no_markers(
     image: GreyImage, marker_set: MarkerSet, markers: Markers, n_corners: int, min_corners: int
 ) -> str:
-    """Return one clause on why there is no view of a set of markers.
+    """Return one clause on the reason why there is no view of a set of markers.
 
     Parameters
     ----------
     image : uint8 array, shape (height, width)
         Grey picture.
     marker_set : MarkerSet
-        What was looked for.
+        The target.
     markers : Markers
         All markers of its family that were read.
     n_corners, min_corners : int
-        How many corners were refined and needed.
+        Numbers of corners refined and needed.
     """
     ours = np.isin(markers.ids, marker_set.ids)
     if np.any(ours):
@@ -121,7 +122,7 @@ def _no_markers(image: GreyImage, dictionary: str, n_read: int) -> str:
 
 
 def _differs(name: str, dictionary: str) -> bool:
-    """Whether two names are of different families: DICT_4X4_50 is the start of DICT_4X4_1000."""
+    """Return whether names differ in family: DICT_4X4_50 is the start of DICT_4X4_1000."""
     return name.split("_")[:2] != dictionary.split("_")[:2] or "APRILTAG" in name
 
 
@@ -131,7 +132,7 @@ def _ids(markers: Markers) -> str:
 
 
 MIN_CORNERS = 6
-"""Fewer corners than this fix neither a pose nor their own mistakes."""
+"""Least number of corners that determines a pose and reveals wrong corners."""
 
 
 def detect_board(
@@ -144,17 +145,17 @@ def detect_board(
     image : uint8 array, shape (height, width)
         Grey picture.
     board : Board
-        What to look for. A ChArUco board may be seen in part, a chessboard only whole.
+        The target. A ChArUco board may be seen in part, a chessboard only whole.
     name : str
-        How messages call the picture.
+        Name of the picture in messages.
     min_corners : int
-        Fewer corners are no view.
+        Least number of corners of a view.
 
     Returns
     -------
     View or str
-        Points in `board`, ids count the inner corners row by row; or, in a clause, why there is
-        none.
+        Points in `board`, ids count the inner corners row by row; or, in a clause, the reason
+        why there is none.
     """
     find = find_charuco if board.kind is BoardKind.CHARUCO else find_chessboard
     grid = find(image, board)
@@ -179,18 +180,18 @@ def detect_markers(
     image : uint8 array, shape (height, width)
         Grey picture.
     marker_set : MarkerSet
-        What to look for; other markers of the family are ignored.
+        The target; other markers of the family are ignored.
     name : str
-        How messages call the picture.
+        Name of the picture in messages.
     min_corners : int
-        Fewer corners are no view.
+        Least number of corners of a view.
 
     Returns
     -------
     View or str
         Points in the set's frame, ids are four times the index in the set plus the corner's place;
-        or why there is none, in a clause. Corners that could not be refined cleanly, under a laser
-        stripe for example, are missing.
+        or, in a clause, the reason why there is none. Corners that could not be refined cleanly,
+        under a laser stripe for example, are missing.
     """
     markers = read_markers(image, marker_set.family)
     index = {int(number): i for i, number in enumerate(marker_set.ids)}

@@ -1,17 +1,14 @@
-"""Sub-pixel place of the corners where four squares of a chessboard meet.
+"""Sub-pixel refinement of chessboard corners, where four squares meet.
 
 Around such a corner the picture is point-symmetric: blur, gamma and the printer's ink change the
-look of the edges but not their crossing. A small model of that neighbourhood, blur included, is
-fitted to the pixels by damped least squares (`saddle_model`); the markers of a ChArUco board, which
-begin a few pixels away on small squares, are part of the model instead of a disturbance.
+look of the edges but not their crossing. A model of that neighbourhood is fitted to the pixels by
+damped least squares, in compiled kernels.
 
-What small fits to pixels inside compiled kernels share: an edge, and what is no information.
-
-What a corner of a chessboard looks like, and the compiled fit of that look to pixels.
-
-Two straight edges cross; two opposite quadrants are light. On a ChArUco board a dark marker begins
-in each light quadrant, a margin away from both edges. The blur is Gaussian, the same everywhere,
-and the tones are a level, a contrast and a slope of the level.
+Model: two straight edges cross; two opposite quadrants are light. On a ChArUco board a dark marker
+begins in each light quadrant, a margin away from both edges. On small squares that is a few pixels
+from the corner, so the markers are part of the model instead of a disturbance. The blur is
+Gaussian and the same everywhere; the tones are a level, a contrast and a slope of the level.
+`tag_corners` uses the same blurred edge.
 """
 
 import math
@@ -25,17 +22,17 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel,
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 
 LEAST_PIVOT = 1e-12
-"""A pivot of the normal matrix below this share of its diagonal is no information."""
+"""Ratio of a pivot of the normal matrix to its diagonal below which there is no information."""
 
 _SQRT_HALF = math.sqrt(0.5)
 _DENSITY_AT_ZERO = 1.0 / math.sqrt(2.0 * math.pi)
-# Farther than this many blurs from where it lies, an edge is over.
+# Beyond this many standard deviations of the blur an edge has its full height.
 _REACH = 4.0
 
 
 @inline_borrowing_kernel
 def blurred_edge(distance: float, blur: float) -> tuple[float, float]:
-    """Return a Gaussian edge's height, 0 to 1, and its slope by `distance`."""
+    """Return the height of a Gaussian edge, 0 to 1, and its derivative by `distance`."""
     t = distance / blur
     if t > _REACH:
         return 1.0, 0.0
@@ -58,13 +55,13 @@ _RADIUS_SHARE = 0.47
 _MIN_RADIUS_PX = 2.4
 # Sine of the angle between the edges below which they no longer cross in a point.
 _MIN_SINE = 0.25
-# Where the fit of the blur starts, as a share of the square.
+# Initial guess of the blur, as a share of the square.
 _BLUR_SHARE = 0.06
 _MAX_STEP_PX = 2.0
 _MAX_STEP_ANGLE = 0.2
 _MAX_STEP_LOG_BLUR = 0.5
 _BLUR_PX = (0.25, 6.0)
-# Bits of a marker blur this many blurs into its border.
+# Bits of a marker affect its border up to this many standard deviations of the blur.
 _BITS_REACH = 2.0
 
 
@@ -84,7 +81,7 @@ def fit_saddles(
 ) -> None:
     """Move `pixels` (N, 2) onto the crossings; write sigma, residual share, turn, blur (N, 4).
 
-    Sigma stays 0 where nothing could be fitted; arguments as in `saddle_corners.refine_saddles`.
+    Sigma stays 0 where nothing could be fitted; arguments as in `refine_saddles`.
     """
     window, matrices, vectors = np.empty(8), np.empty((3, _N, _N)), np.empty((6, _N))
     window[_MARGIN], window[_BITS_FROM] = margin, bits_from
@@ -106,7 +103,7 @@ def fit_saddles(
 
 @inline_borrowing_kernel
 def _start(axes: FloatArray, pixel: FloatArray, window: FloatArray, unknowns: FloatArray) -> bool:
-    """Write where the fit starts; False where the axes span no area."""
+    """Write the initial guess; return False if the axes span no area."""
     area = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
     side_1 = math.hypot(axes[0, 0], axes[1, 0])
     side_2 = math.hypot(axes[0, 1], axes[1, 1])
@@ -152,9 +149,9 @@ def _fit(
 
 @inline_borrowing_kernel
 def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> bool:
-    """Centre the window on the corner; False where the picture's border leaves too little.
+    """Centre the window on the corner; return False if it is too small at the border.
 
-    The window stays symmetric about the corner, so that what the model leaves out cancels.
+    The window stays symmetric about the corner, so that effects outside the model cancel.
     """
     height, width = image.shape
     if not (0.0 <= unknowns[0] <= width - 1.0 and 0.0 <= unknowns[1] <= height - 1.0):
@@ -171,7 +168,7 @@ def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> b
 def _descend(
     image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
 ) -> tuple[float, int]:
-    """Levenberg-Marquardt in one window; return the sum of squares and the number of pixels.
+    """Run Levenberg-Marquardt in one window; return the sum of squares and number of pixels.
 
     vectors[0] is the start and becomes the best; matrices[0] its normal matrix.
     """
@@ -199,7 +196,7 @@ def _descend(
 
 @inline_borrowing_kernel
 def _keep(matrices: FloatArray, vectors: FloatArray) -> None:
-    """Make the trial the best, element by element: this kernel may not create arrays."""
+    """Copy the trial to the best, element by element: this kernel may not create arrays."""
     for i in range(_N):
         vectors[0, i], vectors[2, i] = vectors[1, i], vectors[3, i]
         for j in range(i + 1):
@@ -208,7 +205,7 @@ def _keep(matrices: FloatArray, vectors: FloatArray) -> None:
 
 @inline_borrowing_kernel
 def _advance(best: FloatArray, step: FloatArray, tried: FloatArray) -> None:
-    """Write the next trial; it stays where the model still sees the edges."""
+    """Write the next trial; limit it to where the model still sees the edges."""
     limit = _MAX_STEP_PX / max(_MAX_STEP_PX, math.hypot(step[0], step[1]))
     for i in range(_N):
         tried[i] = best[i] + limit * step[i]
@@ -220,7 +217,7 @@ def _advance(best: FloatArray, step: FloatArray, tried: FloatArray) -> None:
 
 @borrowing_kernel
 def _first_tones(image: U8Array, window: FloatArray, unknowns: FloatArray) -> None:
-    """Write the level and contrast that the two kinds of quadrants have on average."""
+    """Write level and contrast from the means of the two kinds of quadrants."""
     radius = window[_RADIUS]
     light, n_light, dark, n_dark = 0.0, 1e-9, 0.0, 1e-9
     for dy in range(-int(radius), int(radius) + 1):
@@ -289,7 +286,7 @@ def _sums(
 
 @inline_borrowing_kernel
 def _among_bits(d_1: float, d_2: float, blur: float, window: FloatArray) -> bool:
-    """Whether a pixel belongs to, or is blurred with, a marker's bits, which the model ignores."""
+    """Return whether a pixel belongs to, or is blurred with, a marker's bits (not modelled)."""
     if window[_SIGN] * d_1 * d_2 <= 0.0:
         return False
     u = (abs(d_1) + _BITS_REACH * blur) / window[_REACH_1]
@@ -303,8 +300,8 @@ def _lightness(
 ) -> tuple[float, float, float, float]:
     """Return the light's share at signed distances from the edges, and its derivatives.
 
-    By the two distances and by the logarithm of the blur: a blurred edge changes with the latter
-    by minus its distance times its slope.
+    Derivatives are by the two distances and by the logarithm of the blur; the latter is minus the
+    distance times the slope of the edge.
     """
     sign = window[_SIGN]
     d_2 = sign * d_2
@@ -330,8 +327,8 @@ def _lightness(
 GreyImage = NDArray[np.uint8]
 """A grey picture, shape (height, width)."""
 
-# What a fit must reach to be believed: share of the contrast that is left unexplained, how far
-# either edge turned, and the uncertainty of the crossing.
+# Limits of an accepted fit: residual as a share of the contrast, turn of either edge, and
+# uncertainty of the crossing.
 _MAX_RESIDUAL_SHARE = 0.15
 _MAX_TURN = np.deg2rad(12.0)
 _MAX_SIGMA_PX = 0.3
@@ -339,18 +336,18 @@ _MAX_SIGMA_PX = 0.3
 
 @dataclass(frozen=True, slots=True)
 class SaddleFit:
-    """Refined corners.
+    """Corners refined to sub-pixel accuracy.
 
     Attributes
     ----------
     pixels : array, shape (N, 2)
-        In `image`; the start where not valid.
+        In `image`; the starting place where not valid.
     sigma : array, shape (N,)
         Standard deviation of a coordinate from the fit's own residual, in pixels.
     blur : array, shape (N,)
         Standard deviation of the blur across the edges, in pixels.
     valid : bool array, shape (N,)
-        False where the pixels do not look like this corner, or it wandered off.
+        False where the pixels do not fit the model, or the corner moved too far.
     """
 
     pixels: FloatArray
@@ -376,24 +373,24 @@ def refine_saddles(
     image : uint8 array, shape (height, width)
         Grey picture.
     starts : array, shape (N, 2)
-        About where the corners are, in `image`, pixels.
+        Approximate places of the corners, in `image`, pixels.
     axes : array, shape (N, 2, 2)
         `axes[:, :, 0]` and `axes[:, :, 1]`: one square's side along the board's x and y, in pixels.
     light_first : bool array, shape (N,)
-        Whether the square towards +x, +y of the board is light.
+        True where the square towards +x, +y of the board is light.
     margin : float
         Light margin around the marker in a light square, as a share of the square; 1 without
         markers.
     bits_from : float
-        From where in the square on its content is unknown, as a share of the square; 1 without
-        markers.
+        Distance from the corner beyond which the square's content is unknown, as a share of the
+        square; 1 without markers.
     max_wander : float
-        Farthest that a corner may move away from its start, in sides of a square.
+        Greatest move of a corner away from its start, in sides of a square.
 
     Returns
     -------
     SaddleFit
-        The refined corners; those that the picture does not bear out are not valid.
+        Refined corners; those that the picture does not confirm are not valid.
     """
     pixels = np.array(starts, dtype=np.float64, order="C")
     quality = np.zeros((len(pixels), 4))

@@ -1,23 +1,18 @@
-"""Corners of markers without the pull of blur and gamma.
+"""Sub-pixel refinement of marker corners, without the bias of blur and gamma.
 
 An outer corner of a marker lies between light paper and dark ink. Blur and gamma shift both of its
-edges towards the dark, by a third of a pixel or so, and with them the corner. So the whole marker
-is fitted at once (`tag_model`): edges of both directions among its bits tell that shift apart from
-the marker's size. Pixels that something else covers, a laser stripe above all, do not fit; they and
-their surroundings are left out, and corners that the rest does not determine are not valid.
+edges towards the dark side, by about a third of a pixel, and the corner with them. Therefore the
+whole marker is fitted to the pixels at once, by Levenberg-Marquardt in compiled kernels: it has
+edges of both directions, outside and among its bits, which separate that shift from the marker's
+size. Pixels that something else covers, such as a laser stripe, do not fit. They and their
+surroundings are left out, and corners that the rest does not determine are not valid.
 
-What a marker looks like, and the compiled sums of its fit to pixels.
+Model: a grid of dark and light cells with a light margin around it; a homography with a slight bend
+(a dome bends straight lines) from marker to picture; a Gaussian blur of the light; a power law from
+light to grey level, the camera's gamma; a level (the dark cells' grey) and a contrast, which may
+vary linearly across the marker.
 
-A marker is a grid of dark and light cells with a light margin around it. Its model: a homography
-with a slight bend (a dome bends straight lines) from marker to picture; a Gaussian blur of the
-light; a power law from light to grey level, the camera's gamma; a level (the dark cells' grey) and
-a contrast that may vary linearly across the marker. Blur and gamma move every edge towards its dark
-side; because the model has edges of both directions, outside and among the bits, that shift is told
-apart from the marker's size, and the corners come out where they are printed.
-
-Marker coordinates q: (-1, -1) the top-left corner, (1, 1) the bottom-right one.
-
-Levenberg-Marquardt for one marker's model, compiled.
+Marker coordinates q: (-1, -1) is the top-left corner, (1, 1) the bottom-right one.
 """
 
 import math
@@ -40,7 +35,7 @@ U8Array = NDArray[np.uint8]
 # of the level 18-19 and of the contrast 20-21 along q.
 N_UNKNOWNS = 22
 BLUR, GAMMA, LEVEL, CONTRAST = 14, 15, 16, 17
-# The tone of ink over the contrast; below this black is black.
+# Ratio of the ink's tone to the contrast below which ink is taken as black.
 _LEAST_DARKNESS = 0.02
 
 
@@ -76,8 +71,8 @@ def _coverage(
 ) -> tuple[float, float, float, float, float]:
     """Return the light's share in a Gaussian about (u, v), and its derivatives.
 
-    Cell i, j of `cells` spans [i - 1, i] x [j - 1, j] with v as the row: the light margin is part
-    of it. The Gaussian has standard deviations `sigma_u`, `sigma_v` and correlation `rho`, which
+    Cell i, j of `cells` spans [i - 1, i] x [j - 1, j] with v as the row: the light margin is
+    included. The Gaussian has standard deviations `sigma_u`, `sigma_v` and correlation `rho`, which
     Mehler's series takes into account to its second order around every corner of a cell.
 
     Returns
@@ -120,7 +115,7 @@ def _coverage(
 
 @inline_borrowing_kernel
 def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float, float]:
-    """Return the tone, 0 to 1, of a share of light, as a camera with this gamma shows it.
+    """Return the tone, 0 to 1, of a share of light after the camera's gamma.
 
     Light adds up linearly and grey levels are its power 1 / gamma: `darkness` is the dark tone's
     grey level over the contrast.
@@ -149,7 +144,7 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
 def _model_row(
     cells: FloatArray, unknowns: FloatArray, q_0: float, q_1: float, row: FloatArray
 ) -> tuple[float, bool]:
-    """Return the grey value at a marker's point, and whether an edge is near; fill `row` (P,).
+    """Return the grey value at a marker's point, and if an edge is near; fill `row` (P,).
 
     `row` holds the derivatives of the grey value at the *pixel* by all unknowns.
     """
@@ -175,7 +170,7 @@ def _model_row(
     row[CONTRAST], row[20], row[21] = by_contrast, by_contrast * q_0, by_contrast * q_1
     near = by_u != 0.0 or by_v != 0.0
     if near:
-        # By pixel, and the marker moves against it.
+        # By the pixel; a move of the marker has the opposite sign.
         by_0, by_1 = slope * half * by_u, slope * half * by_v
         g_x, g_y = -(by_0 * i_00 + by_1 * i_10), -(by_0 * i_01 + by_1 * i_11)
         w = 1.0 + unknowns[6] * q_0 + unknowns[7] * q_1
@@ -195,7 +190,7 @@ def _model_row(
 def _pixel_to_marker(unknowns: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return the marker's point at a pixel; NaN where the homography turns over."""
     q_0, q_1 = 0.0, 0.0
-    # The bend is a small part of a pixel to a few: two corrections leave nothing of it.
+    # The bend is at most a few pixels: two corrections suffice.
     for _ in range(3):
         a, b, c = q_0 * q_0, q_0 * q_1, q_1 * q_1
         dx = x - unknowns[0] - (unknowns[8] * a + unknowns[9] * b + unknowns[10] * c)
@@ -236,15 +231,15 @@ def tag_sums(
     cells : array, shape (n + 2, n + 2)
         The marker's cells, 1 where light, and a light ring around them.
     reach : float
-        Up to where in q pixels count; 1 is the marker's edge.
+        Largest q of the pixels that count; 1 is the marker's edge.
     unknowns : array, shape (22,)
-        Where to evaluate.
+        Values of the unknowns.
     normal, gradient : array, shape (22, 22) and (22,)
         Written; of `normal` the lower half.
     residuals : array, shape (rows, columns)
         Written: picture minus model; NaN outside the marker.
     every : int
-        Take one pixel of so many: 1 all of them, 2 like the dark squares of a chessboard.
+        Subsampling: 1 takes all pixels, 2 takes those of one colour of a chessboard.
 
     Returns
     -------
@@ -291,7 +286,7 @@ def _sums(
             if weight == 0.0:
                 continue
             squares += weight * residual * residual
-            # Away from edges only the tones matter, which is much of the window.
+            # Away from edges, in much of the window, only the tones matter.
             first = 0 if near else GAMMA
             for i in range(first, N_UNKNOWNS):
                 weighted = weight * row[i]
@@ -324,12 +319,12 @@ def descend(
     n_steps: int,
     every: int,
 ) -> bool:
-    """Improve `unknowns` (22,) in place; False where the pixels do not determine them.
+    """Improve `unknowns` (22,) in place; return False if the pixels do not determine them.
 
     Parameters
     ----------
     image, corner, weights, cells, reach
-        As in `tag_model.tag_sums`.
+        As in `tag_sums`.
     prior : array, shape (2, 22)
         Expected values, and their weight in the sum of squares.
     unknowns : array, shape (22,)
@@ -339,9 +334,9 @@ def descend(
     covariance : array, shape (22, 22)
         Written: the inverse of the normal matrix; times the noise variance it is the covariance.
     n_steps : int
-        At most so many steps.
+        Greatest number of steps.
     every : int
-        Take one pixel of so many.
+        As in `tag_sums`.
     """
     normal, gradient = np.empty((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
     new_normal, new_gradient = np.empty((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
@@ -402,7 +397,7 @@ def _add_prior(
 
 @kernel
 def _shorten(step: FloatArray, unknowns: FloatArray) -> None:
-    """Limit how far the marker's points move, and the blur's change."""
+    """Limit the shift of the marker's points and the change of the blur."""
     side = np.sqrt(abs(unknowns[2] * unknowns[5] - unknowns[3] * unknowns[4])) + 1e-9
     moved = np.max(np.abs(step[:6])) + side * np.max(np.abs(step[6:8]))
     share = min(1.0, _MAX_STEP_PX / (moved + 1e-12))
@@ -413,8 +408,8 @@ def _shorten(step: FloatArray, unknowns: FloatArray) -> None:
 # Share of the light ring's cell that counts: a print may be cut off behind it.
 _RING_SHARE = 0.7
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-# What is known beforehand: bend as a share of the side, log of blur and gamma, slopes of tones as
-# shares of the contrast.
+# Prior standard deviations: bend as a share of the side, log of blur and gamma, slopes of tones
+# as shares of the contrast.
 _BEND_SHARE = 0.004
 _BLUR = (np.log(0.8), 0.7)
 _GAMMA = (np.log(1.6), 0.5)
@@ -422,10 +417,10 @@ _SLOPE_SHARE = 0.3
 _N_ROBUST_ROUNDS = 3
 _N_CLEAN_ROUNDS = 2
 _STEPS = 4
-# Pixels this many noise scales off, or this share of the contrast, are something else's.
+# Pixels this many noise scales off, or this share of the contrast, show something else.
 _POLLUTED_SCALES = 4.5
 _POLLUTED_SHARE = 0.08
-# Rounding to whole grey levels alone makes so much noise.
+# Noise of rounding to whole grey levels.
 _LEAST_NOISE = 0.3
 _MIN_CONTRAST = 8.0
 _MAX_RESIDUAL_SHARE = 0.06
@@ -436,7 +431,7 @@ _MAX_WANDER_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class TagFit:
-    """Refined corners of markers.
+    """Corners of markers, refined to sub-pixel accuracy.
 
     Attributes
     ----------
@@ -454,7 +449,7 @@ class TagFit:
 
 
 def refine_tags(image: GreyImage, ids: IntArray, quads: FloatArray, family: str) -> TagFit:
-    """Fit markers to a picture.
+    """Refine the corners of markers by a fit to the picture.
 
     Parameters
     ----------
@@ -463,7 +458,7 @@ def refine_tags(image: GreyImage, ids: IntArray, quads: FloatArray, family: str)
     ids : int array, shape (M,)
         Numbers of the markers in their dictionary.
     quads : array, shape (M, 4, 2)
-        About where their corners are, in OpenCV's order, pixels.
+        Approximate places of their corners, in OpenCV's order, pixels.
     family : str
         Name of the dictionary.
     """
@@ -490,7 +485,7 @@ def marker_cells(family: str, number: int) -> FloatArray:
 def _fit(
     image: GreyImage, cells: FloatArray, quad: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return the corners (4, 2) and their sigmas (4,), None where the marker does not fit."""
+    """Return the corners (4, 2) and their sigmas (4,); None if the marker does not fit."""
     reach = 1.0 + 2.0 * _RING_SHARE / (len(cells) - 2)
     corner, shape = _window(image, quad, reach)
     unknowns = _start(image, cells, quad)
@@ -502,7 +497,7 @@ def _fit(
     noise = 0.05 * unknowns[CONTRAST]
     for i in range(_N_ROBUST_ROUNDS + _N_CLEAN_ROUNDS):
         prior = _prior(side, unknowns[CONTRAST], noise)
-        # Half of the pixels tell what is polluted; all of them place the corners.
+        # Half of the pixels suffice to find polluted ones; all of them place the corners.
         every = 2 if i < _N_ROBUST_ROUNDS else 1
         if not descend(
             image,
@@ -534,9 +529,9 @@ def _fit(
 
 
 def _window(image: GreyImage, quad: FloatArray, reach: float) -> tuple[FloatArray, tuple[int, int]]:
-    """Return the first column and row, and the rows and columns, of what a marker covers."""
+    """Return first column and row, and numbers of rows and columns, of a marker's window."""
     middle = quad.mean(axis=0)
-    # Two pixels more than the ring, for a start that is not quite right.
+    # Two pixels more than the ring, to allow for errors of the start.
     spread = reach * (quad - middle)
     height, width = image.shape
     low = np.floor(np.clip(middle + spread.min(axis=0) - 2.0, 0, (width - 1, height - 1)))
@@ -546,7 +541,7 @@ def _window(image: GreyImage, quad: FloatArray, reach: float) -> tuple[FloatArra
 
 
 def _start(image: GreyImage, cells: FloatArray, quad: FloatArray) -> FloatArray | None:
-    """Return the unknowns that the rough corners and the cells' middles suggest."""
+    """Return the initial guess from the rough corners and the middles of the cells."""
     h = cv2.getPerspectiveTransform(_CORNERS.astype(np.float32), quad.astype(np.float32))
     if not np.all(np.isfinite(h)):
         return None
@@ -570,7 +565,7 @@ def _start(image: GreyImage, cells: FloatArray, quad: FloatArray) -> FloatArray 
 
 
 def _prior(side: float, contrast: float, noise: float) -> FloatArray:
-    """Return the expected unknowns and their weights (2, 22), for noise of that size."""
+    """Return the prior means of the unknowns and their weights (2, 22), for a given noise."""
     mean, spread = np.zeros(N_UNKNOWNS), np.full(N_UNKNOWNS, np.inf)
     spread[6:8] = 0.5
     spread[8:14] = _BEND_SHARE * side
@@ -581,9 +576,9 @@ def _prior(side: float, contrast: float, noise: float) -> FloatArray:
 
 
 def _weigh(residuals: FloatArray, contrast: float, robust: bool) -> tuple[FloatArray, float]:
-    """Return weights by the residuals, and the noise: soft ones first, then in or out.
+    """Return weights by the residuals, and the noise: soft weights first, then 0 or 1.
 
-    The surroundings of polluted pixels are left out as well: a stripe's foot is faint, but pulls.
+    The surroundings of polluted pixels are left out as well: the faint flank of a stripe biases.
     """
     size = np.abs(residuals)
     noise = max(1.4826 * float(np.nanmedian(size)), _LEAST_NOISE)

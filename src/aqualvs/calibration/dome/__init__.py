@@ -1,1 +1,1 @@
-"""Calibration of the lens's place in the dome and of the camera's orientation."""
+"""Calibration of the lens's position in the dome and of the camera's orientation."""

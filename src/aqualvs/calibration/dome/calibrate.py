@@ -1,11 +1,9 @@
-"""`calibrate dome`: where the lens sits in the dome, and how the camera is turned (paper, 2.2).
+"""Calibration of the dome: position of the lens in it and rotation of the camera (paper, 2.2).
 
-Boards seen through the dome at poses that are known, of which only the distance is known (the
-paper's rail), or of which nothing is known; in air, in water, or both in one solve. Tolerances of
-the dome and the covariance of the intrinsics are priors, so that what pictures cannot tell keeps
-the uncertainty it had.
-
-What a solved dome means, in plain words.
+Boards are seen through the dome at poses that are known, known by their distance only (the paper's
+rail), or unknown; in air, in water, or both in one solve. Tolerances of the dome and the covariance
+of the intrinsics are priors, so that a number that the pictures do not determine keeps the
+uncertainty it had. `findings` says in plain words what the pictures determined.
 """
 
 from collections.abc import Sequence
@@ -64,7 +62,8 @@ _WORDS = {
     "rotation_y": "rotation about y",
     "rotation_z": "rotation about z",
 }
-# Shares of the prior's sigma: nothing learnt, something learnt.
+# Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
+# something.
 _NOTHING, _SOMETHING = 0.9, 0.5
 _CORRELATED = 0.95
 _FAR_FROM_PRIOR = 3.5
@@ -73,7 +72,7 @@ _FAR_FROM_PRIOR = 3.5
 def findings(
     problem: DomeProblem, solution: Solution[BundleState], result: DomeCalibration
 ) -> list[str]:
-    """Return one sentence for everything worth knowing."""
+    """Return one sentence for each finding."""
     bundle, uncertainty = problem.bundle, result.uncertainty
     seen = observability(bundle, solution, uncertainty, _DOME)
     lines = [_lens(result), _rotation(problem, result), *_dome(result, seen), *_untold(seen)]
@@ -153,7 +152,7 @@ def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observabili
 
 
 def _untold(seen: Observability) -> list[str]:
-    """Name the combinations of which the pictures tell nothing."""
+    """Name the combinations that the pictures do not determine."""
     untold = seen.untold()
     if not untold:
         return []
@@ -165,7 +164,7 @@ def _untold(seen: Observability) -> list[str]:
 
 
 def _entangled(result: DomeCalibration) -> list[str]:
-    """Name the pair of numbers that the data tell apart worst, if they hardly do."""
+    """Name the pair of numbers with the strongest correlation, if the data hardly separate them."""
     uncertainty = result.uncertainty
     sigma = np.sqrt(np.diag(uncertainty.covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,7 +192,7 @@ def _media(problem: DomeProblem, result: DomeCalibration) -> list[str]:
 
 
 def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> list[str]:
-    """Name what moved further than its prior allows."""
+    """Name the numbers that moved further than their priors allow."""
     bundle = problem.bundle
     names = [name for name in bundle.free if name in bundle.priors.names]
     moved = rig_difference(bundle.start.rig, solution.state.rig, names)
@@ -220,12 +219,12 @@ def _held_back(held: HeldBack | None) -> list[str]:
     return [f"{told}: the pictures do not show that there is a dome"]
 
 
-# A solve that leaves less than this has found the place; one that leaves more may be elsewhere.
+# A solve with smaller residuals has found the minimum; one with larger ones may be in another.
 _GOOD_NOISE_PX = 0.5
 # A view is bad if it is this many times noisier than the typical one, and noisier than this.
 _BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.5
 _BAD_SHARE = 1.0 / 3.0
-# A given distance this many sigmas off is a mistake.
+# A given distance with an error of this many sigmas is a mistake.
 _WRONG_DISTANCE = 5.0
 
 
@@ -235,7 +234,7 @@ def dome(
     options: DomeOptions | None = None,
     known: RigUncertainty | None = None,
 ) -> DomeCalibration:
-    """Solve lens position, camera rotation and all that goes with them.
+    """Solve lens position, camera rotation and the other free numbers.
 
     Parameters
     ----------
@@ -246,8 +245,8 @@ def dome(
         One for each medium.
     options : DomeOptions, optional
     known : RigUncertainty, optional
-        Of the intrinsics (and of the rotation, where no pose is known); by default what the rig
-        itself has written down. Intrinsics without any are taken as exact.
+        Of the intrinsics (and of the rotation, if no pose is known); by default the rig's own.
+        Intrinsics without an uncertainty are taken as exact.
 
     Returns
     -------
@@ -282,7 +281,7 @@ def dome(
 def _solved(
     rig: Rig, sets: Sequence[BoardSet], known: RigUncertainty, options: DomeOptions
 ) -> tuple[DomeProblem, Solution[BundleState]]:
-    """Solve from where the rig puts the lens, or else from the dome's centre."""
+    """Solve from the rig's lens position, or else from the dome's centre."""
     best: tuple[DomeProblem, Solution[BundleState]] | None = None
     trouble: list[CalibrationError | RigError] = []
     for start in start_rigs(rig):
@@ -309,7 +308,7 @@ def _solved(
 def _without_bad_views(
     problem: DomeProblem, solution: Solution[BundleState]
 ) -> tuple[DomeProblem, Solution[BundleState]]:
-    """Leave out views that fit far worse than the others, and solve again."""
+    """Leave out views that fit much worse than the others, and solve again."""
     n = len(problem.shots)
     noise = CORNER_SIGMA_PX * np.array(solution.block_scales[:n])
     typical = noise_px(solution)
@@ -327,10 +326,10 @@ def _without_bad_views(
 def _without_wrong_distances(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> tuple[DomeProblem, Solution[BundleState]]:
-    """Forget given distances that the pictures contradict, if they are few."""
+    """Drop given distances that the pictures contradict, if they are few."""
     wrong = _wrong_distances(problem, solution)
     if wrong and problem.held.names:
-        # Numbers that were held bend all distances; they must not be blamed for it.
+        # Errors of held numbers bias all distances; distances must not be rejected for that.
         free = problem.with_held_free()
         wrong = _wrong_distances(free, solve(free.bundle, solution.state))
     if not wrong:
@@ -364,7 +363,7 @@ def _again(
 def _of_rail(
     problem: DomeProblem, solution: Solution[BundleState], options: DomeOptions
 ) -> FloatArray:
-    """Return the covariance that an error shared by all given distances adds."""
+    """Return the covariance added by an error that all given distances share."""
     by_offset = options.distance_offset_sigma * solved_by_offset(problem, solution)
     return np.outer(by_offset, by_offset)
 

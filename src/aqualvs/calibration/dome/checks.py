@@ -1,8 +1,10 @@
-"""Refusals of `calibrate dome`: no rig is better than a wrong one.
+"""Checks of `calibrate dome`: refusals of pictures and solutions that would make a wrong rig.
 
-Whether pictures were taken in the medium that they are said to have been taken in.
-
-Errors that all given distances of a rail share: its zero, and its scale against the board's.
+- Start and solution: distances that cannot be, poses from which the board is not seen, wrong units,
+  views that the solution does not explain, numbers that the pictures do not determine.
+- Medium: the stated index of each set against the one that the pictures fit best, and against the
+  other medium (water for air, air for water).
+- Rail: errors that all given distances share, their zero and their scale against the board's.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,22 +35,22 @@ from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import RigUncertainty
 
-# An index this many sigmas from the stated one is not it.
+# An index this many sigmas from the stated one contradicts it.
 _SURE = 5.0
 MAX_NOISE_PX = 1.0
-"""Corners noisier than this mean that something else is wrong than noise."""
-# Differences that make a wrong rig, and that are worth a remark.
+"""Corners noisier than this indicate an error other than noise."""
+# Differences that are refused, and that are reported.
 _WRONG, _WORTH_SAYING = 0.02, 0.003
 # Between air and water.
 _HALFWAY = 1.15
 _AIR, _WATER = 1.0003, 1.3335
-# An index that the pictures tell worse than this, near the stated one, may be a wholly other one.
+# With a larger uncertainty than this, an index near the stated one may be that of the other medium.
 _VAGUE = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class FittedIndex:
-    """The index that pictures call for, and how well they tell it."""
+    """Index of a medium as fitted to the pictures, with its uncertainty."""
 
     n: float
     sigma: float
@@ -62,12 +64,12 @@ def noise_px(solution: Solution[BundleState]) -> float:
 def check_media(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> list[str]:
-    """Compare every stated index with that which the pictures fit best.
+    """Compare every stated index with the one that fits the pictures best.
 
     Returns
     -------
     list of str
-        Doubts, in plain words.
+        Warnings, in plain words.
 
     Raises
     ------
@@ -78,8 +80,8 @@ def check_media(
     for medium, one in enumerate(sets):
         if _suspicion(problem, solution, medium, one) is _Suspicion.NONE:
             continue
-        # Numbers that were held, and a rail's zero, bend the solution; the medium must not take
-        # the blame for them.
+        # Errors of held numbers and of a rail's zero bias the solution; they must not be attributed
+        # to the medium.
         bare = problem.with_held_free().without_distances(problem.measured_views)
         own = solve(bare.bundle, solution.state)
         suspicion = _suspicion(bare, own, medium, one)
@@ -91,7 +93,7 @@ def check_media(
 
 
 def in_other_medium(problem: DomeProblem, medium: int) -> Solution[BundleState] | None:
-    """Solve with a set's pictures in water for air, in air for water; None if that cannot be."""
+    """Solve with a set's medium swapped, water for air and air for water; None if impossible."""
     start = problem.bundle.start
     media = start.media.copy()
     media[medium] = other_medium(float(media[medium]))
@@ -115,7 +117,7 @@ def other_medium(n: float) -> float:
 
 
 def wrong_medium(one: BoardSet, index: float) -> CalibrationError:
-    """Return what to say of pictures that were taken in another medium than stated."""
+    """Return the message on pictures that were taken in another medium than stated."""
     crossed = (index < _HALFWAY) != (one.n_medium < _HALFWAY)
     taken = "in air" if index < _HALFWAY else "in water"
     remedy = (
@@ -138,9 +140,9 @@ def _freed(bundle: Bundle, medium: int) -> Bundle:
 class _Suspicion(Enum):
     NONE = auto()
     NEARBY = auto()
-    """The residuals call for another index."""
+    """Another index fits the residuals."""
     OTHER = auto()
-    """The residuals do not tell the index, or there is something else wrong."""
+    """The residuals do not determine the index, or something else is wrong."""
 
 
 def _suspicion(
@@ -156,7 +158,7 @@ def _suspicion(
 def _nearby(
     bundle: Bundle, solution: Solution[BundleState], medium: int, stated: float
 ) -> FittedIndex:
-    """Return the index that the residuals call for: Newton's step from the solution."""
+    """Return the index that fits the residuals: one Newton step from the solution."""
     blocks = bundle.blocks(solution.state)
     n_data = sum(1 for b in solution.blocks if b.group != PRIORS)
     equations = normal_equations(
@@ -177,7 +179,7 @@ def _nearby(
 def _weighed_against_best(
     problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
 ) -> list[str]:
-    """Solve with the medium free, and compare."""
+    """Solve with a free index of the medium, and compare."""
     free = _freed(problem.bundle, medium)
     try:
         best = solve(free, solution.state)
@@ -200,7 +202,7 @@ def _weighed_against_best(
 def _weighed_against_other(
     problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
 ) -> list[str]:
-    """Solve with the other medium too, where a lens near the centre hides which one it is."""
+    """Solve with the other medium too, if a lens near the centre hides the difference."""
     rival = in_other_medium(problem, medium)
     if rival is None:
         return []
@@ -217,7 +219,7 @@ def _weighed_against_other(
 
 
 def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> float:
-    """Return how much better a rival explains all but the media; both at the smaller noise."""
+    """Return how much better a rival explains all but the media, both at the smaller noise."""
     # The prior of the media stands last, where there is one.
     n = min(len(solution.blocks), len(rival.blocks))
     pairs = zip(solution.block_scales[:n], rival.block_scales[:n], strict=True)
@@ -229,15 +231,15 @@ def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> floa
 
 
 _CHECK_SURE = 3.5
-# Shared errors beyond these (metres, share) make a wrong rig; smaller ones are worth a remark.
+# Shared errors beyond these (metres, share) are refused; smaller ones are reported.
 _MAX_OFFSET, _MAX_SCALE = 1e-3, 0.005
-# Place of the shift along y in a step of a pose.
+# Index of the shift along y in a step of a pose.
 _SHIFT_Y = 4
 
 
 @dataclass(frozen=True, slots=True)
 class SharedError:
-    """An error that all given distances share, as the pictures see it.
+    """An error that all given distances share, estimated from the pictures.
 
     Attributes
     ----------
@@ -250,7 +252,7 @@ class SharedError:
 
     @property
     def sigmas(self) -> float:
-        """How many sigmas it is from none."""
+        """Size of the error in sigmas."""
         return abs(self.value) / self.sigma
 
 
@@ -265,17 +267,17 @@ def check_shared_errors(
     solution : Solution
         Of it.
     covariance : array, shape (P, P)
-        Of what was solved, with that of numbers that were held passed on.
+        Of the solved numbers, with the uncertainty of held ones propagated.
 
     Returns
     -------
     list of str
-        Doubts, in plain words.
+        Warnings, in plain words.
 
     Raises
     ------
     CalibrationError
-        If the distances are off together by more than a good rig can bear.
+        If the shared error of the distances is too large for a good rig.
     """
     blocks = distance_blocks(problem, solution)
     if len(blocks) < 2:
@@ -310,7 +312,7 @@ def distance_blocks(problem: DomeProblem, solution: Solution[BundleState]) -> di
 
 
 def solved_by_offset(problem: DomeProblem, solution: Solution[BundleState]) -> FloatArray:
-    """Return the derivative (P,) of what was solved by an error that all distances share."""
+    """Return the derivative (P,) of the solution by an error that all distances share."""
     blocks = distance_blocks(problem, solution)
     slopes, _, _ = _slopes(len(solution.covariance), blocks, dict.fromkeys(blocks, 1.0))
     by_offset: FloatArray = solution.covariance @ slopes
@@ -320,7 +322,7 @@ def solved_by_offset(problem: DomeProblem, solution: Solution[BundleState]) -> F
 def _shared_error(
     covariance: FloatArray, blocks: Mapping[int, Block], shape: Mapping[int, float]
 ) -> SharedError:
-    """Fit an error of a given shape over the distances, from slopes at the solution."""
+    """Fit an error of a given shape over the distances, from derivatives at the solution."""
     slopes, own, gradient = _slopes(len(covariance), blocks, shape)
     left = own - float(slopes @ covariance @ slopes)
     if left <= 1e-9 * own:
@@ -331,11 +333,11 @@ def _shared_error(
 def _slopes(
     n_parameters: int, blocks: Mapping[int, Block], shape: Mapping[int, float]
 ) -> tuple[FloatArray, float, float]:
-    """Return cross information with what was solved, own information, and minus the gradient."""
+    """Return cross information with the solved numbers, own information, and minus the gradient."""
     slopes, own, gradient = np.zeros(n_parameters), 0.0, 0.0
     for i, block in blocks.items():
         weight = float(block.loss.weight(block.lengths)[0])
-        # A given distance that is too large is mended by what a shift of the board along y does.
+        # A given distance that is too large acts as a shift of the board along y.
         by_error = shape[i] * float(block.jacobian[0, 0, _SHIFT_Y])
         slopes[block.columns] += weight * by_error * block.jacobian[0, 0]
         own += weight * by_error**2
@@ -343,19 +345,19 @@ def _slopes(
     return slopes, own, gradient
 
 
-# A lens this near the inner surface (in radii) was stopped by it.
+# A lens this near the inner surface (in radii) was stopped by that limit.
 _AT_THE_WALL = 0.995
-# A lens known worse than this (metres) costs 0.4 % of range.
+# Uncertainty of the lens position (metres) that makes an error of 0.4 % of range.
 _MAX_LENS_SIGMA = 2e-3
-# Differences of scale that the sizes of boards and rails do not have by chance.
+# Differences of scale that are too large for errors of boards and rails.
 _FINE_SCALE, _EXACT_SCALE = 0.003, 0.02
-# Before the solve a wrong medium or lens position may look like a wrong scale.
+# Larger limit before the solve: a wrong medium or lens position may look like a wrong scale.
 _COARSE_SCALE = 0.5
-# Ratios of lengths that scatter less than this tell one wrong scale.
+# Ratios of lengths with less scatter than this show one wrong scale.
 _SAME_RATIO = 0.05
-# Distance from the image's centre, in its sizes, beyond which no start puts what can be seen.
+# Distance from the image's centre, in its sizes, beyond which a board counts as not seen.
 _SURELY_SEEN = 2.0
-# Typical residual of distances, in sigmas, that have nothing against a solution.
+# Typical residual of distances, in sigmas, that agree with a solution.
 _FITTING_DISTANCE = 1.5
 _POSE_RULES = (
     "poses must be dome_from_board in millimetres, with OpenCV's board axes (x right, y down, z "
@@ -364,7 +366,7 @@ _POSE_RULES = (
 
 
 def check_start(problem: DomeProblem) -> None:
-    """Refuse boards at distances that cannot be, or that given distances contradict grossly.
+    """Refuse boards at impossible distances, or grossly different from the given ones.
 
     Raises
     ------
@@ -393,7 +395,7 @@ def check_start(problem: DomeProblem) -> None:
 
 
 def _check_seen(problem: DomeProblem) -> None:
-    """Refuse exact poses at which the camera cannot see the board at all."""
+    """Refuse exact poses from which the camera cannot see the board at all."""
     bundle = problem.bundle
     fixed = [i for i, view in enumerate(bundle.views) if view.fixed]
     unseen = []
@@ -401,7 +403,7 @@ def _check_seen(problem: DomeProblem) -> None:
         view = bundle.views[i]
         camera = bundle.start.camera(view.medium)
         pixels, _ = camera.project(view.dome_from_target.apply(view.view.points))
-        # Far outside the picture is as good as not to be seen; NaN compares false.
+        # Far outside the picture counts as not seen; NaN compares false.
         off_centre = np.abs(pixels / camera.size_px - 0.5).max(axis=1)
         if np.mean(off_centre < _SURELY_SEEN) < 0.5:
             unseen.append(i)
@@ -415,7 +417,7 @@ def _check_seen(problem: DomeProblem) -> None:
 def contradicted_distances(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> CalibrationError:
-    """Return what to say of given distances most of which the pictures contradict."""
+    """Return the message on given distances if the pictures contradict most of them."""
     for medium, one in enumerate(sets):
         rival = in_other_medium(problem, medium)
         if rival is not None and _distances_fit(problem, rival):
@@ -451,7 +453,7 @@ def _wrong_lengths(problem: DomeProblem, solution: Solution[BundleState]) -> Cal
 def check_solution(
     problem: DomeProblem, solution: Solution[BundleState], uncertainty: RigUncertainty
 ) -> None:
-    """Refuse a solution that does not explain the pictures, or that they do not determine.
+    """Refuse a solution that does not explain the pictures, or is not determined by them.
 
     Parameters
     ----------
@@ -459,7 +461,7 @@ def check_solution(
     solution : Solution
         Of it.
     uncertainty : RigUncertainty
-        Of what was solved, with that of numbers that were held passed on.
+        Of the solved numbers, with the uncertainty of held ones propagated.
 
     Raises
     ------
@@ -511,7 +513,7 @@ def _remedy(problem: DomeProblem) -> str:
 
 
 def _exact_pose_fault(problem: DomeProblem, solution: Solution[BundleState]) -> str | None:
-    """Return what is wrong with poses given as exact, compared with what each picture says."""
+    """Return the fault of poses given as exact, compared with the pose from each picture."""
     given, found = [], []
     for i, shot in enumerate(problem.shots):
         if shot.kind is not PoseKind.EXACT:

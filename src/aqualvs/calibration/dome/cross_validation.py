@@ -1,4 +1,4 @@
-"""Whether the dome predicts corners that nothing was solved from better than a bare lens does."""
+"""Cross-validation of the dome: its prediction of unused corners against that of a bare lens."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,25 +15,24 @@ from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Camera
 
-# The views are held back in so many parts, one after the other; fewer than this are all needed.
+# Number of folds, and least number of views; with fewer all are needed for the solve.
 _PARTS, _MIN_VIEWS = 4, 8
-# Half a view must still fix a pose.
+# Half a view must still determine a pose.
 _MIN_POINTS = 12
 
 
 def compare_with_bare_lens(
     problem: DomeProblem, solution: Solution[BundleState]
 ) -> HeldBack | None:
-    """Solve both models from three views in four, and predict the fourth with them; four times.
+    """Solve both models from three views in four and predict the fourth; four times.
 
     The pose of a view held back is found from half of its corners; the other half is predicted.
-    Outliers of the whole solve are left out for both, and so are corners that either model cannot
-    see.
+    Outliers of the whole solve and corners that either model cannot see are left out for both.
 
     Returns
     -------
     HeldBack or None
-        None where there are too few views.
+        None if there are too few views.
     """
     n = len(problem.shots)
     believed = [
@@ -82,12 +81,12 @@ def _dome_state(
 def _bare_state(
     problem: DomeProblem, solution: Solution[BundleState], rest: Sequence[int]
 ) -> BundleState:
-    """Solve a bare lens, free to sit and look anywhere, from the same pictures."""
+    """Solve a bare lens with free pose from the same pictures."""
     bundle = problem.bundle
     rig = replace(solution.state.rig, dome=None)
     views = [_bare_view(rig.camera(), bundle.views[i], solution.state, i) for i in rest]
     intrinsics = tuple(name for name in bundle.free if name in rig.lens.parameter_names)
-    # At unknown poses every place is as good as any other.
+    # With unknown poses the place is arbitrary.
     free = (LENS + ROTATION if problem.rotation_is_solved else ()) + intrinsics
     start_rig = replace(bundle.start.rig, dome=None)
     start = BundleState(start_rig, solution.state.media, tuple(v.dome_from_target for v in views))
@@ -112,7 +111,7 @@ def _bare_view(camera: Camera, target: TargetView, state: BundleState, i: int) -
 def predicted(state: BundleState, media: Sequence[int], views: Sequence[View]) -> list[FloatArray]:
     """Return residuals (N, 2) of each view's odd corners, from poses found with the even ones.
 
-    NaN where the model cannot see a corner.
+    NaN for corners that the model cannot see.
     """
     errors = []
     for medium, view in zip(media, views, strict=True):

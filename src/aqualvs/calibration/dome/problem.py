@@ -1,11 +1,11 @@
-"""The problem of `calibrate dome`: what is free, what is known, and where to start.
+"""The least-squares problem of `calibrate dome`: its input, free and known numbers, initial guess.
 
-What `calibrate dome` is given: sets of views of boards, each in one medium, and options.
+The input is sets of views of boards, each set in one medium, and options (`BoardSet`,
+`DomeOptions`).
 
-How well boards were set up square to the rail, as the boards themselves tell.
-
-Most boards of a rail stand square, some lean by a degree or more. How closely the good ones agree
-is not known beforehand: it is estimated by likelihood, on a ladder of scales.
+Prior of the boards' tilt: most boards of a rail stand square, some lean by a degree or more. How
+closely the good ones agree is not known beforehand. It is estimated by maximum likelihood, over a
+ladder of scales (`with_leaning_as_found`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,7 +37,7 @@ _MIN_POINTS = 60
 
 
 class GivenPose(Protocol):
-    """What was measured of a board's pose beforehand."""
+    """Measurements of a board's pose: the whole pose, its distance, or nothing."""
 
     @property
     def dome_from_board(self) -> SE3 | None:
@@ -45,11 +45,11 @@ class GivenPose(Protocol):
 
     @property
     def distance(self) -> float | None:
-        """Where the board's plane meets the dome's y axis, in metres, or None."""
+        """Distance along the dome's y axis to the board's plane, in metres, or None."""
 
 
 class PoseKind(StrEnum):
-    """How much is known of a board's pose."""
+    """Kind of knowledge of a board's pose."""
 
     EXACT = "exact"
     DISTANCE = "distance"
@@ -57,7 +57,7 @@ class PoseKind(StrEnum):
 
 
 def kind_of(given: GivenPose | None) -> PoseKind:
-    """Return how much is known of a pose."""
+    """Return the kind of knowledge of a pose."""
     if given is None:
         return PoseKind.UNKNOWN
     if given.dome_from_board is not None:
@@ -76,11 +76,11 @@ class BoardSet:
     views : tuple of View
         One for each picture.
     poses : tuple of GivenPose or None
-        What is known of each view's board; empty where nothing is known of any.
+        Measurements of each view's board; empty if nothing is known of any.
     n_medium : float
         Index outside the dome (vacuum = 1).
     sigma_medium : float
-        How well it is known; 0 takes it as exact.
+        Its standard deviation; 0 takes it as exact.
     """
 
     name: str
@@ -94,33 +94,33 @@ class BoardSet:
             raise ValueError(f"{len(self.poses)} poses given for {len(self.views)} views")
 
     def given(self, i_view: int) -> GivenPose | None:
-        """Return what is known of a view's board."""
+        """Return the measurements of a view's board."""
         return self.poses[i_view] if self.poses else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DomeOptions:
-    """What `calibrate dome` assumes and does; SI units and radians.
+    """Options of `calibrate dome`; SI units and radians.
 
     Attributes
     ----------
     inner_radius_sigma, thickness_sigma : float
-        How well the dome's sizes are known; 0 takes one as exact.
+        Standard deviations of the dome's sizes; 0 takes one as exact.
     n_acrylic_sigma : float
-        How well the dome's index is known.
+        Standard deviation of the dome's index.
     distance_sigma : float
-        How well given distances are known, one apart from the other.
+        Standard deviation of given distances, independent of each other.
     distance_offset_sigma : float
-        How well the point is known that they are all measured from: an error that they share
-        shifts the lens as a whole.
+        Standard deviation of the zero of all distances: this shared error shifts the lens as a
+        whole.
     tilt_sigma : float
-        How square to the dome boards at known distances stand that were set up well, about each
-        axis. Boards that were not may be off by any amount, as long as they are a minority.
+        Standard deviation, about each axis, of well set up boards at known distances from
+        square to the dome. A minority of boards may be off by any amount.
     refine_intrinsics : bool
-        Whether intrinsics move within what the camera's calibration says of them. If not, they are
-        held, and their uncertainty is passed on to the result.
+        Whether intrinsics are solved too, with the camera's calibration as their prior. If not,
+        they are held, and their uncertainty is propagated to the result.
     check_held_back : bool
-        Whether the dome is compared with a bare lens on views held back.
+        Whether to compare the dome with a bare lens on views held back.
     """
 
     inner_radius_sigma: float = 1e-4
@@ -141,12 +141,12 @@ class DomeOptions:
 
 
 def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
-    """Refuse a rig without a dome, and sets that hold too little.
+    """Refuse a rig without a dome, and sets with too little in them.
 
     Raises
     ------
     CalibrationError
-        With what there is and what it takes.
+        With what is given and what is needed.
     """
     if rig.dome is None:
         raise CalibrationError(
@@ -173,13 +173,13 @@ def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
 
 LENS = ("lens_x", "lens_y", "lens_z")
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")
-# Wherever the lens is, poses of a board that is what it is said to be come nearer than this.
+# For every lens position, poses of the right board are nearer than this.
 _MAX_MISFIT_PX = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One view with its set and what is given of its board; `label` names it in messages."""
+    """One view with its set and the measurements of its board; `label` names it in messages."""
 
     label: str
     view: View
@@ -188,13 +188,13 @@ class Shot:
 
     @property
     def kind(self) -> PoseKind:
-        """How much is known of the board's pose."""
+        """Kind of knowledge of the board's pose."""
         return kind_of(self.given)
 
 
 @dataclass(frozen=True, slots=True)
 class DomeProblem:
-    """A bundle with what it was made of.
+    """The least-squares problem: a bundle and the views it was made of.
 
     Attributes
     ----------
@@ -202,9 +202,9 @@ class DomeProblem:
     shots : tuple of Shot
         One for each of the bundle's views.
     held : RigUncertainty
-        Numbers that are taken as they are though they are not exact.
+        Uncertainty of numbers that are not solved for.
     left_out : dict
-        Labels of views that could not be used, and why.
+        Labels of views that could not be used, with the reason.
     """
 
     bundle: Bundle
@@ -214,12 +214,12 @@ class DomeProblem:
 
     @property
     def rotation_is_solved(self) -> bool:
-        """Whether boards tell the camera's rotation."""
+        """True if known poses of boards determine the camera's rotation."""
         return any(shot.kind is not PoseKind.UNKNOWN for shot in self.shots)
 
     @property
     def measured_views(self) -> list[int]:
-        """Views whose board's distance is given and believed."""
+        """Indices of views whose board's distance is given and used."""
         return [
             i
             for i, view in enumerate(self.bundle.views)
@@ -227,7 +227,7 @@ class DomeProblem:
         ]
 
     def given_distance(self, i_view: int) -> float:
-        """Return the given distance of a view's board; NaN where none is given."""
+        """Return the given distance of a view's board; NaN if none is given."""
         given = self.shots[i_view].given
         return float("nan") if given is None or given.distance is None else given.distance
 
@@ -248,7 +248,7 @@ class DomeProblem:
         )
 
     def with_held_free(self) -> "DomeProblem":
-        """Return the problem with what is held solved for, within what is known of it."""
+        """Return the problem with the held numbers solved for, with priors."""
         bundle = replace(
             self.bundle,
             free=(*self.bundle.free, *self.held.names),
@@ -257,7 +257,7 @@ class DomeProblem:
         return replace(self, bundle=bundle, held=RigUncertainty.none())
 
     def without_distances(self, wrong: Sequence[int]) -> "DomeProblem":
-        """Return the problem with some of the given distances forgotten."""
+        """Return the problem without some of the given distances."""
         views = list(self.bundle.views)
         for i in wrong:
             known = tuple(t for t in views[i].known if not isinstance(t, KnownDistance))
@@ -265,7 +265,7 @@ class DomeProblem:
         return replace(self, bundle=replace(self.bundle, views=tuple(views)))
 
     def with_lean_sigma(self, sigma: float) -> "DomeProblem":
-        """Return the problem with other expectations of how boards lean that stand well."""
+        """Return the problem with another prior scale of the boards' tilt."""
         views = []
         for view in self.bundle.views:
             known = tuple(
@@ -286,9 +286,9 @@ def shots_of(sets: Sequence[BoardSet]) -> list[Shot]:
 
 
 def start_rigs(rig: Rig) -> Iterator[Rig]:
-    """Yield the rig, then the same with its lens at the dome's centre, from where solves find home.
+    """Yield the rig, then the same with its lens at the dome's centre, where solves converge.
 
-    A lens that is said to sit far to the wrong side may leave no pose of a board to start from.
+    A stated lens position far to the wrong side may leave no pose of a board to start from.
     """
     yield rig
     yield replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
@@ -297,12 +297,12 @@ def start_rigs(rig: Rig) -> Iterator[Rig]:
 def dome_problem(
     rig: Rig, sets: Sequence[BoardSet], known: RigUncertainty, options: DomeOptions
 ) -> DomeProblem:
-    """Set the problem up, with starting poses.
+    """Return the problem with starting poses.
 
     Parameters
     ----------
     rig : Rig
-        Where it starts: its lens lies inside the dome.
+        Initial guess; its lens lies inside the dome.
     sets : sequence of BoardSet
     known : RigUncertainty
         Of the rig beforehand: intrinsics from the camera's calibration.
@@ -311,7 +311,7 @@ def dome_problem(
     Raises
     ------
     CalibrationError
-        If no view has a pose to start from.
+        If no view has a starting pose.
     """
     shots, poses, left_out = _started(rig, sets)
     boards = [i for i, shot in enumerate(shots) if shot.kind is PoseKind.DISTANCE]
@@ -362,7 +362,7 @@ def _started(rig: Rig, sets: Sequence[BoardSet]) -> tuple[list[Shot], list[SE3],
 
 
 def _why_none(rig: Rig, sets: Sequence[BoardSet]) -> str | None:
-    """Return why no board has a pose outside the dome, from its size without one."""
+    """Return why no board has a pose outside the dome, from its distance without a dome."""
     bare = rig.bare_camera()
     found = {}
     for shot in shots_of(sets):
@@ -391,7 +391,7 @@ def _known(shot: Shot, square: FloatArray, options: DomeOptions) -> tuple[PoseTe
 def _priors(
     rig: Rig, known: RigUncertainty, options: DomeOptions, solves_rotation: bool
 ) -> tuple[RigUncertainty, RigUncertainty]:
-    """Return what is known of numbers that are solved for, and of those that are held."""
+    """Return the prior uncertainty of solved numbers, and the uncertainty of held ones."""
     intrinsics = [n for n in rig.lens.parameter_names if known.sigmas.get(n, 0.0) > 0.0]
     rotation = [n for n in ROTATION if known.sigmas.get(n, 0.0) > 0.0 and not solves_rotation]
     tolerances = {
@@ -405,29 +405,29 @@ def _priors(
     return combined(dome, moving), held
 
 
-# Nobody sets up boards better than this: 0.9 mm a metre.
+# Boards are not set up better than this: 0.9 mm a metre.
 _FINEST = float(np.deg2rad(0.05))
 _STEP = 0.5
-# A finer scale must explain the boards so much better (natural logarithm): odds of 20 to 1.
+# A finer scale must raise the log likelihood by this much: odds of 20 to 1.
 _EVIDENCE = 3.0
 
 
 def with_leaning_as_found(
     problem: DomeProblem, solution: Solution[BundleState], sigma: float
 ) -> tuple[DomeProblem, Solution[BundleState]]:
-    """Solve with a finer scale of leaning as long as boards agree that closely.
+    """Solve with a finer scale of the boards' tilt as long as they agree that closely.
 
     Parameters
     ----------
     problem, solution
         Solved with `sigma`.
     sigma : float
-        Scale of leaning, in radians.
+        Scale of the tilt, in radians.
 
     Returns
     -------
     problem, solution
-        The same, where boards do not agree better, or nothing is known of their poses.
+        Unchanged if boards do not agree better, or nothing is known of their poses.
     """
     while sigma * _STEP >= _FINEST * (1.0 - 1e-9):
         finer = problem.with_lean_sigma(sigma * _STEP)
@@ -440,7 +440,7 @@ def with_leaning_as_found(
 
 
 def _misfit(solution: Solution[BundleState], sigma: float) -> float:
-    """Negative log likelihood of two-dimensional Cauchy leaning, but for a constant."""
+    """Return the negative log likelihood of two-dimensional Cauchy tilts, up to a constant."""
     leaning = [block.residuals[0] for block in solution.blocks if block.group == TILTS]
     if not leaning:
         return 0.0

@@ -1,9 +1,8 @@
-"""Calibrating lasers: from pictures of a box or a board that the lasers shine on, to planes.
+"""Calibration of the lasers: planes from pictures of a box, board or wall that they shine on.
 
-The paper's automatic calibration (section 3.3) with all lasers on at once, several pictures in one
-solve, and an uncertainty that carries the camera's along.
-
-How good lasers are on pictures that they were not calibrated from: leave one out.
+This is the paper's automatic calibration (section 3.3) with all lasers on at once, several pictures
+in one solve, and a covariance that includes the camera's. `leave_one_out` measures each picture's
+board with lasers that were calibrated from the other pictures.
 """
 
 from collections.abc import Sequence
@@ -41,9 +40,9 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 
-# Corners that miss by more than this, in pixels, tell of a wrong rig, medium or target.
+# Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
 _BAD_CORNERS_PX = 0.5
-# Likewise stripes; paint and speckle leave a tenth to a third.
+# The same of stripes; paint and speckle leave a tenth to a third of a pixel.
 _BAD_STRIPES_PX = 0.7
 # A metre away this is 7 mm: too much to call a laser calibrated.
 _UNCERTAIN_NORMAL = np.deg2rad(0.4)
@@ -56,21 +55,21 @@ class LaserOptions:
     Attributes
     ----------
     n_lasers : int or None
-        How many lasers shine. None for as many as the rig has, or, if it has none, as many as can
-        be told apart.
+        Number of lasers that shine. None for as many as the rig has, or, if it has none, as many
+        as can be distinguished.
     n_medium : float or None
         Index of the medium in the pictures; None for the rig's own water.
     sigma_n_medium : float
-        Its standard deviation; where it is the rig's own water, its uncertainty counts instead.
+        Its standard deviation; for the rig's own water the rig's uncertainty counts instead.
     refine : bool
-        Whether the camera's uncertain numbers are solved along, with what is known of them as
-        prior; else they are held, and their uncertainty is passed on.
+        Whether the camera's uncertain numbers are solved too, with their uncertainty as prior;
+        else they are held, and their uncertainty is propagated.
     stripe_bias_px : float
         Standard deviation of the error that all centres of one laser's stripe share on one
-        surface: the light's glow in the water, a slope of the surface's lightness.
+        surface: by glow in the water, or by a gradient of the surface's lightness.
     loose : bool or None
         Whether a board may lie unevenly on the surface that the stripes are on, or bend. None to
-        let the pictures say: where stripes and corners contradict each other, it does.
+        decide by the pictures: it does if stripes and corners contradict each other.
     """
 
     n_lasers: int | None = None
@@ -81,7 +80,7 @@ class LaserOptions:
     loose: bool | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
+        """Refuse values that make no sense."""
         if self.n_lasers is not None and self.n_lasers < 1:
             raise OptionError(f"n_lasers is {self.n_lasers}; use 1 or more")
         if not self.sigma_n_medium >= 0.0:
@@ -103,14 +102,14 @@ def calibrate_lasers(
     Parameters
     ----------
     rig : Rig
-        Camera, dome and media; lasers that it has give their names, order and windows.
+        Camera, dome and media; its lasers, if any, give names, order and windows.
     views : sequence of LaserView
         Corners and stripes of every picture.
     surfaces : Surfaces
         Of the target: `box_surfaces` or `board_surface`.
     options : LaserOptions, optional
     uncertainty : RigUncertainty, optional
-        How well the camera's numbers are known; exactly if left out.
+        Of the camera's numbers; without it they are exact.
 
     Returns
     -------
@@ -119,9 +118,9 @@ def calibrate_lasers(
     Raises
     ------
     CalibrationError
-        If the pictures do not tell enough, or contradict what is expected.
+        If the pictures do not determine the lasers, or contradict what is expected.
     OptionError
-        If refinement is asked for and nothing is uncertain.
+        If refinement is requested and nothing is uncertain.
     """
     options = options or LaserOptions()
     doubt = _doubt(rig, options, uncertainty or RigUncertainty.none())
@@ -168,7 +167,7 @@ def _doubt(rig: Rig, options: LaserOptions, uncertainty: RigUncertainty) -> Came
 def _sorted_stripes(
     rig: Rig, views: Sequence[PlacedView], surfaces: Surfaces, options: LaserOptions
 ) -> tuple[list[Laser], IntArray, list[str]]:
-    """Return the lasers with rough planes, which of them each point is of, and warnings."""
+    """Return the lasers with rough planes, the index of each point's laser, and warnings."""
     split, warnings = _split(rig, views, surfaces, options)
     if len(rig.lasers) == len(split.planes):
         order = [i for i in match_to_rig(rig, split.planes) if i is not None]
@@ -191,7 +190,7 @@ def _sorted_stripes(
 def _split(
     rig: Rig, views: Sequence[PlacedView], surfaces: Surfaces, options: LaserOptions
 ) -> tuple[LaserSplit, list[str]]:
-    """Split the stripes, leniently if a board that leans may have torn lasers apart."""
+    """Split the stripes, with a larger tolerance if a tilted board may have split lasers."""
     expected = options.n_lasers or len(rig.lasers) or None
     stripes, lens = pooled(views, surfaces), rig.dome_from_cam.translation
 
@@ -204,7 +203,7 @@ def _split(
         try:
             return lenient, check_count(lenient, expected, rig, views, surfaces)
         except CalibrationError:
-            # What can be said of the stricter split is the plainer complaint.
+            # The message about the stricter split is the plainer one.
             pass
     return split, check_count(split, expected, rig, views, surfaces)
 
@@ -248,7 +247,7 @@ def _warnings(
     return words
 
 
-# Where the board says that a laser's stripe is, to tell the lasers from each other.
+# Place of each laser's stripe by the board's pose, to distinguish the lasers.
 _NEAR_PX = 8.0
 _FEWEST_POINTS = 20
 _N_FITS = 10
@@ -263,11 +262,11 @@ class HeldOutView:
     name : str
         File name.
     n_lasers : int
-        Lasers that were seen in it.
+        Number of lasers seen in it.
     by_lasers, by_board : Plane
-        The surface in `dome` as the lasers measure it, and as the board's corners tell it.
+        The surface in `dome` as measured by the lasers, and by the board's corners.
     range_error, pitch_error, yaw_error : float
-        Lasers minus board, in metres and radians; of the board's own errors, too.
+        Lasers minus board, in metres and radians; errors of the board are included.
     """
 
     name: str
@@ -302,7 +301,7 @@ def leave_one_out(
     Raises
     ------
     CalibrationError
-        If a calibration fails, or a picture shows too little to be measured.
+        If a calibration fails, or a picture shows too little for a measurement.
     """
     if len(surfaces.planes) != 1:
         raise CalibrationError("pictures are left out in turn only with a board, not with a box")
@@ -346,7 +345,7 @@ def _measured(
 def _triangulated(
     rig: Rig, view: PlacedView, stripes: PooledStripes, planes: Sequence[Plane]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return points (N, 3) where pixels meet their laser's plane, and which laser's it is."""
+    """Return points (N, 3) where pixels meet their laser's plane, and the lasers' indices."""
     residuals = np.abs(plane_residuals_px(stripes.placed, planes))
     nearest = np.argmin(residuals, axis=1)
     near = residuals[np.arange(len(nearest)), nearest] <= _NEAR_PX
@@ -374,6 +373,6 @@ def fitted(points: FloatArray) -> Plane:
 
 
 def posture(plane: Plane) -> tuple[float, float, float]:
-    """Return range (m), pitch and yaw (radians) of a plane, as docs/conventions.md has them."""
+    """Return range (m), pitch and yaw (radians) of a plane, as defined in docs/conventions.md."""
     n = plane.normal
     return plane.offset, float(np.arctan2(n[2], n[1])), float(np.arctan2(n[0], n[1]))

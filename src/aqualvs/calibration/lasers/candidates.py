@@ -1,12 +1,11 @@
-"""Laser planes that straight stripes suggest, and the evidence for each of them.
+"""Candidates for laser planes, from straight stripes on flat surfaces, with their evidence.
 
-A line on one surface and a line on another span a plane. Such a pair meets by accident now and
-then; the plane of a laser is told by the lines of further surfaces that it meets as well. How much
-each of them says is counted by how often planes of accidental pairs meet it: an a-contrario test
-(Desolneux, Moisan & Morel 2000, doi:10.1023/A:1026593302236), whose chance rates come from the
-pictures themselves. The number of points plays no part in it.
-
-Straight lines among stripe points on one flat surface: where laser planes cut it.
+`lines_on_patch` finds the straight lines among the stripe points on one surface: a laser plane cuts
+the surface in such a line. Two lines on different surfaces that lie in one plane suggest it. Such
+pairs also occur by accident; the plane of a laser meets lines of further surfaces as well. The
+evidence of each further line follows from how often planes of accidental pairs meet it: an
+a-contrario test (Desolneux, Moisan & Morel 2000, doi:10.1023/A:1026593302236) whose chance rates
+come from the pictures themselves. The number of points does not count.
 """
 
 from collections.abc import Sequence
@@ -21,9 +20,9 @@ from aqualvs.geometry.planes import Plane
 
 # Points this near to a line, in pixels across their stripe, belong to it.
 _TOLERANCE_PX = 2.0
-# Points this near are taken away with it: the halo of a stripe is no second one.
+# Points this near are removed with it: the halo of a stripe is no second stripe.
 _HALO_PX = 6.0
-# A point's stripe runs along the line to within this tangent, as seen in the image.
+# Largest tangent of the angle between a point's stripe and the line, in the image.
 _ALIGNED = 0.35
 _MIN_POINTS = 12
 _MIN_LENGTH_PX = 20.0
@@ -38,7 +37,7 @@ class StripeLine:
     Attributes
     ----------
     patch : int
-        Which surface of which view.
+        Index of the surface of a view.
     members : int array, shape (M,)
         Indices of its points among those of all patches.
     """
@@ -55,14 +54,14 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     pooled : PooledStripes
         Points of all patches.
     members : int array, shape (M,)
-        Which points lie on the surface.
+        Indices of the points on the surface.
     patch : int
-        Its number.
+        Index of the surface.
 
     Returns
     -------
     list of StripeLine
-        The longest first; no point belongs to two.
+        Longest first; no point belongs to two.
     """
     placed, normal = pooled.placed, pooled.patch_planes[patch].normal
     points, across = placed.points_in_dome[members], placed.by_across[members]
@@ -70,7 +69,7 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
     i, j = _pairs(pooled.chain[members], patch)
     guessed, offsets = _guesses(points, normal, i, j)
-    # Most pairs are of two stripes, which do not run along the line through both points.
+    # Most pairs are of two stripes; their directions are not that of the line through both points.
     good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
     guessed, offsets = guessed[good], offsets[good]
     votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
@@ -120,7 +119,7 @@ def _guesses(
 
 
 def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
-    """Return which points (N) have a stripe that runs along their line (N)."""
+    """Return the mask of points (N) whose stripe runs along their line (N)."""
     gain = np.abs(np.einsum("ni,ni->n", across, m))
     aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _ALIGNED * gain
     return aligned
@@ -134,7 +133,7 @@ def _near(
     c: FloatArray | float,
     tolerance_px: float,
 ) -> BoolArray:
-    """Return which points (N) are near which lines (H) and run along them, shape (N, H)."""
+    """Return the mask (N, H) of points that are near lines and run along them."""
     gain = np.abs(across @ m.T)
     near: BoolArray = np.abs(points @ m.T - c) <= tolerance_px * gain
     near &= np.abs(along @ m.T) <= _ALIGNED * gain
@@ -144,7 +143,7 @@ def _near(
 def _fitted(
     points: FloatArray, across: FloatArray, normal: FloatArray, m: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Fit a line by least squares, weighing points as the image measures them."""
+    """Fit a line by least squares, with the points' weights of the image."""
     weight = 1.0 / np.maximum(np.abs(across @ m), 1e-9) ** 2
     middle = weight @ points / weight.sum()
     t = np.cross(m, normal)
@@ -155,7 +154,7 @@ def _fitted(
 
 
 def _length_px(points: FloatArray, along: FloatArray) -> float:
-    """Return how long a line is in the image, roughly."""
+    """Return the approximate length of a line in the image."""
     if not len(points):
         return 0.0
     spread = points.max(axis=0) - points.min(axis=0)
@@ -163,23 +162,23 @@ def _length_px(points: FloatArray, along: FloatArray) -> float:
     return float(np.linalg.norm(spread)) / per_px
 
 
-# Surfaces of which the normals differ by less (sine), at one distance (metres), are one surface.
+# Limits within which two surfaces are the same: sine between normals, distance in metres.
 _SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
 _CANDIDATES_N_FITS = 5
-# A point's stripe runs along the plane's to within this tangent, as seen in the image.
+# Largest tangent of the angle between a point's stripe and the plane's, in the image.
 _CANDIDATES_ALIGNED = 0.35
-# More pairs than this are sampled; so many planes are tried at a time.
+# Number of pairs beyond which they are sampled; number of planes tried at a time.
 _MOST_PLANES, _AT_ONCE = 6000, 500
-# Where few accidents are seen, their rate is that of lines spread over so many pixels, with the
-# weight of so many observed planes. By how many pixels, and how often, lines of so many pairs are
-# moved at random to see whether they meet by accident.
+# Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
+# weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
+# number of pairs in the random test of how often lines meet by accident.
 _SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
 _MOVED_PX, _N_MOVES, _MOST_MOVED = 250.0, 8, 1000
-# A line nearer than this share of the tolerance is no better evidence: poses are no better.
+# A line nearer than this share of the tolerance is no better evidence: poses are not more accurate.
 _NEAREST = 0.1
-# A line is met by accident as often as those of its surface that have this share of its length.
+# Accidents of a line are counted on lines of its surface of at least this share of its length.
 _AS_LONG = 0.5
-# Rounds in which lines of planes that were found are taken out of the accidents.
+# Rounds of removing the lines of found planes from the accidents.
 _N_ROUNDS = 3
 _MOST_TRIALS = 60
 
@@ -195,10 +194,10 @@ class PlaneCandidate:
     lines : int array, shape (K,)
         Indices of the lines in it.
     log_false_alarms : float
-        Natural logarithm of how many planes as good as this one accidents are expected to make in
-        these pictures.
+        Natural logarithm of the number of accidental planes as good as this one that are expected
+        in these pictures.
     residual_px : float
-        Root mean square over surfaces of how far lines are from the plane, at their worst end.
+        Root mean square over surfaces of the distance of lines from the plane, at their worst end.
     """
 
     plane: Plane
@@ -209,18 +208,18 @@ class PlaneCandidate:
 
 @dataclass(frozen=True, slots=True)
 class LineTable:
-    """Ends and middles of lines, L of them: what planes are guessed from and tried on.
+    """Ends and middles of L lines, from which planes are guessed and on which they are tested.
 
     Attributes
     ----------
     patch : int array, shape (L,)
-        Which surface of which view a line lies on.
+        Index of the line's surface of a view.
     length : array, shape (L,)
         In metres.
     points : array, shape (L, 3, 3)
         Ends and middle, in `dome`.
     by_across : array, shape (L, 3, 3)
-        How they move with their pixel across the stripe, metres per pixel.
+        Their derivative by the pixel across the stripe, metres per pixel.
     """
 
     patch: IntArray
@@ -249,7 +248,7 @@ class LineTable:
         )
 
     def worst_px(self, normals: FloatArray, offsets: FloatArray) -> FloatArray:
-        """Return how far each line (L) is from planes (H) at its worst end, shape (H, L)."""
+        """Return the distance of lines from planes at their worst end, in pixels, shape (H, L)."""
         distance = np.abs(np.einsum("hi,lki->hlk", normals, self.points) - offsets[:, None, None])
         gain = np.abs(np.einsum("hi,lki->hlk", normals, self.by_across))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -259,7 +258,7 @@ class LineTable:
 
 @dataclass(frozen=True, slots=True)
 class _Hypotheses:
-    """Planes through pairs of lines that meet, H of them."""
+    """H planes through pairs of lines that meet."""
 
     pairs: IntArray
     worst: FloatArray
@@ -288,14 +287,14 @@ class _Hypotheses:
 
 @dataclass(frozen=True, slots=True)
 class _Accidents:
-    """How often planes and lines meet without being of one laser.
+    """Rates at which planes and lines of different lasers meet.
 
     Attributes
     ----------
     rate : array, shape (L,)
-        Probability that an accidental plane meets a line as long as this one on its surface.
+        Probability that an accidental plane meets a line of this length on its surface.
     n_planes : float
-        How many accidental pairs of lines meet.
+        Number of accidental pairs of lines that meet.
     """
 
     rate: FloatArray
@@ -305,7 +304,7 @@ class _Accidents:
 def find_candidates(
     pooled: PooledStripes, lines: Sequence[StripeLine], tolerance_px: float
 ) -> list[PlaneCandidate]:
-    """Find planes that straight stripes lie in, the best first; no line is used twice.
+    """Find planes of straight stripes, the best first; no line is used twice.
 
     Parameters
     ----------
@@ -314,12 +313,12 @@ def find_candidates(
     lines : sequence of StripeLine
         Straight stripes of all surfaces.
     tolerance_px : float
-        How far a stripe may be from its plane.
+        Greatest distance of a stripe from its plane.
 
     Returns
     -------
     list of PlaneCandidate
-        Those of which accidents would make fewer than one.
+        Planes with an expected number of accidents below one.
     """
     table = LineTable.of(pooled, lines)
     planes = _Hypotheses.of(pooled, table, tolerance_px)
@@ -335,7 +334,7 @@ def find_candidates(
 
 
 def _accidental(n_lines: int, pairs: IntArray, found: Sequence[PlaneCandidate]) -> BoolArray:
-    """Return which pairs (H,) are not of two lines of one found plane."""
+    """Return the mask of pairs (H,) that are not of two lines of one found plane."""
     owner = np.full(n_lines, -1)
     for i, candidate in enumerate(found):
         owner[candidate.lines] = i
@@ -357,7 +356,7 @@ def _accidents(
     as_long = table.length[None] >= _AS_LONG * table.length[:, None]
     rivals = (table.patch[:, None] == table.patch[None]) & as_long
     rate = np.minimum(rivals @ own_rate, 1.0)
-    # Of pairs that meet one is the plane's own; lines elsewhere would meet as often.
+    # One of the pairs that meet is the plane's own; the rate is the same for lines elsewhere.
     n_planes = max(n / planes.kept_share, planes.n_expected)
     return _Accidents(rate, float(n_planes))
 
@@ -370,7 +369,7 @@ def _collected(
     accidents: _Accidents,
     tolerance_px: float,
 ) -> list[PlaneCandidate]:
-    """Take the best plane and its lines away, as long as one is better than accidents."""
+    """Extract the best plane and its lines, as long as one is better than accidents."""
     found: list[PlaneCandidate] = []
     free = np.ones(len(lines), np.bool_)
     alive = np.ones(len(planes.pairs), np.bool_)
@@ -406,15 +405,15 @@ def _nearness(worst: FloatArray, tolerance_px: float) -> FloatArray:
 def _log_false_alarms(table: LineTable, nearness: FloatArray, accidents: _Accidents) -> FloatArray:
     """Return the logarithm of the expected number (H,) of accidents as good as these planes.
 
-    Two lines make a plane, and only how well they meet is evidence; of all further ones, whichever
-    surfaces they are on, it is that they are met and how well.
+    Two lines define a plane, so that only their distance is evidence; for all further lines, on any
+    surface, the evidence is that the plane meets them, and their distance.
     """
     order = np.argsort(table.patch, kind="stable")
     starts = np.flatnonzero(np.diff(table.patch[order], prepend=-1))
     chance = np.minimum(nearness * accidents.rate, 1.0)[:, order]
     by_patch = np.minimum.reduceat(chance, starts, axis=1)
     by_patch.sort(axis=1)
-    # The two most telling lines count as those that make the plane.
+    # The two lines with the most evidence count as those that define the plane.
     further = by_patch[:, 2:]
     n, k = further.shape[1], np.count_nonzero(further < 1.0, axis=1)
     choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
@@ -432,7 +431,7 @@ def _candidates_fitted(
     accidents: _Accidents,
     tolerance_px: float,
 ) -> PlaneCandidate | None:
-    """Fit a plane to the points of the free lines near it, and weigh it anew."""
+    """Fit a plane to the points of the free lines near it, and evaluate its evidence anew."""
     worst, mine = np.zeros((1, len(lines))), np.zeros(0, np.int64)
     for _ in range(_CANDIDATES_N_FITS):
         worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
@@ -476,7 +475,7 @@ def _pairs_meet(
     offsets: FloatArray,
     tolerance_px: float,
 ) -> BoolArray:
-    """Return which pairs (P,) lie in their plane to within the tolerance."""
+    """Return the mask of pairs (P,) that lie in their plane to within the tolerance."""
     distance = np.abs(
         np.einsum("pi,pski->psk", normals, table.points[pairs]) - offsets[:, None, None]
     )
@@ -486,9 +485,9 @@ def _pairs_meet(
 
 
 def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> float:
-    """Return how often pairs (P, 2) of lines would meet if one were moved at random.
+    """Return the rate at which pairs (P, 2) of lines meet after a random shift of one.
 
-    Parallel lines always meet; the farther from parallel, the less.
+    Parallel lines always meet; the rate falls with the angle between them.
     """
     if not len(pairs):
         return 0.0
@@ -512,7 +511,7 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
 
 
 def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:
-    """Return which patches (P, P) lie in one plane of `dome`, nearly."""
+    """Return the mask (P, P) of patches that lie nearly in one plane of `dome`."""
     normals = np.array([p.normal for p in planes]).reshape(-1, 3)
     offsets = np.array([p.offset for p in planes])
     sine = np.linalg.norm(np.cross(normals[:, None], normals[None]), axis=2)
@@ -529,7 +528,7 @@ def _on_two_surfaces(pooled: PooledStripes, patches: IntArray) -> bool:
 
 
 def fitted_plane(placed: PlacedStripes, members: IntArray, start: Plane) -> Plane:
-    """Fit a plane to some of the points, each weighed as the image measures it."""
+    """Fit a plane to some of the points, with the weights of the image."""
     points = placed.points_in_dome[members]
     gain = np.abs(placed.by_across[members] @ start.normal)
     weight = 1.0 / np.maximum(gain, 1e-9) ** 2
@@ -541,9 +540,9 @@ def fitted_plane(placed: PlacedStripes, members: IntArray, start: Plane) -> Plan
 
 
 def plane_residuals_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
-    """Return how far points are from the stripes of planes, across their own stripe, (N, L) px.
+    """Return distances (N, L) of points from the stripes of planes, across their stripe, in px.
 
-    Infinite where a point's stripe runs along none of the directions that the plane's could.
+    Infinite where the direction of a point's stripe is not that of the plane's stripe.
     """
     normals = np.array([p.normal for p in planes]).reshape(-1, 3)
     offsets = np.array([p.offset for p in planes])

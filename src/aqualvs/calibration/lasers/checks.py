@@ -1,6 +1,8 @@
-"""What cannot be calibrated from, and what to tell the user about it.
+"""Checks of `calibrate lasers`, and the assignment of planes to the lasers of the rig.
 
-Which found plane is which laser of the rig, and names for lasers that the rig has not.
+The checks refuse targets, poses, distances and numbers of lasers that no calibration can be made
+from, with the remedy. Planes are matched to the rig's lasers by direction and distance; lasers that
+the rig does not have are named after the direction of their stripe.
 """
 
 from collections.abc import Sequence
@@ -17,14 +19,14 @@ from aqualvs.errors import CalibrationError
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig
 
-# Half a radian and a tenth of a metre are as far apart as a laser is ever remounted.
+# Scales of the distance between planes: lasers are remounted within half a radian and 0.1 m.
 _FAR_ANGLE, _FAR_OFFSET = 0.5, 0.1
-# A sheet's normal this near to an axis of `dome` (cosine) makes its stripes level or upright.
+# Cosine between a sheet's normal and an axis of `dome` from which stripes are level or upright.
 _ALONG_AXIS = 0.9
 
 
 def match_to_rig(rig: Rig, planes: Sequence[Plane]) -> list[int | None]:
-    """Return for every laser of the rig which plane is nearest to it, each plane used once.
+    """Return the index of the nearest plane for every laser of the rig, each plane used once.
 
     None for lasers that are left over where there are fewer planes.
     """
@@ -37,7 +39,7 @@ def match_to_rig(rig: Rig, planes: Sequence[Plane]) -> list[int | None]:
 
 
 def far_apart(laser: Laser, plane: Plane) -> bool:
-    """Return whether a plane is so far from where the rig has the laser that it may be another."""
+    """Return whether a plane is too far from the rig's laser to be surely the same."""
     return _apart(laser.plane, plane) > 1.0
 
 
@@ -45,7 +47,7 @@ def named(planes: Sequence[Plane]) -> tuple[list[int], list[Laser]]:
     """Name lasers after the directions of their stripes, or number them.
 
     A single plane near level is `horizontal`, near upright `vertical`, between them `diagonal`;
-    where two would have one name, all are numbered from the left.
+    if two would have one name, all are numbered from the left.
 
     Returns
     -------
@@ -85,7 +87,7 @@ def _word(plane: Plane) -> str:
 
 
 def _place(plane: Plane) -> float:
-    """Where the plane crosses the view half a metre ahead: from the left, or from the top."""
+    """Return where the plane crosses the view half a metre ahead, from the left or the top."""
     ahead = plane.offset - 0.5 * plane.normal[1]
     if abs(plane.normal[0]) >= abs(plane.normal[2]):
         return float(ahead / plane.normal[0])
@@ -100,22 +102,22 @@ def _apart(a: Plane, b: Plane) -> float:
     return float(np.hypot(angle, (a.offset - b.offset) / _FAR_OFFSET))
 
 
-# Targets beyond these sizes, in metres, have their lengths in another unit than they say.
+# Sizes of targets, in metres, beyond which their lengths must be in another unit.
 _SMALLEST, _LARGEST = 0.02, 10.0
-# Stripes at so many times the working range are no stripes that the rig is made for.
+# Multiple of the working range beyond which stripes are refused.
 _NEARER, _FARTHER = 0.2, 5.0
-# Corners that fit so many times worse with stripes than without contradict them; and stripes that
-# fit a plane so many times worse than each a line contradict each other.
+# Ratio of the corners' residuals with stripes to those without from which they contradict each
+# other; ratio of the stripes' residuals from a plane to those from lines from which they do.
 _CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
 _FEWEST_BINS = 5
-# No detection is as bad as this, in pixels.
+# Larger than any error of detection, in pixels.
 _IMPOSSIBLE_PX = 2.0
-# A stripe with this share of the points that the weakest laser has in a picture is mentioned.
+# Share of the weakest laser's points in a picture from which a further stripe is reported.
 _AS_STRONG = 0.5
 
 
 def check_size(views: Sequence[LaserView]) -> None:
-    """Refuse targets of a size that tells of a wrong unit.
+    """Refuse targets whose size indicates a wrong unit.
 
     Raises
     ------
@@ -135,7 +137,7 @@ def check_size(views: Sequence[LaserView]) -> None:
 
 
 def check_poses(views: Sequence[PlacedView]) -> None:
-    """Refuse pictures of which the corners contradict the rig, the medium or the target's file.
+    """Refuse pictures with corners that contradict the rig, the medium or the target's file.
 
     Raises
     ------
@@ -151,7 +153,7 @@ def check_poses(views: Sequence[PlacedView]) -> None:
 
 
 def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
-    """Refuse stripes at distances that tell of a wrong unit, or of no stripes on the target.
+    """Refuse stripes at distances that indicate a wrong unit, or no stripes on the target.
 
     Raises
     ------
@@ -180,13 +182,13 @@ def check_count(
     views: Sequence[PlacedView],
     surfaces: Surfaces,
 ) -> list[str]:
-    """Refuse fewer or more lasers than expected, or an undecided number; warn about the rest.
+    """Refuse fewer or more lasers than expected, or an undecided number; warn of uncertain ones.
 
     Raises
     ------
     CalibrationError
-        If there are fewer, more, or none, or planes of light of which the pictures do not tell
-        whether they are lasers.
+        If there are fewer, more, or none, or if the pictures do not decide whether planes of
+        light are lasers.
     """
     found = len(split.planes)
     if found < (expected or 1):
@@ -214,7 +216,7 @@ def check_count(
     unmatched = [
         line
         for line in split.unmatched
-        # The lasers' counts are of all pictures, a line is of one.
+        # The lasers' counts are over all pictures, a line is in one.
         if len(line.members) >= _AS_STRONG * counts.min() / len(views)
         and not np.isin(line.members, taken).any()
     ]
@@ -237,29 +239,29 @@ def _planes(planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces
 
 
 def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
-    """Return how many points a plane has, and where it is seen."""
+    """Return the number of a plane's points and the pictures it is seen in."""
     patches = plane.patches
     rest = f" and {len(patches) - 1} others" if len(patches) > 1 else ""
     return f"{len(plane.members)} points in {_where(patches[0], views, surfaces)}{rest}"
 
 
 def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
-    """Return what a pose by corners alone leaves of them in each direction, in pixels."""
+    """Return the corners' residual in each direction after a pose by corners alone, in pixels."""
     return float(np.median([view.rms_px for view in views]) / np.sqrt(2.0))
 
 
 def contradicts(solved: Solved) -> bool:
     """Return whether corners and stripes of a board cannot both be right.
 
-    Then stripes pull corners from where these alone would put the board, or stripes, though each
-    is straight, do not fit together.
+    Then stripes shift the board from its pose by corners alone, or stripes do not fit one plane
+    although each is straight.
     """
     corners = _corners_px(solved) / _alone_px(solved)
     return corners > _CORNERS_CONTRADICT or _stripes_misfit(solved) > _STRIPES_CONTRADICT
 
 
 def _stripes_misfit(solved: Solved) -> float:
-    """Return how many times stripes miss their plane more than they miss straight lines."""
+    """Return the ratio of the stripes' residuals from their plane to those from straight lines."""
     from_plane = from_line = 0.0
     for i, group in enumerate(solved.problem.groups):
         residuals, _ = solved.stripe_residuals_px(i)
@@ -278,7 +280,7 @@ def _stripes_misfit(solved: Solved) -> float:
 
 
 def loose_words(solved: Solved) -> str:
-    """Return the warning that a board is taken to lie unevenly on its surface."""
+    """Return the warning that a board is assumed to lie unevenly on its surface."""
     slack = solved.state.slack
     tilt = np.rad2deg(np.sqrt(np.mean(np.sum(slack[:, :2] ** 2, axis=1))))
     offset = np.sqrt(np.mean(slack[:, 2] ** 2)) * 1e3

@@ -1,12 +1,11 @@
-"""What a laser calibration knows in the end: one joint covariance of camera, medium and lasers.
+"""Joint covariance of camera, medium and lasers after a calibration of the lasers.
 
-The camera's numbers come from another calibration, with their own uncertainty. Either they are
-held, and their uncertainty is carried into the planes to first order (a "consider" covariance,
-Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4), or they are refined with it as their prior.
-In both cases planes and camera remain correlated, and the result says so. What centres of stripes
-have in common, on each surface, is carried along in the same way: more points do not reduce it.
-
-What is uncertain of the camera that lasers are calibrated with.
+The camera's numbers come from another calibration, with their own uncertainty (`CameraDoubt`).
+Either they are held, and their uncertainty is propagated to the planes to first order (a "consider"
+covariance, Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4), or they are refined with that
+uncertainty as their prior. In both cases planes and camera remain correlated, and the result holds
+their correlation. The error that all stripe centres on one surface share is propagated in the same
+way: more points do not reduce it.
 """
 
 from collections.abc import Sequence
@@ -24,18 +23,18 @@ from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
 
 @dataclass(frozen=True, slots=True)
 class CameraDoubt:
-    """Which of the camera's numbers are uncertain, and the medium's index.
+    """Uncertain numbers of the camera, and uncertainty of the medium's index.
 
     Attributes
     ----------
     names : tuple of str
-        Of the rig, the medium's index not among them.
+        Of the rig's numbers, without the medium's index.
     sigma_medium : float
         Standard deviation of the index of the medium in the pictures; 0 if exact.
     medium_is_water : bool
-        Whether that medium is the rig's own water, so that both are the same number.
+        True if that medium is the rig's own water, so that both indices are the same number.
     given : RigUncertainty
-        What was known beforehand.
+        Prior uncertainty.
     """
 
     names: tuple[str, ...]
@@ -47,20 +46,20 @@ class CameraDoubt:
     def of(
         cls, rig: Rig, given: RigUncertainty, n_medium: float | None, sigma_medium: float
     ) -> "CameraDoubt":
-        """Sort out what is uncertain.
+        """Return the uncertain numbers.
 
         Parameters
         ----------
         rig : Rig
-            As the calibration starts.
+            Before the calibration.
         given : RigUncertainty
             Of the rig.
         n_medium : float or None
             Index of the medium in the pictures; None for the rig's own water.
         sigma_medium : float
-            Its standard deviation, where it is not the rig's water.
+            Its standard deviation, if it is not the rig's water.
         """
-        # What was known of the lasers before is replaced.
+        # Earlier knowledge of the lasers is replaced.
         given = given.only([name for name in given.names if ":" not in name])
         sigmas = given.sigmas
         known = set(parameter_names(rig.camera())) - {"n_water"}
@@ -72,12 +71,12 @@ class CameraDoubt:
 
     @property
     def n_columns(self) -> int:
-        """How many numbers are uncertain."""
+        """Number of uncertain numbers."""
         return len(self.names) + (self.sigma_medium > 0.0)
 
     @property
     def covariance(self) -> FloatArray:
-        """Of the uncertain numbers as the problem's first columns have them."""
+        """Covariance of the uncertain numbers in the order of the problem's first columns."""
         covariance = np.zeros((self.n_columns, self.n_columns))
         n = len(self.names)
         covariance[:n, :n] = self.given.of(self.names)
@@ -88,7 +87,7 @@ class CameraDoubt:
         return covariance
 
     def with_given(self) -> FloatArray:
-        """Return the covariance (C, U) of the uncertain numbers with all that are given."""
+        """Return the covariance (C, U) of the uncertain numbers with all given numbers."""
         names = (*self.names, "n_water") if self.medium_is_water else self.names
         rows = [self.given.names.index(n) for n in names[: self.n_columns]]
         crossed = np.zeros((self.n_columns, len(self.given.names)))
@@ -105,9 +104,9 @@ class JointResult:
     uncertainty : RigUncertainty
         Of all given numbers and all lasers' planes together; windows are taken as given.
     lasers : array, shape (3 L, 3 L)
-        Its part for the lasers.
+        Covariance of the lasers' planes.
     correlation : tuple of float
-        For every laser, how many binned residuals say as much as one independent.
+        For every laser, the number of binned residuals that are worth one independent one.
     """
 
     uncertainty: RigUncertainty
@@ -124,20 +123,20 @@ def joint_uncertainty(
     refined: bool,
     stripe_bias_px: float,
 ) -> JointResult:
-    """Work out the joint covariance.
+    """Return the joint covariance of camera, medium and lasers.
 
     Parameters
     ----------
     solution : Solution
         Of `problem`.
     problem : LaserProblem
-        With the uncertain numbers free if `refined`, else held.
+        With free uncertain numbers if `refined`, else held ones.
     doubt : CameraDoubt
-        What was uncertain beforehand.
+        Numbers that were uncertain before.
     lasers : sequence of Laser
-        In the order of the problem's.
+        In the problem's order.
     refined : bool
-        Whether the solve moved the uncertain numbers.
+        Whether the solve included the uncertain numbers.
     stripe_bias_px : float
         Standard deviation of the error that all centres of one laser's stripe share on one
         surface, across the stripe.
@@ -145,7 +144,7 @@ def joint_uncertainty(
     correlation = _correlation(solution, problem)
     information = _data_information(solution, problem, doubt, correlation)
     covariance = _all_covariance(information, problem, doubt, stripe_bias_px, refined)
-    # Poses, slack and bias are integrated out.
+    # Poses, slack and bias are marginalised.
     n, mine = doubt.n_columns, np.arange(N_LASER * problem.n_lasers)
     mine += problem.laser_columns(0)[0] + n - problem.bundle.n_shared
     kept = np.concatenate([np.arange(n), mine])
@@ -165,7 +164,7 @@ def _all_covariance(
     stripe_bias_px: float,
     refined: bool,
 ) -> FloatArray:
-    """Covariance of everything, from what the data alone say."""
+    """Return the covariance of all numbers from the information of the data alone."""
     n, n_bias = doubt.n_columns, problem.n_lasers * len(problem.surfaces.planes)
     bias = np.arange(len(information) - n_bias, len(information))
     bias_prior = np.diag(np.full(n_bias, stripe_bias_px**2))
@@ -180,7 +179,7 @@ def _all_covariance(
 
 def _correlation(solution: Solution[LaserState], problem: LaserProblem) -> tuple[float, ...]:
     if problem.slack is not None:
-        # The noise of stripes then holds what their bins share.
+        # The noise of stripes then includes the errors that bins share.
         return (1.0,) * problem.n_lasers
     sequences: list[list[FloatArray]] = [[] for _ in range(problem.n_lasers)]
     n_groups = len(problem.groups)
@@ -204,7 +203,7 @@ def _data_information(
     doubt: CameraDoubt,
     correlation: Sequence[float],
 ) -> FloatArray:
-    """Information of stripes, corners and slack; first the uncertain numbers, last the biases."""
+    """Return the information of stripes, corners, slack: uncertain numbers first, biases last."""
     bundle = replace(
         problem.bundle,
         free=doubt.names,
@@ -217,7 +216,7 @@ def _data_information(
     n_slack = 0 if problem.slack is None else len(bundle.views)
 
     def of_interest(n_blocks: int) -> list[int]:
-        # Priors of the camera, of which the two problems have different ones, stand in between.
+        # The priors of the camera, different in the two problems, are in between.
         return [*range(n_data), *range(n_blocks - n_slack, n_blocks)]
 
     then = of_interest(len(solution.blocks))
@@ -234,7 +233,7 @@ def _data_information(
 
 
 def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
-    """Return a stripe's block with a shift across the stripe for each surface, in pixels."""
+    """Return a stripe's block with one more unknown for each surface: a shift across, in pixels."""
     by_bias = np.zeros((len(group), 1, len(columns)))
     by_bias[np.arange(len(group)), 0, group.surface] = 1.0 / group.sigma_px
     return replace(
@@ -245,7 +244,7 @@ def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
 
 
 def _considered(information: FloatArray, held: IntArray, prior: FloatArray) -> FloatArray:
-    """Covariance of all numbers where some were held at values with covariance `prior`."""
+    """Return the covariance of all numbers if some were held at values of covariance `prior`."""
     solved = np.setdiff1d(np.arange(len(information)), held)
     noise = inverse(information[np.ix_(solved, solved)])
     by_held = -noise @ information[np.ix_(solved, held)]
@@ -258,9 +257,9 @@ def _considered(information: FloatArray, held: IntArray, prior: FloatArray) -> F
 
 
 def _with_given(covariance: FloatArray, doubt: CameraDoubt) -> FloatArray:
-    """Covariance of all given numbers and the lasers, from that of the uncertain and the lasers.
+    """Return the covariance of all given numbers and the lasers.
 
-    What the solve did not know follows what it did by the correlation given beforehand.
+    Numbers outside the solve follow those in it by their prior correlation.
     """
     n, n_given = doubt.n_columns, len(doubt.given.names)
     crossed = doubt.with_given()
@@ -276,7 +275,7 @@ def _with_given(covariance: FloatArray, doubt: CameraDoubt) -> FloatArray:
 
 
 def _pseudo_inverse(covariance: FloatArray) -> FloatArray:
-    """Invert a covariance whose numbers have units of many sizes, and may be tied to each other."""
+    """Invert a covariance with units of many sizes and possibly dependent numbers."""
     sigma = np.sqrt(np.diag(covariance))
     size = np.outer(sigma, sigma)
     inverted: FloatArray = np.linalg.pinv(covariance / size, rcond=1e-10) / size

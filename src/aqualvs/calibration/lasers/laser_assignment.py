@@ -1,9 +1,9 @@
-"""Which stripe points belong to which laser, when all lasers shine at once.
+"""Assignment of stripe points to lasers when all lasers shine at once.
 
-Points on known surfaces fall apart into laser planes in space. On each surface a laser plane draws
-a straight line; lines on different surfaces tell which planes there are, and how many lasers.
-
-Which of the planes that stripes suggest are lasers, which are not, and which may be.
+The points lie on known surfaces. On each surface a laser plane draws a straight line; lines on
+different surfaces together determine planes and number of lasers (`candidates`). Each candidate
+plane is judged by its evidence and against the better planes: laser, no laser, or undecided
+(`judged`). `split_lasers` then assigns every point to the plane it lies in.
 """
 
 from collections.abc import Sequence
@@ -24,31 +24,31 @@ from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledSt
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
-# Share of false planes among those that are taken for lasers (Benjamini & Hochberg 1995,
-# doi:10.1111/j.2517-6161.1995.tb02031.x); planes of fewer points in all are no lasers.
+# False discovery rate of planes that are accepted as lasers (Benjamini & Hochberg 1995,
+# doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
 _FALSE_SHARE = 1e-3
 _LEAST_POINTS = 40
-# Light nearer to another laser's stripe than this, in pixels, is its halo; the same light on other
-# surfaces, where that laser is not seen, is perhaps the same laser on a board that is not flat.
+# Distance from another laser's stripe, in pixels, within which light is its halo; on other
+# surfaces, where that laser is not seen, it may be the same laser on a board that is not flat.
 _HALO_PX, _TORN_PX = 6.0, 15.0
-# Points and surfaces that agree on this are enough of them.
+# Share of points or surfaces that must agree.
 _MOST = 0.8
-# Stripes of one laser overlap by no more than this share of their length where it goes on from the
-# target to what lies behind or before it; of two lasers, most of it.
-# A kink leaves them alike to within this cosine.
+# Largest overlap, as a share of their length, of two stripes of one laser that continues from the
+# target to a surface behind or before it; stripes of two lasers overlap for most of their length.
+# Least cosine between such stripes.
 _LITTLE, _ALIKE = 0.15, 0.8
-# A stripe that stays in one place of the target to within this, in pixels, may be print.
+# A stripe that stays in one place of the target to within this, in pixels, may be printed there.
 _FIXED_PX = 1.5
-# A plane nearer to the lens, in metres, shows its stripe in one place of the picture: no laser that
-# measures, but a scratch or a text in the picture.
+# The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is a
+# scratch or an overlaid text.
 _LEAST_BASELINE = 2e-3
-# Light that misses its plane so many times more than the best laser's misses its own lies on
-# something else. Poses leave a tenth of a pixel, whatever the stripe.
+# Ratio of a plane's residual to the best laser's from which its light lies on something else;
+# errors of the poses make a tenth of a pixel for every stripe.
 _POORER, _LEAST_RESIDUAL_PX = 5.0, 0.1
 
 
 class Verdict(Enum):
-    """What a plane of light is taken for."""
+    """Verdict on a plane of light."""
 
     LASER = "laser"
     WEAK = "plane of little evidence"
@@ -59,7 +59,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedPlane:
-    """A plane of light and what it is taken for.
+    """Plane of light with the verdict on it.
 
     Attributes
     ----------
@@ -67,10 +67,10 @@ class JudgedPlane:
     members : int array, shape (M,)
         Indices of its points.
     patches : tuple of int
-        Which surfaces of which views it is seen on.
+        Surfaces of views that it is seen on.
     verdict : Verdict
     why : str
-        In words, why it is no laser or may be none; empty for lasers.
+        In words, the reason why it is no laser or may be none; empty for lasers.
     """
 
     candidate: PlaneCandidate
@@ -95,14 +95,14 @@ def judged(
     lines : sequence of StripeLine
         Of all surfaces.
     candidates : sequence of PlaneCandidate
-        As `find_candidates` returns them.
+        As returned by `find_candidates`.
     lens_in_dome : array, shape (3,)
         The lens's projection centre.
 
     Returns
     -------
     list of JudgedPlane
-        By verdict, and the better before the worse.
+        By verdict, then by evidence.
     """
     alarms = np.array([c.log_false_alarms for c in candidates])
     n_sure = _n_sure(alarms)
@@ -123,7 +123,7 @@ def judged(
 
 
 def _n_sure(log_alarms: FloatArray) -> int:
-    """Return how many of the best planes hold no more false ones than is allowed."""
+    """Return the number of best planes within the allowed false discovery rate."""
     allowed = _FALSE_SHARE * np.arange(1, len(log_alarms) + 1)
     good = np.flatnonzero(np.exp(np.sort(log_alarms)) <= allowed)
     return int(good[-1]) + 1 if len(good) else 0
@@ -136,7 +136,7 @@ def _members(lines: Sequence[StripeLine], candidate: PlaneCandidate) -> IntArray
 def _by_target(
     pooled: PooledStripes, lines: Sequence[StripeLine], candidates: Sequence[PlaneCandidate]
 ) -> list[int]:
-    """Return the order of judgement: planes with light on the target before those beside it."""
+    """Return the order of judging: planes with light on the target before those beside it."""
     beside = [
         float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _MOST for c in candidates
     ]
@@ -149,7 +149,7 @@ def _fault(
     members: IntArray,
     seen: Sequence[JudgedPlane],
 ) -> tuple[Verdict, str] | None:
-    """Return what speaks against a plane's being a laser of its own."""
+    """Return the reason against a plane as a laser of its own, or None."""
     if len(members) < _LEAST_POINTS:
         return Verdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
@@ -180,7 +180,7 @@ def _same_light(
     members: IntArray,
     other: JudgedPlane,
 ) -> tuple[Verdict, str] | None:
-    """Return what shows that a plane's stripes may be of another plane's laser."""
+    """Return the reason why a plane's stripes may be of another plane's laser, or None."""
     mine = set(pooled.patch[members].tolist())
     shared = mine & set(other.patches)
     away = plane_residuals_px(pooled.placed, [other.candidate.plane])[members, 0]
@@ -198,7 +198,7 @@ def _same_light(
 
 
 def _goes_on(pooled: PooledStripes, members: IntArray, others: IntArray, patch: int) -> bool:
-    """Return whether a stripe of a surface lies before or behind another one's end."""
+    """Return whether a stripe continues another one of the surface beyond its ends."""
     points = pooled.placed.points_in_dome
     mine = points[members[pooled.patch[members] == patch]]
     theirs = points[others[pooled.patch[others] == patch]]
@@ -218,7 +218,7 @@ def _direction(points: FloatArray) -> FloatArray:
 
 
 def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
-    """Return whether the points of every surface are on one line of the target in all views."""
+    """Return whether the points stay on one line of each surface of the target in all views."""
     worst = 0.0
     several = False
     for surface in np.unique(pooled.placed.surface[members]):
@@ -240,19 +240,19 @@ def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
 
 
 TOLERANCE_PX = 3.0
-"""A stripe this near to a plane may be the plane's; poses add to the noise of stripes."""
+"""Greatest distance of a stripe from its plane; errors of poses add to the noise of stripes."""
 BENT_TOLERANCE_PX = 10.0
-"""Likewise where the light may be bent at a window, so that no plane fits well."""
-# Points this near to the stripe of a second laser have its light in their centre.
+"""The same for light that may be refracted at a window, so that no plane fits well."""
+# Distance from the stripe of a second laser within which its light biases a point's centre.
 _CROSSING_PX = 9.0
 _N_FITS = 5
-# A straight stripe holds this share of the chains that it is cut from, or is a chord of a curve.
+# Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
 _LEAST_OF_CHAIN = 0.25
-# Accidents are so many times as likely (natural logarithm) to make a plane that is clearly worse.
+# Difference of log false alarms from which a plane is clearly worse.
 _CLEARLY_WORSE = 3.0
-# Accidents that a plane which is asked for may be expected to be, at most, and how many times as
-# long as its own a stripe in no plane may be: tuned on 24 simulated scenes of one picture of a box
-# with glints. Accidents that a plane which has to be asked about may be expected to be.
+# Greatest expected number of accidents of a plane that is needed for the given number of lasers,
+# and greatest length of a stripe in no plane as a multiple of its own: tuned on 24 simulated scenes
+# of one picture of a box with glints. Greatest expected number of accidents of an undecided plane.
 _TOLD = float(np.log(0.2))
 _LONGER = 1.5
 _HARDLY_AN_ACCIDENT = float(np.log(0.05))
@@ -267,11 +267,11 @@ class LaserSplit:
     planes : tuple of Plane
         Rough planes of the lasers, the one with the best evidence first.
     laser : int array, shape (N,)
-        Index into `planes`; -1 for points of none, or near where two stripes cross.
+        Index into `planes`; -1 for points of none, or near the crossing of two stripes.
     unmatched : tuple of StripeLine
         Long stripes that belong to none of the planes, the longest first.
     spare : tuple of JudgedPlane
-        Further planes of light, which are not taken for lasers; undecided ones first.
+        Further planes of light that are not accepted as lasers; undecided ones first.
     """
 
     planes: tuple[Plane, ...]
@@ -281,12 +281,12 @@ class LaserSplit:
 
     @property
     def undecided(self) -> tuple[JudgedPlane, ...]:
-        """Planes that accidents hardly make, and that may be lasers nevertheless."""
+        """Further planes that are hardly accidents and may be lasers."""
         return self._undecided(_HARDLY_AN_ACCIDENT)
 
     @property
     def possible(self) -> tuple[JudgedPlane, ...]:
-        """Planes that may be lasers if there must be more of them."""
+        """Further planes that may be lasers if more are known to shine."""
         return self._undecided(_TOLD)
 
     def _undecided(self, most: float) -> tuple[JudgedPlane, ...]:
@@ -298,7 +298,7 @@ class LaserSplit:
 
     @property
     def torn(self) -> bool:
-        """Whether a laser seems to lie in several planes, as on a board that is not flat."""
+        """True if a laser appears as several planes, as on a board that is not flat."""
         return any(plane.verdict is Verdict.TORN for plane in self.spare)
 
 
@@ -309,7 +309,7 @@ def split_lasers(
     n_lasers: int | None = None,
     tolerance_px: float = TOLERANCE_PX,
 ) -> LaserSplit:
-    """Sort stripe points by the laser plane that they lie in.
+    """Assign stripe points to the laser planes that they lie in.
 
     Parameters
     ----------
@@ -318,15 +318,15 @@ def split_lasers(
     lens_in_dome : array, shape (3,)
         The lens's projection centre; a plane through it is no laser.
     n_lasers : int, optional
-        How many lasers shine; if left out, all planes of which the evidence is clear.
+        Number of lasers that shine; by default all planes with clear evidence.
     tolerance_px : float
-        How far a stripe may be from its plane.
+        Greatest distance of a stripe from its plane.
 
     Returns
     -------
     LaserSplit
-        All planes that are clear, be there more than `n_lasers`. Where there are fewer, the best
-        undecided ones, if they are clearly better than the rest of those.
+        All planes with clear evidence, even more than `n_lasers`. If there are fewer, also the best
+        undecided ones, if they are clearly better than the other undecided ones.
     """
     lines = _all_lines(pooled)
     found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
@@ -347,9 +347,9 @@ def split_lasers(
 
 
 def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
-    """Return whether a plane can be a laser if there are known to be more of them.
+    """Return whether a plane can be a laser if more are known to shine.
 
-    Not if a much longer stripe, of `longest` points, is in no plane: then that may be the laser,
+    Not if a much longer stripe, of `longest` points, is in no plane: that may be the laser then,
     seen on one surface only.
     """
     perhaps = plane.verdict in (Verdict.WEAK, Verdict.DOUBTFUL)
@@ -358,7 +358,7 @@ def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int)
 
 
 def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
-    """Return whether a plane is nearly as good as another that is a little better."""
+    """Return whether a plane's evidence is nearly as good as that of a better one."""
     worse = plane.candidate.log_false_alarms - other.candidate.log_false_alarms
     return plane.verdict is other.verdict and worse < _CLEARLY_WORSE
 
@@ -377,7 +377,7 @@ def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
 
 
 def _counts_on_patch(pooled: PooledStripes) -> IntArray:
-    """Return how many points (N,) of its own chain lie on a point's surface."""
+    """Return for each point (N,) the number of points of its chain on its surface."""
     n_chains = int(pooled.chain.max(initial=-1)) + 1
     _, place, counts = np.unique(
         pooled.patch * n_chains + pooled.chain, return_inverse=True, return_counts=True
@@ -387,7 +387,7 @@ def _counts_on_patch(pooled: PooledStripes) -> IntArray:
 
 
 def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArray) -> float:
-    """Return which share of its chains' points a line holds, the mean over its points."""
+    """Return the share of its chains' points that a line holds, as the mean over its points."""
     chains, place = np.unique(pooled.chain[line.members], return_inverse=True)
     mine = np.bincount(place, minlength=len(chains))[place]
     return float(np.mean(mine / n_of_chain[line.members]))
@@ -409,7 +409,7 @@ def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) ->
 def assigned(
     pooled: PooledStripes, planes: Sequence[Plane], tolerance_px: float = TOLERANCE_PX
 ) -> IntArray:
-    """Return which plane each point (N,) belongs to; -1 for none, or where stripes cross."""
+    """Return the index of each point's plane (N,); -1 for none, or where stripes cross."""
     n = len(pooled.patch)
     if not planes:
         return np.full(n, -1)
@@ -422,7 +422,7 @@ def assigned(
 
 
 def _crossed_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
-    """Return how far points are from where planes cut their surface, in pixels, (N, L)."""
+    """Return distances (N, L) of points from the planes' cuts with their surface, in pixels."""
     normals = np.array([p.normal for p in planes])
     offsets = np.array([p.offset for p in planes])
     gain = np.hypot(placed.by_across @ normals.T, placed.by_along @ normals.T)
@@ -432,7 +432,7 @@ def _crossed_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
 
 
 def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine, ...]:
-    """Return lines of which hardly a point was given to a laser."""
+    """Return lines with hardly any point assigned to a laser."""
     free = [
         line
         for line in lines

@@ -1,8 +1,8 @@
-"""The joint problem of `calibrate lasers`: corners and stripes, poses, laser sheets and camera.
+"""The least-squares problem of `calibrate lasers`: corners and stripes, poses, sheets and camera.
 
-A stripe's pixel sees one point of a surface of the target; the laser's sheet should pass through
-it. The residual is its distance from the sheet, told in pixels across the stripe as it was
-measured. All of it hangs on the target's pose, on the camera's numbers and on the sheet's.
+The pixel of a stripe sees one point of a surface of the target; the laser's sheet should pass
+through that point. The residual is its distance from the sheet, converted to pixels across the
+stripe, as it was measured. It depends on the target's pose, the camera's numbers and the sheet's.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from aqualvs.optics.sheet import Sheet
 N_LASER = len(LASER_PARAMETERS)
 N_SLACK = 3
 SLACK = "slack"
-"""Group of what is said beforehand about how a board lies on its surface."""
+"""Group of the priors on a board's pose on its surface."""
 
 
 def stripes_group(i_laser: int) -> str:
@@ -39,7 +39,7 @@ def stripes_group(i_laser: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Slack:
-    """How well a board lies on the surface that its stripes lie on, as standard deviations.
+    """Standard deviations of a board's pose on the surface of the stripes.
 
     Attributes
     ----------
@@ -54,23 +54,23 @@ class Slack:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Of a view's slack, shape (3,)."""
+        """Standard deviations of a view's slack, shape (3,)."""
         return np.array([self.tilt, self.tilt, self.offset])
 
 
 @dataclass(frozen=True, slots=True)
 class LaserState:
-    """What is solved for.
+    """Unknowns of the problem.
 
     Attributes
     ----------
     bundle : BundleState
         Camera, medium and poses.
     sheets : tuple of Sheet
-        Light of every laser.
+        Sheet of every laser.
     slack : array, shape (V, 3)
-        How the surface that stripes lie on differs from the target's own in every view: two tilts
-        about the target's middle (radians), and an offset away from the camera (metres).
+        Difference between the surface of the stripes and the target's own in every view: two
+        tilts about the target's middle (radians), and an offset away from the camera (metres).
     """
 
     bundle: BundleState
@@ -80,7 +80,7 @@ class LaserState:
 
 @dataclass(frozen=True, slots=True)
 class _Distances:
-    """How far a group's points (N) are from their sheet, and its derivatives."""
+    """Distances of a group's points (N) from their sheet, with derivatives."""
 
     distance: FloatArray
     by_point: FloatArray
@@ -91,22 +91,22 @@ class _Distances:
 
 @dataclass(frozen=True, slots=True)
 class LaserProblem:
-    """The problem; see `least_squares.solve`.
+    """The joint problem of `calibrate lasers`, see `least_squares.solve`.
 
-    Columns: those of `bundle`, then `LASER_PARAMETERS` of every laser, then, with slack, three of
+    Columns: those of `bundle`, then `LASER_PARAMETERS` of every laser, then, with slack, three for
     every view.
 
     Attributes
     ----------
     bundle : Bundle
-        Corners and what is known beforehand; all views in its first medium.
+        Corners and priors; all views in its first medium.
     surfaces : Surfaces
         Of the target.
     groups : tuple of StripeGroup
         Stripes; their residuals come before the corners'.
     n_lasers : int
     slack : Slack or None
-        How well the target lies on the surface; None where the target is the surface.
+        Uncertainty of the target's pose on the surface; None if the target is the surface.
     """
 
     bundle: Bundle
@@ -127,7 +127,7 @@ class LaserProblem:
         return np.arange(first, first + N_LASER)
 
     def slack_columns(self, i_view: int) -> IntArray:
-        """Return the columns of a view's slack; none where there is no slack."""
+        """Return the columns of a view's slack; none without slack."""
         if self.slack is None:
             return np.zeros(0, np.int64)
         first = self.bundle.n_parameters + N_LASER * self.n_lasers + N_SLACK * i_view
@@ -174,7 +174,7 @@ class LaserProblem:
         return LaserState(bundle, tuple(sheets), slack)
 
     def surface_planes(self, state: LaserState, i_view: int) -> list[Plane]:
-        """Return the surfaces that stripes lie on in a view, in `dome`."""
+        """Return the surfaces of the stripes in a view, in `dome`."""
         pose, slack = state.bundle.poses[i_view], state.slack[i_view]
         planes = [self.surfaces.placed(i, pose) for i in range(len(self.surfaces.planes))]
         if self.slack is None:
@@ -183,11 +183,11 @@ class LaserProblem:
         return [_slackened(plane, self._tangents(pose), middle, slack) for plane in planes]
 
     def _tangents(self, pose: SE3) -> FloatArray:
-        """Axes of the tilts in `dome`, (2, 3): fixed to the target."""
+        """Return the axes (2, 3) of the tilts in `dome`, fixed to the target."""
         return pose.rotate(tangent_basis(self.surfaces.planes[0].normal))
 
     def _seen(self, state: LaserState, camera: Camera) -> list[tuple[FloatArray, FloatArray]]:
-        """Return for every group its points and how they move, see `_moves`."""
+        """Return for every group its points and their derivatives, see `_moves`."""
         found: dict[int, tuple[FloatArray, FloatArray]] = {}
         for i_view in range(len(self.bundle.views)):
             mine = [i for i, group in enumerate(self.groups) if group.view == i_view]
@@ -204,7 +204,7 @@ class LaserProblem:
         return [found[i] for i in range(len(self.groups))]
 
     def _lit(self, state: LaserState, points: Sequence[FloatArray]) -> list[_Distances]:
-        """Return for every group how far its points are from their sheet, with derivatives."""
+        """Return for every group the distances of its points from their sheet, with derivatives."""
         found: dict[int, _Distances] = {}
         for i_laser, sheet in enumerate(state.sheets):
             mine = [i for i, group in enumerate(self.groups) if group.laser == i_laser]
@@ -230,7 +230,7 @@ class LaserProblem:
     def _stripe_block(self, group: StripeGroup, moves: FloatArray, lit: _Distances) -> Block:
         bundle = self.bundle
         slopes = np.einsum("ni,nic->nc", lit.by_point, moves)
-        # A window bends light by the ratio of the two.
+        # A window refracts light by the ratio of the two.
         if bundle.free_media:
             slopes[:, len(bundle.free)] += lit.by_water
         if "n_air" in bundle.free:
@@ -248,14 +248,14 @@ class LaserProblem:
             np.concatenate(columns),
             (lit.distance / unit)[:, None],
             (slopes / unit[:, None])[:, None, :],
-            # With slack, the noise of stripes is what their residuals cannot tell.
+            # With slack, residuals do not determine the noise of stripes.
             scaled=self.slack is None,
         )
 
     def _moves(
         self, i_view: int, points: FloatArray, normals: FloatArray, camera: Camera, pose: SE3
     ) -> FloatArray:
-        """How points (N, 3, C) move with shared numbers and the pose while their pixels stay."""
+        """Return the derivatives (N, 3, C) of points by shared numbers and pose at fixed pixels."""
         bundle, view = self.bundle, self.bundle.views[i_view]
         n_free, n_shared = len(bundle.free), bundle.n_shared
         n_pose = 0 if view.fixed else 6
@@ -282,7 +282,7 @@ class LaserProblem:
 
 
 def _rows(groups: Sequence[StripeGroup]) -> list[slice]:
-    """Return the rows of every group where all are joined."""
+    """Return the rows of every group in the joined arrays."""
     ends = np.cumsum([0, *[len(group) for group in groups]]).tolist()
     return [slice(a, b) for a, b in pairwise(ends)]
 
@@ -290,7 +290,7 @@ def _rows(groups: Sequence[StripeGroup]) -> list[slice]:
 def _slackened(plane: Plane, tangents: FloatArray, middle: FloatArray, slack: FloatArray) -> Plane:
     """Return the plane tilted about the foot of `middle`, and moved along its normal.
 
-    The normal's length is left to grow, so that slack enters linearly.
+    The normal is not normalised, so that slack enters linearly.
     """
     foot = middle - float(plane.signed_distance(middle)) * plane.normal
     normal = plane.normal + slack[:2] @ tangents

@@ -1,4 +1,4 @@
-"""What a laser calibration hands back: lasers, poses, residuals, and words about them."""
+"""The result of a laser calibration: lasers, poses, residuals and findings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,32 +18,32 @@ from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 
 @dataclass(frozen=True, slots=True)
 class LaserFigures:
-    """One calibrated laser.
+    """Figures of one calibrated laser.
 
     Attributes
     ----------
     laser : Laser
-        As the rig has it now.
+        As solved.
     sigma_normal : float
-        Standard deviation of the normal's direction, where it is worst, in radians.
+        Standard deviation of the normal's direction, along the worst axis, in radians.
     sigma_offset : float
         Standard deviation of the offset, in metres.
     rms_px, rms : float
         Root mean square distance of stripe points, by bins, from the sheet: in pixels across the
         stripe, and in metres.
     n_points, n_outliers : int
-        Stripe points that entered, and those of them that were not believed.
+        Stripe points used, and outliers among them.
     n_effective : float
-        Independent measurements that the points are worth.
+        Number of independent measurements that the points are worth.
     surfaces : tuple of str
-        Planes that the laser was seen on.
+        Surfaces that the laser was seen on.
     n_views : int
-        Pictures that it was seen in.
+        Number of pictures that it was seen in.
     paper_plane : Plane
-        By the paper's way (Eq. 33-36), for comparison: poses by distances in space, then the
+        By the paper's method (Eq. 33-36), for comparison: poses by distances in space, then the
         pseudo-inverse.
     sheet : str
-        In words, which model of the light was taken and why.
+        In words, the chosen model of the sheet and the reason.
     """
 
     laser: Laser
@@ -62,7 +62,7 @@ class LaserFigures:
 
 @dataclass(frozen=True, slots=True)
 class ViewFigures:
-    """One picture of the calibration.
+    """Figures of one picture of the calibration.
 
     Attributes
     ----------
@@ -71,9 +71,9 @@ class ViewFigures:
     dome_from_target : SE3
         Pose by corners and stripes together.
     rms_corners_px, rms_stripes_px : float
-        Of what was believed; NaN where there is none.
+        Of the inliers; NaN if there are none.
     n_corners, n_corners_rejected, n_stripe_points : int
-        Corners found, those of them not believed, and stripe points on surfaces.
+        Corners found, outliers among them, and stripe points on surfaces.
     spatial_pose : SE3
         `dome_from_target` by the paper's cost (Eq. 32-33).
     spatial_cost : float
@@ -81,11 +81,11 @@ class ViewFigures:
     spatial_rms : float
         Root mean square distance of corners from their rays, in metres.
     pose_angle, pose_shift : float
-        By how much the two poses differ, in radians, and metres at the middle of the corners.
+        Difference of the two poses, in radians, and in metres at the middle of the corners.
     corners_px, corner_residuals_px : array, shape (N, 2)
-        Where corners were found, and by how much the solution misses them.
+        Measured corners, and their residuals.
     corner_inliers : bool array, shape (N,)
-        Corners that were believed.
+        Inlier corners.
     """
 
     name: str
@@ -107,24 +107,24 @@ class ViewFigures:
 
 @dataclass(frozen=True, slots=True)
 class LaserCalibration:
-    """A finished calibration of lasers.
+    """Result of a calibration of lasers.
 
     Attributes
     ----------
     rig : Rig
         With the lasers, and the camera's numbers if they were refined.
     uncertainty : RigUncertainty
-        Of all that was uncertain beforehand and of the lasers, jointly.
+        Joint, of all numbers that were uncertain before and of the lasers.
     lasers : tuple of LaserFigures
         In the order of `rig.lasers`.
     views : tuple of ViewFigures
         Pictures that were used.
     left_out : tuple of str
-        Why others were not, in words.
+        Reasons why others were not, in words.
     warnings : tuple of str
-        What the user should know, in words.
+        Warnings for the user, in words.
     refined : bool
-        Whether the camera's numbers were solved along.
+        Whether the camera's numbers were solved too.
     """
 
     rig: Rig
@@ -138,7 +138,7 @@ class LaserCalibration:
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """A solved problem with what it was made of."""
+    """A solved problem with its parts."""
 
     problem: LaserProblem
     solution: Solution[LaserState]
@@ -150,7 +150,7 @@ class Solved:
         return self.solution.state
 
     def stripe_residuals_px(self, i_group: int) -> tuple[FloatArray, BoolArray]:
-        """Return a group's residuals (B,) in pixels, and which of them were believed."""
+        """Return a group's residuals (B,) in pixels, and the mask of inliers."""
         group = self.problem.groups[i_group]
         residuals = self.solution.blocks[i_group].residuals[:, 0]
         return residuals * group.sigma_px, self.solution.inliers[i_group]
@@ -171,7 +171,7 @@ def laser_figures(
     papers: Sequence[Plane],
     words: Sequence[str],
 ) -> list[LaserFigures]:
-    """Work out the figures of every laser."""
+    """Return the figures of every laser."""
     return [
         _laser_figures(solved, joint, i, laser, papers[i], words[i])
         for i, laser in enumerate(lasers)
@@ -205,7 +205,7 @@ def _laser_figures(
 def _stripes(
     solved: Solved, groups: Sequence[int]
 ) -> tuple[FloatArray, BoolArray, IntArray, FloatArray]:
-    """Return residuals (px), which were believed, counts and distances (m) of groups' bins."""
+    """Return residuals (px), inlier mask, counts and distances (m) of groups' bins."""
     parts = [solved.stripe_residuals_px(i) for i in groups]
     none = np.zeros(0)
     residuals = np.concatenate([none, *[p[0] for p in parts]])
@@ -223,7 +223,7 @@ def _rms(values: FloatArray, weights: IntArray) -> float:
 
 
 def view_figures(solved: Solved) -> list[ViewFigures]:
-    """Work out the figures of every picture."""
+    """Return the figures of every picture."""
     return [_view_figures(solved, i, view) for i, view in enumerate(solved.views)]
 
 

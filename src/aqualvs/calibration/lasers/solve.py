@@ -1,6 +1,9 @@
-"""Solving lasers from placed stripes: poses and planes together, in as many rounds as it takes.
+"""The solver of `calibrate lasers`: poses and planes together, and the model of each sheet.
 
-Whether the light of a laser behind a window is a plane in the water: by the residuals.
+`solve_lasers` solves the lasers as planes, assigns the stripe points anew by those planes, solves
+again, and then chooses between plane and bent sheet. The light of a laser behind a window is not
+exactly a plane in the water; the Bayesian information criterion of the residuals decides
+(`choose_sheets`). `paper_planes` gives the paper's planes (Eq. 33-36) for comparison.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,8 +32,8 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.sheet import Sheet, sheet_in
 
-# Difference of the Bayesian information criterion (Kass & Raftery 1995,
-# doi:10.1080/01621459.1995.10476572) from which the evidence is strong.
+# Difference of the Bayesian information criterion that is strong evidence (Kass & Raftery 1995,
+# doi:10.1080/01621459.1995.10476572).
 _STRONG = 6.0
 
 
@@ -41,16 +44,16 @@ class _Fit:
 
 
 def start_sheets(rig: Rig, lasers: Sequence[Laser], *, bent: bool) -> tuple[Sheet, ...]:
-    """Return the sheets to start from: planes, or bent where a laser has a window.
+    """Return the initial sheets: planes, or bent ones for lasers with a window.
 
     Parameters
     ----------
     rig : Rig
         In the medium of the pictures.
     lasers : sequence of Laser
-        `plane` is the one that fits the light in that medium.
+        `plane` fits the light in that medium.
     bent : bool
-        Whether windows count.
+        Whether sheets behind windows are bent.
     """
     sheets = []
     for laser in lasers:
@@ -60,7 +63,7 @@ def start_sheets(rig: Rig, lasers: Sequence[Laser], *, bent: bool) -> tuple[Shee
 
 
 def _bent(rig: Rig, laser: Laser) -> Sheet:
-    """Find the plane in air of which the light in the medium is nearly `laser.plane`."""
+    """Return the bent sheet whose light in the medium is nearly in `laser.plane`."""
     in_air = laser.plane
     for _ in range(5):
         sheet = sheet_in(Laser(laser.name, in_air, laser.window), rig.n_air, rig.n_water)
@@ -89,14 +92,14 @@ def choose_sheets(
     lasers : sequence of Laser
         With their windows, and the planes of `flat`.
     solve_with : callable
-        Solves again with the sheets it is given as start.
+        Solves again with given initial sheets.
 
     Returns
     -------
     solved : Solved
         With the chosen sheets.
     words : list of str
-        For every laser, what was chosen and why.
+        For every laser, the choice and its reason.
     """
     if all(laser.window is None for laser in lasers):
         return flat, ["plane"] * len(lasers)
@@ -114,7 +117,7 @@ def choose_sheets(
 
 
 def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
-    # Both have three unknowns, so that only the residuals weigh.
+    # Both have three unknowns, so that only the residuals count.
     n = min(flat.n_effective, bent.n_effective)
     evidence = 2.0 * n * float(np.log(max(flat.rms_px, 1e-9) / max(bent.rms_px, 1e-9)))
     residuals = f"residuals {bent.rms_px:.3f} px if bent at the window, {flat.rms_px:.3f} px if not"
@@ -135,20 +138,20 @@ def _fit(solved: Solved, i_laser: int) -> _Fit:
         known = np.where(inside, residuals, np.nan)
         sequences += [known[surface == k] for k in np.unique(surface)]
     everything = np.concatenate(squares)
-    # Bent light fitted by a plane leaves long waves; only their shape counts, not how many points.
+    # A plane fitted to bent light leaves long waves; their shape counts, not the number of points.
     n_effective = len(everything) / correlation_factor(sequences)
     return _Fit(float(np.sqrt(np.mean(everything))), n_effective)
 
 
-# A board fixed by hand, of paper or foam: how it lies on a wall.
+# Tilt and offset of a board of paper or foam that is fixed to a wall by hand.
 _LOOSE = Slack(float(np.deg2rad(1.0)), 2e-3)
-# A laser with fewer points in a view says nothing there.
+# Least number of a laser's points in a view.
 _FEWEST_POINTS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What solves begin with.
+    """Input and initial guess of a solve.
 
     Attributes
     ----------
@@ -158,11 +161,11 @@ class Start:
         Of the target.
     views : tuple of PlacedView
     doubt : CameraDoubt or None
-        What is refined along; None where the camera is held.
+        Numbers that are refined too; None if the camera is held.
     slack : Slack or None
-        How well a board lies on its surface; None where it is the surface.
+        Uncertainty of a board's pose on its surface; None if it is the surface.
     shared_error_px : float
-        What shifts or turns a whole stripe in its picture.
+        Error that shifts or turns a whole stripe in its picture.
     """
 
     rig: Rig
@@ -178,7 +181,7 @@ class Start:
         return [self.surfaces.placed(i, view.dome_from_target) for i in range(n)]
 
     def bundle(self) -> Bundle:
-        """Return the problem of the corners alone."""
+        """Return the bundle of the corners alone."""
         doubt = self.doubt
         return Bundle(
             views=tuple(TargetView(v.view, 0, v.dome_from_target) for v in self.views),
@@ -189,13 +192,13 @@ class Start:
         )
 
     def state(self) -> BundleState:
-        """Return camera, medium and poses to start from."""
+        """Return the initial guess of camera, medium and poses."""
         poses = tuple(v.dome_from_target for v in self.views)
         return BundleState(self.rig, np.array([self.rig.n_water]), poses)
 
 
 def tolerance_px(lasers: Sequence[Laser]) -> float:
-    """Return how far a stripe may be from its plane to be sorted to it, in pixels."""
+    """Return the largest distance of a stripe from its assigned plane, in pixels."""
     bent = any(laser.window is not None for laser in lasers)
     return BENT_TOLERANCE_PX if bent else TOLERANCE_PX
 
@@ -203,7 +206,7 @@ def tolerance_px(lasers: Sequence[Laser]) -> float:
 def solve_lasers(
     start: Start, lasers: Sequence[Laser], laser_of: IntArray, loose: bool | None
 ) -> tuple[Solved, list[str]]:
-    """Solve lasers: first as planes, then with points sorted anew by those, then their sheets.
+    """Solve lasers as planes, again with points assigned by those planes, then their sheets.
 
     Parameters
     ----------
@@ -211,7 +214,7 @@ def solve_lasers(
     lasers : sequence of Laser
         `plane` fits the light in the medium of the pictures roughly.
     laser_of : int array, shape (N,)
-        Which laser each stripe point of all views is of; -1 for none.
+        Index of the laser of each stripe point of all views; -1 for none.
     loose : bool or None
         As `LaserOptions.loose`.
 
@@ -219,7 +222,7 @@ def solve_lasers(
     -------
     solved : Solved
     words : list of str
-        For every laser, which sheet was taken and why.
+        For every laser, the chosen sheet and the reason.
     """
     names = [laser.name for laser in lasers]
     first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of, names)
@@ -241,9 +244,9 @@ def solve_lasers(
 def _sorted_again(
     start: Start, solved: Solved, laser_of: IntArray, tolerance: float
 ) -> tuple[Start, IntArray]:
-    """Return the start with solved poses, and which laser each point is of by solved planes.
+    """Return the start with solved poses, and each point's laser by solved planes.
 
-    Both as they were if a laser would lose its points by it.
+    Both are unchanged if a laser would lose its points.
     """
     state = solved.state
     camera = state.bundle.camera(0)
@@ -283,7 +286,7 @@ def _solve_from(
 def free_words(
     problem: LaserProblem, names: Sequence[str], views: Sequence[PlacedView], parameter: int
 ) -> str:
-    """Return what to do about a parameter of the problem that the pictures do not tell.
+    """Return the remedy for a parameter that the pictures do not determine.
 
     Parameters
     ----------
@@ -317,7 +320,7 @@ def free_words(
 
 
 def paper_planes(solved: Solved) -> list[Plane]:
-    """Return the planes of all lasers by the paper's way (Eq. 33-36)."""
+    """Return the planes of all lasers by the paper's method (Eq. 33-36)."""
     camera = solved.problem.bundle.start.camera(0)
     surfaces, planes = solved.problem.surfaces, []
     spatial = [

@@ -1,8 +1,9 @@
-"""Which surface of a target a stripe's light lies on, and where.
+"""Stripe points of calibration pictures and their places on the flat surfaces of a target.
 
-What one picture says of the lasers: points on stripes, whichever laser drew them.
-
-Stripe points of one laser in one picture, in bins: what the joint problem measures.
+`StripePoints` are the points of one picture, of all lasers together. `place_stripes` intersects
+their rays with the surfaces (paper, Eq. 34); `PooledStripes` joins the points of all pictures.
+`binned` puts the points of one laser in one picture into bins, the measurements of the joint
+least-squares problem.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,9 +30,9 @@ class StripePoints:
     pixels : array, shape (N, 2)
         Sub-pixel centres, in `image`.
     across : array, shape (N, 2)
-        Unit vectors in `image` at right angles to the stripe: only along these is a point measured.
+        Unit vectors in `image` at right angles to the stripe: a point is measured along these only.
     chain : int array, shape (N,)
-        Which unbroken piece of a stripe a point belongs to; pieces may bend.
+        Index of the unbroken segment of a stripe that a point belongs to; segments may bend.
     sigma_px : array, shape (N,)
         Nominal standard deviation along `across`; solves estimate the real one.
     """
@@ -47,7 +48,7 @@ class StripePoints:
         return len(self.chain)
 
     def thinned(self, n_points: int) -> "StripePoints":
-        """Return every second, third... point, so that hardly more than `n_points` are left."""
+        """Return every k-th point, so that hardly more than `n_points` are left."""
         every = -(-len(self) // n_points) if len(self) else 1
         return self if every == 1 else self.where(np.arange(len(self)) % every == 0)
 
@@ -66,7 +67,7 @@ class StripePoints:
         )
 
 
-# Points this near to where two surfaces meet may be light of the other one, or of both.
+# Points this near to the edge of two surfaces may be light of the other one, or of both.
 _EDGE = 0.006
 # An open side of a box ends this share of the box's size beyond the outermost marker.
 _RIM_SHARE = 0.02
@@ -76,16 +77,16 @@ _PIXEL_STEPS: FloatArray = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 
 @dataclass(frozen=True, slots=True)
 class Surfaces:
-    """The flat surfaces of a target that stripes are seen on, in the target's frame.
+    """Flat surfaces of a target that stripes are seen on, in the target's frame.
 
     Attributes
     ----------
     names : tuple of str
-        What messages call them.
+        Names in messages.
     planes : tuple of Plane
         Normals point away from the side that is seen.
     lowest, highest : array, shape (3,)
-        Stripes outside these bounds, in metres, lie on something else.
+        Bounds in metres; stripes outside lie on something else.
     """
 
     names: tuple[str, ...]
@@ -94,14 +95,14 @@ class Surfaces:
     highest: FloatArray
 
     def hits(self, rays_in_target: Rays) -> tuple[FloatArray, IntArray]:
-        """Find where rays meet the surfaces.
+        """Intersect rays with the surfaces.
 
         Returns
         -------
         points : array, shape (N, 3)
-            In the target's frame; NaN where a ray meets none.
+            In the target's frame; NaN if a ray meets none.
         surface : int array, shape (N,)
-            Index of the surface; -1 where there is none, or the hit lies near another surface.
+            Index of the surface; -1 if there is none, or the hit lies near another surface.
         """
         n = len(rays_in_target.origins)
         points, surface = np.full((n, 3), np.nan), np.full(n, -1)
@@ -133,10 +134,10 @@ def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> Surfaces:
     Parameters
     ----------
     planes : mapping of str to Plane
-        In `box`; normals may point either way. Surfaces end where they meet.
+        In `box`; normals may point either way. Surfaces end at their intersections.
     points : array, shape (N, 3)
-        All corners of all markers, in `box`. On its open sides the box is taken to end just beyond
-        the outermost of them, along the axes of `box`.
+        All corners of all markers, in `box`. On its open sides the box ends just beyond the
+        outermost of them, along the axes of `box`.
 
     Raises
     ------
@@ -163,13 +164,13 @@ def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> Surfaces:
 
 
 def board_surface(*, thickness: float = 0.0) -> Surfaces:
-    """Return the surface that a board lies on, with its stripes beside or on the board.
+    """Return the surface of a board, for stripes on the board or beside it.
 
     Parameters
     ----------
     thickness : float
-        How far the board's printed face stands in front of the surface that the stripes lie on, in
-        metres; 0 where the print is on the surface itself.
+        Distance of the board's printed face in front of the surface of the stripes, in metres; 0
+        if the print is on the surface itself.
     """
     far = np.full(3, np.inf)
     # A board's z axis points into it (OpenCV).
@@ -183,13 +184,13 @@ class PlacedStripes:
     Attributes
     ----------
     index : int array, shape (N,)
-        Which of the `StripePoints` they are: those that lie on a surface.
+        Indices into the `StripePoints`.
     surface : int array, shape (N,)
         Index into `Surfaces`.
     points_in_dome : array, shape (N, 3)
         In metres.
     by_pixel : array, shape (N, 3, 2)
-        How a point moves on its surface with its pixel, metres per pixel.
+        Derivative of a point on its surface by its pixel, metres per pixel.
     across : array, shape (N, 2)
         As `StripePoints.across`.
     """
@@ -202,13 +203,13 @@ class PlacedStripes:
 
     @property
     def by_across(self) -> FloatArray:
-        """How points move on their surface with their pixel across the stripe, shape (N, 3)."""
+        """Derivative of points by their pixel across the stripe, shape (N, 3)."""
         moved: FloatArray = np.einsum("nij,nj->ni", self.by_pixel, self.across)
         return moved
 
     @property
     def by_along(self) -> FloatArray:
-        """How points move on their surface with their pixel along the stripe, shape (N, 3)."""
+        """Derivative of points by their pixel along the stripe, shape (N, 3)."""
         along = np.stack([-self.across[:, 1], self.across[:, 0]], axis=-1)
         moved: FloatArray = np.einsum("nij,nj->ni", self.by_pixel, along)
         return moved
@@ -227,17 +228,17 @@ class PooledStripes:
     placed : PlacedStripes
         N points of all views; `index` counts within each view.
     patch : int array, shape (N,)
-        Which surface of which view a point lies on, counted through.
+        Surface of a view that a point lies on, counted through all views.
     patch_planes : tuple of Plane
         Surface of every patch, in `dome`.
     view : int array, shape (N,)
-        Which view a point is of.
+        View of each point.
     points_in_target : array, shape (N, 3)
         In metres.
     on_target : bool array, shape (N,)
-        Whether a point lies within the bounds of the target's corners, and not beside them.
+        True for points within the bounds of the target's corners.
     chain : int array, shape (N,)
-        Unbroken piece of a stripe, counted through all views.
+        Unbroken segment of a stripe, counted through all views.
     """
 
     placed: PlacedStripes
@@ -291,7 +292,7 @@ def place_stripes(
 
 
 def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the moves (N, 3, K) of points on surfaces that bring about given changes.
+    """Return the moves (N, 3, K) of points on surfaces that cause given changes.
 
     Parameters
     ----------
@@ -318,23 +319,23 @@ def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArra
 
 
 BIN_PX = 12.0
-"""Neighbouring points share speckle, paint and blur; so many pixels along count as one."""
+"""Length of a bin along a stripe: neighbouring points share speckle, paint and blur."""
 # A gap of more pixels than this along a stripe ends a bin.
 _GAP_PX = 10.0
-# Autocorrelation is looked at over so many bins, each from so many pairs at least.
+# Greatest lag of the autocorrelation, in bins, and least number of pairs at each lag.
 _MAX_LAG, _LEAST_PAIRS = 12, 20
 
 
 @dataclass(frozen=True, slots=True)
 class StripeGroup:
-    """Bins of points of one laser in one view, B of them, along each surface in turn.
+    """B bins of points of one laser in one view, along each surface in turn.
 
     Attributes
     ----------
     view, laser : int
-        Which.
+    Their indices.
     pixels : array, shape (B, 2)
-        Means of the points' centres, weighed by their noise, in `image`.
+        Means of the points' centres, weighted by their noise, in `image`.
     across : array, shape (B, 2)
         As `StripePoints`.
     surface : int array, shape (B,)
@@ -344,8 +345,8 @@ class StripeGroup:
     counts : int array, shape (B,)
         Number of points in every bin.
     gain : array, shape (B,)
-        How far the point moves away from the sheet as its pixel moves across the stripe, metres
-        per pixel; taken at the start and held, so that residuals stay plain squares.
+        Derivative of the distance from the sheet by the pixel across the stripe, metres per pixel;
+        taken at the start and held, so that residuals stay plain squares.
     """
 
     view: int
@@ -368,11 +369,11 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
     Parameters
     ----------
     i_view, i_laser : int
-        Which view and laser.
+        Indices of view and laser.
     points : StripePoints
         Of that laser alone, N of them.
     surface : int array, shape (N,)
-        Which surface each lies on.
+        Index of each point's surface.
 
     Returns
     -------
@@ -381,8 +382,8 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
 
     Notes
     -----
-    Within a bin a stripe is straight to a hundredth of a pixel, so that means of pixels stand for
-    means of residuals.
+    Within a bin a stripe is straight to a hundredth of a pixel, so that means of pixels can
+    replace means of residuals.
     """
     order, starts = _ordered(points.pixels, surface)
     weights = 1.0 / points.sigma_px[order] ** 2
@@ -411,7 +412,7 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
 
 
 def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the order of points along their stripe, surface by surface, and bins' first places."""
+    """Return the order of points along their stripe, by surface, and each bin's first index."""
     order, starts, n = [], [], 0
     for i in np.unique(surface):
         mine = np.flatnonzero(surface == i)
@@ -432,7 +433,7 @@ def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]
 def points_on(
     camera: Camera, pixels: FloatArray, surface: IntArray, planes: Sequence[Plane]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where pixels meet their surfaces, and the surfaces' normals, (N, 3) each.
+    """Return the points where pixels meet their surfaces, and the normals there, (N, 3) each.
 
     Parameters
     ----------
@@ -443,7 +444,7 @@ def points_on(
     surface : int array, shape (N,)
         Index into `planes`.
     planes : sequence of Plane
-        The target's surfaces in `dome`; their normals need not be units.
+        The target's surfaces in `dome`; their normals may have any length.
     """
     rays = camera.rays(pixels)
     normals = np.stack([plane.normal for plane in planes])[surface]
@@ -457,7 +458,7 @@ def points_on(
 def with_gain(
     group: StripeGroup, camera: Camera, planes: Sequence[Plane], sheet: Sheet
 ) -> StripeGroup:
-    """Return the group with its gain by the present surfaces and sheet."""
+    """Return the group with its gain for the present surfaces and sheet."""
     points, normals = points_on(camera, group.pixels, group.surface, planes)
     _, _, by_point = camera.project_with_jacobian(points)
     right = np.concatenate([group.across, np.zeros((len(points), 1))], axis=1)[..., None]
@@ -473,20 +474,20 @@ def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
     ----------
     group : StripeGroup
     error_px : float
-        Standard deviation of what shifts and turns the whole stripe in its picture. All bins
-        together then tell a place and a direction no better than that.
+        Standard deviation of a shift and turn of the whole stripe in its picture. All bins
+        together then determine place and direction no better than that.
     """
     shared = error_px * np.sqrt(0.5 * len(group))
     return replace(group, sigma_px=np.hypot(group.sigma_px, shared))
 
 
 def correlation_factor(sequences: Sequence[FloatArray]) -> float:
-    """Return by how much the variance of a mean exceeds that of independent values.
+    """Return the ratio of the variance of a mean to that for independent values.
 
     Parameters
     ----------
     sequences : sequence of array, shape (B,)
-        Residuals in order along stripes; NaN where there is none.
+        Residuals in order along stripes; NaN for missing ones.
 
     Notes
     -----

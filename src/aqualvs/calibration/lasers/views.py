@@ -1,10 +1,10 @@
-"""The pictures of a laser calibration: where the vehicle was in each, and what its stripes lit.
+"""Pictures of a laser calibration: pose of the target in each, and stripe points on its surfaces.
 
-Where the vehicle is in a box of markers: the paper's least squares of distances in space.
-
-The paper minimises V (Eq. 32-33) over the pose and the distance along every ray; each distance has
-a closed form, so that V is the sum of squared distances of the markers' corners from their rays.
-Reprojection weighs corners as they are measured, in pixels, and is better; both are reported.
+Poses are solved by reprojection, which weighs corners in pixels, as they are measured. For
+comparison `spatial_pose` solves the paper's least squares of distances in space: V (Eq. 32-33) is
+minimised over the pose and the distance along every ray. Each distance has a closed form, so that V
+is the sum of squared distances of the markers' corners from their rays. Reprojection is better;
+both are reported.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 
-# A corner belongs to a plane of the box that it is this near to, in metres.
+# A corner belongs to a plane of the box within this distance, in metres.
 _ON_PLANE = 1e-4
 _MAX_STEPS = 50
 _SMALL_TURN, _SMALL_SHIFT = 1e-10, 1e-10
@@ -61,7 +61,7 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
     camera : Camera
         Looking into the medium of the picture.
     view : View
-        Corners that are believed; this cost has no defence against wrong ones.
+        Inlier corners; this cost is not robust.
     start : SE3
         `dome_from_target` near the solution.
 
@@ -72,7 +72,7 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
     Raises
     ------
     CalibrationError
-        If fewer than three corners have rays (the paper's least number).
+        If fewer than three corners have rays (the paper's minimum).
     """
     rays = camera.rays(view.pixels)
     n = int(np.count_nonzero(rays.valid))
@@ -80,7 +80,7 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
         raise CalibrationError(f"{view.name}: {n} corners can be used but a pose needs 3")
     origins, directions = rays.origins[rays.valid], rays.directions[rays.valid]
     points = view.points[rays.valid]
-    # The closed form of lambda leaves of every equation what is at right angles to its ray.
+    # With the closed form of lambda the residual is the part at right angles to the ray.
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     middle, pose = points.mean(axis=0), start
     for _ in range(_MAX_STEPS):
@@ -97,13 +97,13 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
 
 
 def planes_with_points(view: View, planes: Sequence[Plane]) -> tuple[int, ...]:
-    """Return which of a target's planes the view's points lie on, three or more each."""
+    """Return the planes of a target that hold three or more of the view's points."""
     near = [np.abs(plane.signed_distance(view.points)) < _ON_PLANE for plane in planes]
     return tuple(i for i, on in enumerate(near) if np.count_nonzero(on) >= 3)
 
 
 def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
-    """Return by how much two poses differ: angle (radians), and shift of a point `middle` (m)."""
+    """Return the difference of two poses: angle (radians), and shift of a point `middle` (m)."""
     turn = a.rotation @ b.rotation.T
     # Accurate near zero, unlike the arc cosine of the trace.
     sine = 0.5 * np.linalg.norm(
@@ -114,13 +114,13 @@ def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
 
 
 _FEWEST_CORNERS = 4
-# Neighbouring points of a stripe say much the same.
+# Neighbouring points of a stripe are nearly redundant.
 _ENOUGH_POINTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
 class LaserView:
-    """One picture: points of the target, and of stripes on it.
+    """Points of the target and of stripes on it in one picture.
 
     Attributes
     ----------
@@ -136,12 +136,12 @@ class LaserView:
 
 @dataclass(frozen=True, slots=True)
 class PlacedView:
-    """A picture with the target's pose in it.
+    """Picture with the target's pose and the stripes on its surfaces.
 
     Attributes
     ----------
     view : View
-        Corners that were believed.
+        Inlier corners.
     stripes : StripePoints
         As found.
     dome_from_target : SE3
@@ -151,9 +151,9 @@ class PlacedView:
     placed : PlacedStripes
         Stripe points on the target's surfaces.
     n_corners_rejected : int
-        Corners that were not believed.
+        Number of outlier corners.
     rms_px : float
-        Root mean square distance of the corners from where the pose by them alone puts them.
+        Root mean square residual of the corners for the pose by them alone.
     """
 
     view: View
@@ -177,13 +177,13 @@ def place_views(
     views : sequence of LaserView
         One for each picture.
     surfaces : Surfaces
-        Of the target. Where it has several, markers must be seen on two or more.
+        Of the target. If it has several, markers must be seen on at least two.
 
     Returns
     -------
     placed : list of PlacedView
     left_out : list of str
-        Why others could not be used, in words, the picture's name first.
+        Reasons why others could not be used, in words, the picture's name first.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: Surfaces) -> P
 
 
 def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: Surfaces) -> PlacedView:
-    """Return the picture with another pose, and its stripes where that puts them."""
+    """Return the picture with another pose, and its stripes placed by that pose."""
     placed = place_stripes(camera, view.stripes, pose, surfaces)
     return replace(view, dome_from_target=pose, placed=placed)
 
@@ -262,7 +262,7 @@ def _none() -> PlacedStripes:
 
 
 def pooled(views: Sequence[PlacedView], surfaces: Surfaces) -> PooledStripes:
-    """Return the stripe points of all pictures as one."""
+    """Return the stripe points of all pictures joined."""
     n_surfaces = len(surfaces.planes)
     parts = [view.placed for view in views]
     placed = PlacedStripes(
@@ -298,6 +298,6 @@ def pooled(views: Sequence[PlacedView], surfaces: Surfaces) -> PooledStripes:
 
 
 def split_by_view(values: IntArray, views: Sequence[PlacedView]) -> list[IntArray]:
-    """Return what belongs to each picture of values (N,) of all points."""
+    """Split values (N,) of all points by picture."""
     ends = np.cumsum([len(view.placed) for view in views])[:-1]
     return np.split(values, ends)

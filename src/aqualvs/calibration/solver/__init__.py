@@ -1,1 +1,1 @@
-"""Least squares with an honest covariance: residual blocks, bundle adjustment, priors."""
+"""Least squares with estimated covariance: residual blocks, bundle adjustment, priors."""

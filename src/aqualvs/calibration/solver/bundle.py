@@ -1,12 +1,12 @@
 """Bundle adjustment through the dome: views of targets, one camera, one or several media.
 
-The one problem behind `calibrate camera`, `calibrate dome` and the poses of `calibrate lasers`:
-reprojection residuals of all corners, with analytic derivatives by the camera's numbers, the media
-outside and the targets' poses.
+The common problem of `calibrate camera`, `calibrate dome` and the poses of `calibrate lasers`:
+reprojection residuals of all corners, with analytic derivatives by the camera's numbers, the
+indices of the media and the targets' poses.
 
-Small changes of a target's pose, in which poses are solved and their covariance is told.
-
-Reprojection residuals of many views at once, with derivatives by camera, medium and poses.
+A step of a pose has six numbers: a rotation vector about a point of the target (the middle of the
+view's points) and a shift, both in `dome`. Poses are solved, and their covariance is given, in such
+steps (`moved_target`).
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
     ----------
     pose : SE3
     middle : array, shape (3,)
-        In the target's frame; stays in its place under the turn.
+        Centre of the turn, in the target's frame.
     step : array, shape (6,)
         Rotation vector (radians) and shift (metres), both in `dome`.
     """
@@ -41,7 +41,7 @@ def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
 def moved_targets(
     poses: Sequence[SE3], middles: Sequence[FloatArray], steps: FloatArray
 ) -> list[SE3]:
-    """Return several poses, each moved by its own of the steps (N, 6), as `moved_target` does."""
+    """Return several poses, each moved by its row of the steps (N, 6), as by `moved_target`."""
     turns = rotation_from_rotvec(steps[:, :3])
     moves = zip(poses, middles, turns, steps[:, 3:], strict=True)
     return [_moved(pose, middle, turn, shift) for pose, middle, turn, shift in moves]
@@ -61,7 +61,7 @@ def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
     points_in_dome : array, shape (N, 3)
         Points of the target.
     centre : array, shape (3,)
-        What the target turns about, in `dome`.
+        Centre of the turn, in `dome`.
     """
     by_pose = np.zeros((len(points_in_dome), 3, 6))
     by_pose[:, :, :3] = -skew(points_in_dome - centre)
@@ -76,16 +76,16 @@ CORNER_SIGMA_PX = 0.1
 
 @dataclass(frozen=True, slots=True)
 class PosedView:
-    """A view, where its target is taken to be, and where its derivatives belong.
+    """A view with the pose of its target and the columns of its derivatives.
 
     Attributes
     ----------
     view : View
     dome_from_target : SE3
     shared_columns : int array, shape (S,)
-        Of the camera's numbers, in the order that `corner_blocks` is given.
+        Of the camera's numbers, in the order of `shared` in `corner_blocks`.
     pose_columns : int array, shape (6,) or (0,)
-        Of the pose; none where it is exact.
+        Of the pose; none if it is exact.
     """
 
     view: View
@@ -100,9 +100,9 @@ def corner_blocks(camera: Camera, shared: Sequence[str], views: Sequence[PosedVi
     Parameters
     ----------
     camera : Camera
-        As it looks into that medium.
+        Looking into that medium.
     shared : sequence of str
-        The camera's numbers that are solved for, as `parameter_names` has them.
+        The camera's numbers that are solved for, named as by `parameter_names`.
     views : sequence of PosedView
     """
     if not views:
@@ -163,15 +163,15 @@ _N_WATER = "n_water"
 
 
 class PoseTerm(Protocol):
-    """What is known beforehand about the pose of one target, as residuals of it."""
+    """A prior on the pose of one target, as residuals."""
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
-        """Return residuals and their derivative by a step of the pose, see `pose_steps`."""
+        """Return residuals and their derivative by a step of the pose, see `moved_target`."""
 
 
 @dataclass(frozen=True, slots=True)
 class TargetView:
-    """One view with all that is given about it.
+    """A view with the starting pose of its target and the priors on it.
 
     Attributes
     ----------
@@ -180,11 +180,11 @@ class TargetView:
     medium : int
         Index into `BundleState.media`.
     dome_from_target : SE3
-        Start of the pose, or the pose itself.
+        Initial guess of the pose, or the exact pose.
     fixed : bool
         Whether the pose is exact.
     known : tuple of PoseTerm
-        What else is known about the pose.
+        Priors on the pose.
     """
 
     view: View
@@ -196,7 +196,7 @@ class TargetView:
 
 @dataclass(frozen=True, slots=True)
 class BundleState:
-    """What a bundle solves for.
+    """Unknowns of a bundle.
 
     Attributes
     ----------
@@ -213,13 +213,13 @@ class BundleState:
     poses: tuple[SE3, ...]
 
     def camera(self, medium: int) -> Camera:
-        """Return the camera as it looks into one of the media."""
+        """Return the camera looking into one of the media."""
         return self.rig.in_water(float(self.media[medium])).camera()
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """The problem; see `least_squares.solve`.
+    """Bundle adjustment as a problem of `least_squares.solve`.
 
     Columns: the rig's free numbers, the free media, then six for each view whose pose is free (a
     turn about the middle of its points, radians in `dome`, and a shift, metres).
@@ -228,14 +228,14 @@ class Bundle:
     ----------
     views : tuple of TargetView
     free : tuple of str
-        Names of the rig's numbers that are solved for, as `parameter_names` has them, `n_water`
-        not among them.
+        Names of the rig's numbers that are solved for, as in `parameter_names`, without
+        `n_water`.
     start : BundleState
-        Where the solve starts, and what priors are centred on.
+        Initial guess, and mean of the priors.
     priors : RigUncertainty
-        How well the start is known; numbers it does not name have no prior.
+        Uncertainty of the start; numbers that it does not name have no prior.
     media_sigma : array, shape (M,)
-        How well the start's media are known: 0 keeps one exact, infinite leaves it free.
+        Standard deviation of the start's media: 0 keeps one exact, infinite leaves it free.
     """
 
     views: tuple[TargetView, ...]
@@ -260,19 +260,19 @@ class Bundle:
         return self.n_shared + 6 * sum(not v.fixed for v in self.views)
 
     def medium_columns(self, medium: int) -> IntArray:
-        """Return the column of a medium; none where it is exact."""
+        """Return the column of a medium; none if it is exact."""
         free = self.free_media
         return np.array([len(self.free) + free.index(medium)] if medium in free else [], np.int64)
 
     def pose_columns(self, i_view: int) -> IntArray:
-        """Return the columns of a view's pose; none where it is exact."""
+        """Return the columns of a view's pose; none if it is exact."""
         if self.views[i_view].fixed:
             return np.zeros(0, np.int64)
         first = self.n_shared + 6 * sum(not v.fixed for v in self.views[:i_view])
         return np.arange(first, first + 6)
 
     def blocks(self, state: BundleState) -> list[Block]:
-        """Return the residuals: one block of corners a view, in order; what is known; priors."""
+        """Return the residuals: one block of corners a view, in order; then all priors."""
         return [*self._corner_blocks(state), *self._known(state), *self._priors(state)]
 
     def moved(self, state: BundleState, step: FloatArray) -> BundleState:

@@ -1,22 +1,21 @@
-"""Covariance of what all views share, estimated from how the views disagree.
+"""Covariance and observability of the parameters that all views share.
 
-Errors of corners that are common to a view (the board bends, the camera moves during the exposure,
-a rolling shutter) leave residuals that vary smoothly over the picture. A covariance that counts
-every corner as independent is then too small. Each view's pull on the shared parameters is taken as
-one observation instead: the cluster-robust "sandwich" (Liang & Zeger 1986,
-doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views of unequal leverage (Bell &
-McCaffrey 2002, Survey Methodology 28, 169-181). A few views tell many parameters' covariance badly;
-it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
+By views (`view_covariance`): errors of corners that are common to a view (the board bends, the
+camera moves during the exposure, a rolling shutter) leave residuals that vary smoothly over the
+picture. A covariance that counts every corner as independent is then too small. Each view's score
+of the shared parameters is taken as one observation instead: the cluster-robust "sandwich" (Liang &
+Zeger 1986, doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views of unequal leverage
+(Bell & McCaffrey 2002, Survey Methodology 28, 169-181). Few views determine the covariance of many
+parameters badly; it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
 doi:10.1016/S0047-259X(03)00096-4).
 
-Views from which nothing good can come, and the words that say what to do about it.
+Held parameters (`considered`): the errors of numbers that were held, though they are not known
+exactly, pass into the numbers that were solved for, through the derivatives of both. This is the
+"consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4).
 
-What the data of a solve determined, and what rests on prior knowledge.
-
-Covariance of a solve that took some numbers as they are, though they are not known exactly.
-
-The "consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4): the errors of
-numbers that were held pass into those that were solved for, through the slopes of both.
+Observability (`observability`): combinations of numbers that the data determined, and those that
+rest on their priors. Degenerate sets of views, such as boards that are all alike or distances in a
+wrong unit, are recognised and described with a remedy (`all_alike`, `scale_fault`).
 """
 
 from collections.abc import Sequence
@@ -30,9 +29,9 @@ from aqualvs.calibration.solver.priors import PRIORS
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import RigUncertainty
 
-# Boards less than this apart in direction (radians) and in distance (share) are all the same.
+# Boards less than this apart in direction (radians) and in distance (share) are all alike.
 _SAME_DIRECTION, _SAME_DISTANCE = np.deg2rad(3.0), 0.05
-# Ratios of found to given lengths that a mistaken unit explains, to within the last.
+# Ratios of found to given lengths that a wrong unit explains, and the tolerance of the ratio.
 _UNITS = {
     1e3: "distances written in metres, or square_mm in micrometres",
     1e-3: "distances written in micrometres, or square_mm in metres",
@@ -47,7 +46,7 @@ _UNIT_TOLERANCE = 0.12
 
 
 def spread_of(normals: FloatArray, distances: FloatArray) -> tuple[float, float]:
-    """Return how much boards differ in direction (radians, largest) and distance (share).
+    """Return the spread of boards in direction (radians, largest) and distance (share).
 
     Parameters
     ----------
@@ -66,10 +65,10 @@ def all_alike(normals: FloatArray, distances: FloatArray) -> bool:
 
 
 def length_ratio(given: FloatArray, found: FloatArray) -> float:
-    """Return how many times longer distances found in pictures are than those given.
+    """Return the ratio of distances found in pictures to those given.
 
-    From the differences between views where they differ enough (a median, so that a few wrong ones
-    do not count): an offset, such as of a lens that is not yet known, plays no part then.
+    From the differences between views if they differ enough (a median, so that a few wrong ones do
+    not count): an offset, such as of a lens that is not yet known, then cancels.
     """
     i, j = np.triu_indices(len(given), 1)
     apart = np.abs(given[i] - given[j]) > 0.1 * np.median(np.abs(given))
@@ -79,7 +78,7 @@ def length_ratio(given: FloatArray, found: FloatArray) -> float:
 
 
 def scale_fault(ratio: float, tolerance: float) -> str | None:
-    """Return what a ratio of found to given distances means; None where all is well."""
+    """Return what a ratio of found to given distances means; None if it is near 1."""
     if abs(ratio - 1.0) <= tolerance:
         return None
     for unit, meaning in _UNITS.items():
@@ -101,7 +100,7 @@ def scale_fault(ratio: float, tolerance: float) -> str | None:
 
 
 def unbelievable_distance(distances: FloatArray, labels: Sequence[str]) -> str | None:
-    """Return what is wrong with boards at distances (metres) at which nobody holds them."""
+    """Return the fault of boards at unlikely distances (metres)."""
     median = float(np.median(distances))
     label = labels[int(np.argsort(distances)[len(distances) // 2])]
     if 0.03 < median < 30.0:
@@ -114,14 +113,14 @@ def unbelievable_distance(distances: FloatArray, labels: Sequence[str]) -> str |
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """A combination of numbers, each counted in sigmas of its prior.
+    """A combination of numbers, each in sigmas of its prior.
 
     Attributes
     ----------
     weights : dict
-        Share of every number, squares adding up to 1.
+        Component of every number, squares adding up to 1.
     gain : float
-        How many times more the data say about it than the prior does.
+        Ratio of the information of the data to that of the prior.
     """
 
     weights: dict[str, float]
@@ -129,20 +128,20 @@ class Direction:
 
     @property
     def main(self) -> dict[str, float]:
-        """The numbers that make up nearly all of it, largest first."""
+        """Numbers that make up nearly all of it, largest first."""
         order = sorted(self.weights, key=lambda name: -abs(self.weights[name]))
         return {name: self.weights[name] for name in order if abs(self.weights[name]) > 0.3}
 
 
 @dataclass(frozen=True, slots=True)
 class Observability:
-    """What the data determined of the numbers of which something was known beforehand.
+    """Observability of numbers with a prior: how far the data determined them.
 
     Attributes
     ----------
     shrinkage : dict
-        For every such number its sigma after the solve over that before: 1 says that the data
-        added nothing.
+        Ratio of each number's sigma after the solve to that before: 1 if the data added
+        nothing.
     directions : tuple of Direction
         Independent combinations, best determined first.
     """
@@ -151,11 +150,11 @@ class Observability:
     directions: tuple[Direction, ...]
 
     def untold(self, limit: float = 0.1) -> list[Direction]:
-        """Return the combinations about which the data say far less than the priors do."""
+        """Return the combinations with far less information from the data than from the priors."""
         return [direction for direction in self.directions if direction.gain < limit]
 
     def undetermined(self, names: Sequence[str], limit: float = 0.9) -> list[str]:
-        """Return which of the names the data hardly say anything about."""
+        """Return those of the names that the data hardly determine."""
         return [name for name in names if self.shrinkage.get(name, 0.0) > limit]
 
 
@@ -165,9 +164,9 @@ def observability(
     uncertainty: RigUncertainty,
     names: Sequence[str],
 ) -> Observability:
-    """Weigh what a solve learnt about some numbers against what was known of them.
+    """Compare the information that a solve adds about some numbers with their priors.
 
-    All else is marginalised, with what was known of it: poses, the lens, the intrinsics.
+    All else is marginalised, with its priors: poses, the lens, the intrinsics.
 
     Parameters
     ----------
@@ -175,10 +174,10 @@ def observability(
     solution : Solution
         Of it.
     uncertainty : RigUncertainty
-        After the solve, with that of numbers that were held passed on.
+        After the solve, with the uncertainty of held numbers propagated.
     names : sequence of str
-        Numbers to judge, whose priors do not hang on those of others; those without a prior are
-        passed over.
+        Numbers to judge, with priors independent of those of others; those without a prior are
+        skipped.
     """
     names = [name for name in names if name in bundle.free and name in bundle.priors.names]
     if not names:
@@ -189,7 +188,7 @@ def observability(
     learnt[np.ix_(columns, columns)] -= np.linalg.inv(prior)
     root = np.linalg.cholesky(prior)
     gains, vectors = np.linalg.eigh(root.T @ _marginal(learnt, columns) @ root)
-    # In the numbers themselves a direction is root @ vector; told in sigmas of each one's prior.
+    # In the numbers themselves a direction is root @ vector; given in sigmas of each one's prior.
     shares = root @ vectors / np.sqrt(np.diag(prior))[:, None]
     shares /= np.linalg.norm(shares, axis=0)
     directions = tuple(
@@ -212,7 +211,7 @@ def _marginal(information: FloatArray, columns: IntArray) -> FloatArray:
 def considered(
     bundle: Bundle, solution: Solution[BundleState], held: RigUncertainty
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Return the joint covariance of what was solved for and of what was held.
+    """Return the joint covariance of solved and held numbers.
 
     Parameters
     ----------
@@ -247,7 +246,7 @@ def considered(
 def _cross_information(
     bundle: Bundle, solution: Solution[BundleState], held: tuple[str, ...]
 ) -> FloatArray:
-    """Return what the data say about solved and held numbers together, shape (P, H)."""
+    """Return the cross information of the data on solved and held numbers, shape (P, H)."""
     wider = replace(bundle, free=(*bundle.free, *held))
     kept = [i for i, b in enumerate(solution.blocks) if b.group != PRIORS]
     # Priors stand at the end, so both problems begin with the same blocks.
@@ -264,10 +263,10 @@ def _cross_information(
     return cross
 
 
-# A view that determines a combination by itself to more than this share has nothing to be compared
-# with there.
+# A view with more than this share of the information on a combination has no other view to be
+# compared with there.
 _ALONE = 0.999
-# Student's distribution has a variance from three views on; fewer are taken as so many.
+# Student's distribution has a variance from three views on; fewer count as this number.
 _FEWEST_VIEWS = 3.0
 
 
@@ -282,11 +281,11 @@ class ViewCovariance:
     by_views : array, shape (S, S)
         From the disagreement of the views; nowhere smaller than `by_corners`.
     inflation : float
-        How many times larger the variance by views is, over all combinations; 1 if the corners'
-        errors are independent, and by chance below.
+        Ratio of the variance by views to that by corners, over all combinations; 1 if the
+        corners' errors are independent, or less by chance.
     step : array, shape (S,)
-        What one Gauss-Newton step would add to the parameters; zero at the solution. The
-        disagreement of the views is that after this step.
+        One Gauss-Newton step of the parameters; zero at the solution. The disagreement of the
+        views is evaluated after this step.
     """
 
     by_corners: FloatArray
@@ -296,12 +295,12 @@ class ViewCovariance:
 
 
 def shared_covariance(bundle: Bundle, solution: Solution[BundleState]) -> ViewCovariance:
-    """Estimate the covariance of what the views of a bundle share, see `view_covariance`.
+    """Estimate the covariance of the parameters that a bundle's views share, by `view_covariance`.
 
     Parameters
     ----------
     bundle : Bundle
-        Without priors, and with free poses of which nothing is known.
+        Without priors, and with free poses that have none either.
     solution : Solution
         Of it; columns beyond those of the bundle are shared, too, and come last.
     """
@@ -327,7 +326,7 @@ def view_covariance(
         One for each view, at the solution or near it. Columns that are not shared
         belong to its pose alone.
     inliers : sequence of bool array, shape (N,)
-        Corners that were believed.
+        Inlier corners.
     scales : sequence of float
         Noise of each view as a multiple of the nominal one.
     shared : int array, shape (S,)
@@ -336,7 +335,7 @@ def view_covariance(
     Raises
     ------
     CalibrationError
-        If the views say nothing at all about one of the parameters.
+        If the views give no information on one of the parameters.
     """
     own, pulls = [], []
     for block, inside, scale in zip(blocks, inliers, scales, strict=True):
@@ -355,7 +354,7 @@ def view_covariance(
 def _without_pose(
     block: Block, inside: BoolArray, scale: float, shared: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what one view says (S, S) of the shared parameters, and its pull (S,) on them."""
+    """Return one view's information (S, S) on the shared parameters, and its score (S,)."""
     n = len(block.columns)
     equations = normal_equations(n, [replace(block, columns=np.arange(n))], [inside], [scale])
     place = {int(column): i for i, column in enumerate(shared)}
@@ -384,9 +383,9 @@ def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[Fl
     Parameters
     ----------
     own : sequence of array, shape (S, S)
-        What each view says; they add up to the unit matrix.
+        Information of each view; they add up to the unit matrix.
     scores : sequence of array, shape (S,)
-        Its pull; of covariance own (1 - own) if the errors of corners are independent.
+        Its score; of covariance own (1 - own) if the errors of corners are independent.
     """
     n, size = len(own), len(own[0])
     corrected, expected = np.zeros((n, size)), 0.0
@@ -402,8 +401,8 @@ def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[Fl
     sandwich = corrected.T @ corrected
     inflation = float(np.trace(sandwich)) / expected
     values, vectors = np.linalg.eigh(_shrunk(corrected, sandwich, inflation))
-    # Few views tell their own scatter badly: a ratio to it is Student's, of a variance so much
-    # larger. Corners' own noise is known from many, and is there in any case.
+    # Few views determine their own scatter badly: a ratio to it has Student's distribution, whose
+    # variance is larger. The noise of corners is known from many, and is present in any case.
     shares = np.einsum("sk,nst,tk->nk", vectors, np.array(own), vectors)
     effective = np.maximum(np.sum(shares, axis=0) ** 2 / np.sum(shares**2, axis=0), _FEWEST_VIEWS)
     students = effective / (effective - 2.0)
@@ -412,7 +411,7 @@ def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[Fl
 
 
 def _shrunk(corrected: FloatArray, sandwich: FloatArray, inflation: float) -> FloatArray:
-    """Shrink the sandwich towards a multiple of one, by how uncertain it is itself."""
+    """Shrink the sandwich towards a multiple of the unit matrix, by its own uncertainty."""
     n, size = corrected.shape
     target = inflation * np.eye(size)
     outer = corrected[:, :, None] * corrected[:, None, :]

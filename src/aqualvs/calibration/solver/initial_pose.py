@@ -1,12 +1,14 @@
-"""Where a target is, from one picture of it, with no starting values: flat targets or not.
+"""Pose of a target from one picture, without starting values, for flat and other targets.
 
 Through a dome there is no closed form. The rays that the pixels see in the outer medium are first
 taken to start at the one point nearest to them all, for which perspective-n-point has closed
 solutions: IPPE for flat targets with both of its answers (Collins & Bartoli 2014,
 doi:10.1007/s11263-014-0725-5), SQPnP for others (Terzakis & Lourakis 2020,
-doi:10.1007/978-3-030-58452-8_28). Each is then refined through the true optics, robustly.
+doi:10.1007/978-3-030-58452-8_28). Each is then refined robustly through the true optics
+(`target_pose`).
 
-Where a solve of poses starts: each view's pose by itself, then all of them turned square.
+`start_pose` gives the faster initial guess of each view for a bundle; `turned_square` then turns
+camera and boards together until most boards stand square to the dome.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,22 +28,22 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 
 MAX_RMS_PX = 5.0
-"""Corners that fit worse than this do not show the target they are said to."""
+"""Largest residual of corners of the right target."""
 _CORNERS = "corners"
 _MIN_POINTS = 4
 # Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.
 _LINE, _FLAT, _NEARLY_FLAT = 1e-3, 1e-6, 0.05
-# The start takes all rays to meet in one point, which behind a dome they miss by some pixels.
+# Error, in pixels, of taking all rays to meet in one point, which behind a dome they do not.
 _START_ERROR_PX = 8.0
 _FEW_INLIERS = 0.7
-# Rivals whose residuals are less than this many times longer may be the truth.
+# A second pose with residuals less than this many times larger may be the true one.
 _RIVAL = 1.5
 # Closed solutions this many times worse than the best are not worth refining.
 _HOPELESS = 5.0
-# So many observations at the nominal noise temper the noise that a view's own residuals tell: the
-# eight residuals of a single marker leave two degrees of freedom.
+# Number of observations at the nominal noise that are added to a view's own residuals in the noise
+# estimate: the eight residuals of a single marker leave two degrees of freedom.
 _PRIOR_FREEDOM = 8.0
-# Rays further than this from their mean (cosine) are of no use to the start.
+# Rays further than this from their mean (cosine) are not used in the initial guess.
 _SIDEWAYS = 0.15
 
 
@@ -54,14 +56,14 @@ class TargetPose:
     dome_from_target : SE3
         The pose.
     covariance : array, shape (6, 6)
-        Of the step of `pose_steps.moved_target`: a turn about the middle of the view's points
+        Of the step of `bundle.moved_target`: a turn about the middle of the view's points
         (radians) and a shift (metres), both in `dome`; camera and medium taken as exact.
     rms_px : float
         Root mean square distance of the inliers from their predicted pixels.
     inliers : bool array, shape (N,)
-        The view's points that were believed.
+        Mask of the view's points that were used.
     ambiguous : bool
-        Whether a second pose, a flat target leaning the other way, explains the view nearly as
+        True if a second pose, a flat target leaning the other way, explains the view nearly as
         well.
     """
 
@@ -75,18 +77,18 @@ class TargetPose:
 def target_pose(
     camera: Camera, view: View, *, sigma_px: float = 0.1, max_rms_px: float = MAX_RMS_PX
 ) -> TargetPose:
-    """Find the pose of a target from scratch.
+    """Find the pose of a target without an initial guess.
 
     Parameters
     ----------
     camera : Camera
         Bare or behind a dome, looking into the medium of the picture.
     view : View
-        Four points or more that are not on one line; up to about a third may be wrong.
+        At least four points that are not on one line; up to about a third may be wrong.
     sigma_px : float
-        Nominal noise of a corner; weighs in where a view has few points.
+        Nominal noise of a corner; counts if a view has few points.
     max_rms_px : float
-        Inliers that fit worse are no view of this target. Infinite to take any pose.
+        Largest residual of the inliers of a view of this target. Infinite accepts any pose.
 
     Returns
     -------
@@ -197,14 +199,14 @@ def _doubtful(solution: Solution[SE3], sigma_px: float, max_rms_px: float) -> bo
 
 
 def _better(a: Solution[SE3], b: Solution[SE3]) -> bool:
-    """Return whether `a` is more believable: the median residual of all points decides."""
+    """Return whether `a` is the better pose, by the median residual of all points."""
     a_all, b_all = (np.linalg.norm(s.blocks[0].residuals, axis=1) for s in (a, b))
     return bool(np.median(np.nan_to_num(a_all, nan=np.inf)) < np.nanmedian(b_all))
 
 
 @dataclass(frozen=True, slots=True)
 class _Pinhole:
-    """The pinhole camera that comes nearest to the rays of a view."""
+    """Pinhole camera that is nearest to the rays of a view."""
 
     dome_from_pinhole: SE3
     points: FloatArray
@@ -219,8 +221,8 @@ def _pinhole(view: View, rays: Rays) -> _Pinhole:
     forward = directions.mean(axis=0)
     forward /= np.linalg.norm(forward)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    # Rays of a narrow view nearly meet anywhere along them: a faint pull towards the mean origin
-    # picks one place.
+    # Rays of a narrow view nearly meet anywhere along them: a weak prior on the mean origin selects
+    # one place.
     pull = 1e-6 * len(directions) * np.eye(3)
     right = np.einsum("nij,nj->i", across, origins) + pull @ origins.mean(axis=0)
     centre = np.linalg.solve(across.sum(axis=0) + pull, right)
@@ -234,9 +236,9 @@ def _pinhole(view: View, rays: Rays) -> _Pinhole:
 
 
 def closed_form_poses(view: View, rays: Rays) -> Iterator[SE3]:
-    """Yield the poses that closed solutions find for a view whose pixels see these rays.
+    """Yield the closed-form poses of a view whose pixels see these rays.
 
-    They take all rays to start at the one point nearest to them all.
+    All rays are taken to start at the one point nearest to them all.
     """
     pinhole = _pinhole(view, rays)
     extents, axes, middle = _extents(pinhole.points)
@@ -309,9 +311,9 @@ def _not_found(view: View, best: Solution[SE3] | None, sigma_px: float) -> str:
     )
 
 
-# Points of a view that a starting pose is found from: more gain nothing.
+# Number of points of a view used for a starting pose: more gain nothing.
 _ENOUGH_POINTS = 48
-# A closed solution whose median corner is this near needs no refinement of its own.
+# A closed solution with a median error below this needs no refinement.
 _NEAR_PX = 2.0
 _START_MIN_POINTS = 6
 _QUARTER = 0.5 * np.pi
@@ -325,7 +327,7 @@ class StartPose:
     ----------
     dome_from_target : SE3
     median_px : float
-        How far off the median point is that it was found from.
+        Median error of the points it was found from.
     """
 
     dome_from_target: SE3
@@ -333,7 +335,7 @@ class StartPose:
 
 
 def start_pose(camera: Camera, view: View) -> StartPose | str:
-    """Return a view's pose, however badly the starting camera explains it, or why there is none."""
+    """Return a view's pose, even if the starting camera fits badly, or why there is none."""
     few = thinned(view)
     rays = camera.rays(few.pixels)
     if np.count_nonzero(rays.valid) >= _START_MIN_POINTS:
@@ -355,11 +357,11 @@ def _judged(camera: Camera, view: View, pose: SE3) -> StartPose:
 
 
 def thinned(view: View, n_points: int = _ENOUGH_POINTS) -> View:
-    """Return a view with at most so many points, spread over the target."""
+    """Return a view with a limited number of points, spread over the target."""
     if len(view) <= n_points:
         return view
     keep = np.zeros(len(view), np.bool_)
-    # A fixed stride would keep few columns of a board whose rows it divides.
+    # A fixed stride would keep few columns if it divides the length of the rows.
     keep[np.random.default_rng(len(view)).permutation(len(view))[:n_points]] = True
     return view.where(keep)
 
@@ -387,8 +389,8 @@ def turned_square(
 ) -> tuple[Rig, list[SE3]]:
     """Turn camera and boards together about the dome's centre until most boards stand square.
 
-    Pictures cannot tell: through a sphere the turn changes nothing. The turn is that which makes
-    one of the boards exactly square and leaves the smallest robust tilt of the others.
+    The pictures do not determine this turn: through a sphere it changes nothing. The turn chosen
+    makes one of the boards exactly square and leaves the smallest robust tilt of the others.
 
     Parameters
     ----------
@@ -398,9 +400,9 @@ def turned_square(
     square : array, shape (3, 3)
         Rotation of a square board.
     boards : sequence of int
-        Those of which it is known that most are square.
+        Indices of boards most of which are known to be square.
     sigma : float
-        How square, in radians.
+        Standard deviation of their tilt, in radians.
     """
     tilts = np.array([rotvec_from_rotation(poses[i].rotation @ square.T) for i in boards])
     apart = np.sum((tilts[:, None] - tilts[None]) ** 2, axis=-1)

@@ -1,14 +1,11 @@
-"""Robust non-linear least squares over blocks of residuals, with an honest covariance.
+"""Robust non-linear least squares over blocks of residuals, with an estimated covariance.
 
-Levenberg-Marquardt on the normal equations (Marquardt 1963, doi:10.1137/0111030), robust by
-iterated reweighting (Huber 1964, doi:10.1214/aoms/1177703732). The noise of measurements is
-estimated from their residuals, and the covariance rests on that, not on a promise.
+Levenberg-Marquardt on the normal equations (Marquardt 1963, doi:10.1137/0111030), made robust by
+iteratively reweighted least squares (Huber 1964, doi:10.1214/aoms/1177703732). A loss is a function
+of the length of an observation's residual in standard deviations (`Loss`).
 
-Loss functions of robust least squares, by the length of a residual in standard deviations.
-
-Blocks of residuals: what a least-squares problem is made of.
-
-How noisy measurements are, from their residuals: of every block, tempered by its group's.
+The noise of each block (`Block`) is estimated from its residuals, shrunk towards the noise of its
+group; the covariance follows from that estimate, not from the nominal noise.
 """
 
 import functools
@@ -23,22 +20,22 @@ from scipy.stats import chi2
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 
-# Good residuals hardly reach this, so that the estimate stays efficient; outliers count linearly.
+# Few good residuals exceed this, so that the estimate stays efficient; outliers count linearly.
 _HUBER = 3.0
-# At this, the estimate is 95 % efficient on normal errors (Holland & Welsch 1977,
-# doi:10.1080/03610927708827533), and the weights tell its covariance rightly.
+# The estimate is 95 % efficient on normal errors (Holland & Welsch 1977,
+# doi:10.1080/03610927708827533), and its covariance follows from the weights.
 _CAUCHY = 2.385
 
 
 class Loss(StrEnum):
-    """How the length of a residual counts."""
+    """Loss function of the length of a residual."""
 
     SQUARE = "square"
     """As its square: for priors."""
     HUBER = "huber"
     """As its square up to three standard deviations, linearly beyond: for measurements."""
     CAUCHY = "cauchy"
-    """Logarithmically beyond two or so: where a good part of the data obeys another law."""
+    """Logarithmically beyond about two: if a large part of the data has another distribution."""
 
     def cost(self, lengths: FloatArray) -> FloatArray:
         """Return the loss of residuals (N,), half the square for short ones."""
@@ -51,7 +48,7 @@ class Loss(StrEnum):
         return square
 
     def weight(self, lengths: FloatArray) -> FloatArray:
-        """Return d cost / d length over length: what iterated reweighting multiplies with."""
+        """Return d cost / d length over length, the weight of iterative reweighting."""
         if self is Loss.HUBER:
             return np.where(lengths <= _HUBER, 1.0, _HUBER / np.maximum(lengths, _HUBER))
         if self is Loss.CAUCHY:
@@ -76,10 +73,9 @@ class Block:
     jacobian : array, shape (N, K, C)
         Derivative of `residuals`.
     loss : Loss
-        How the length of an observation's residual counts.
+        Loss of the length of an observation's residual.
     scaled : bool
-        Whether the noise is estimated, as a multiple of the nominal one; priors are meant as they
-        are.
+        Whether the noise is estimated, as a multiple of the nominal one; for priors it is not.
     """
 
     group: str
@@ -97,19 +93,19 @@ class Block:
 
     @property
     def seen(self) -> BoolArray:
-        """Which observations (N,) have a residual."""
+        """Mask (N,) of observations that have a residual."""
         seen: BoolArray = np.isfinite(self.lengths)
         return seen
 
     def values(self, inliers: BoolArray) -> int:
-        """Return how many numbers the marked observations hold."""
+        """Return the number of values in the marked observations."""
         n_values: int = self.residuals.shape[1]
         return int(np.count_nonzero(inliers)) * n_values
 
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Gauss-Newton's view of a cost at one state.
+    """Normal equations of Gauss-Newton at one state.
 
     Attributes
     ----------
@@ -144,7 +140,7 @@ def normal_equations(
 def _of_block(block: Block, inside: BoolArray, scale: float) -> tuple[FloatArray, FloatArray]:
     n_values, n_columns = block.residuals.shape[1], len(block.columns)
     weights = block.loss.weight(block.lengths / scale)
-    # A point that a step made invisible has no slope to offer.
+    # A point that a step made invisible has no derivative.
     believed = inside & np.isfinite(weights)
     residuals, jacobian = block.residuals, block.jacobian
     if not believed.all():
@@ -173,18 +169,18 @@ def cost(
 
 # Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
 _REJECT = 5.0
-# How many times the median's scale may be too small by chance.
+# Factor by which the median's scale may be too small by chance.
 _DOUBT = 1.5
-# Data without any noise still need a scale to divide by.
+# Least scale, for data without noise.
 _TINY = 1e-6
-# A block's noise is that of its group until its own residuals, by so many values, say otherwise.
+# Weight of the group's noise in that of a block, as a number of values.
 _GROUP_FREEDOM = 10.0
-# Fewer values than this left over by the fit say nothing about noise.
+# Least number of degrees of freedom for an estimate of the noise.
 _LEAST_FREEDOM = 0.5
 
 
 def start_scales(blocks: Sequence[Block]) -> list[float]:
-    """Return a first noise scale for every block: its group's median, which outliers hardly move.
+    """Return a first noise scale for every block: its group's median, robust to outliers.
 
     Blocks that are not scaled have 1.
     """
@@ -199,7 +195,7 @@ def freedoms(
     equations: NormalEquations,
     covariance: FloatArray,
 ) -> list[float]:
-    """Return for every block how many of its values are left over by the fit."""
+    """Return the residual degrees of freedom of every block."""
     triples = zip(blocks, inliers, equations.own, strict=True)
     return [
         block.values(inside)
@@ -227,10 +223,9 @@ def group_scales(
     scales: Sequence[float],
     freedom: Sequence[float],
 ) -> dict[str, float]:
-    """Return the typical scale of every group: the median over what its blocks say by themselves.
+    """Return the typical scale of every group: the median of its blocks' own scales.
 
-    A block counts by its freedom, so that one block alone is its group; a few bad ones do not
-    count.
+    Blocks are weighted by their degrees of freedom. A few bad ones do not count.
     """
     typical = {}
     for group in {b.group for b in blocks if b.scaled}:
@@ -256,7 +251,7 @@ def block_scales(
     freedom: Sequence[float],
     typical: dict[str, float],
 ) -> list[float]:
-    """Return the scale of every block: from its own residuals, tempered by its group's."""
+    """Return the scale of every block: from its own residuals, shrunk towards its group's."""
     found = []
     for block, inside, scale, free in zip(blocks, inliers, scales, freedom, strict=True):
         if not block.scaled:
@@ -270,9 +265,9 @@ def block_scales(
 
 
 def _largest_scale(block: Block, freedom: float) -> float:
-    """Return the scale that a block's median allows at most.
+    """Return the upper limit of a block's scale from the median of its residuals.
 
-    Where many observations are outliers, they hold up the scale that lets them in; this breaks it.
+    Many outliers would raise the scale that accepts them; the limit prevents that.
     """
     values = block.values(block.seen)
     if freedom <= _LEAST_FREEDOM or not values:
@@ -295,7 +290,7 @@ def _median_scale(blocks: Sequence[Block]) -> float:
 
 @functools.cache
 def _median_length(n_values: int) -> float:
-    """Return the median length of so many values with unit noise."""
+    """Return the median length of a vector of values with unit noise."""
     return float(np.sqrt(chi2.ppf(0.5, n_values)))
 
 
@@ -318,26 +313,26 @@ __all__ = [
 _MAX_ROUNDS = 20
 _MAX_ITERATIONS = 60
 _DAMPING_START, _DAMPING_LEAST, _DAMPING_LIMIT, _FREE = 1e-4, 1e-12, 1e10, 1e-3
-# Steps shorter than this, in sigmas, leave nothing to gain; so does a relative fall of the cost
-# below rounding. Noise can be told from nearby.
+# Convergence: steps shorter than this, in sigmas, or a relative decrease of the cost below
+# rounding. The noise can be estimated before that.
 _SMALL_STEP, _SMALL_FALL, _NEAR = 2e-2, 1e-10, 0.5
-# Relative change of a noise scale that the solution does not feel.
+# Relative change of a noise scale that does not affect the solution.
 _SAME_SCALE = 5e-3
-# An observation that a step makes invisible costs as much as one that is so many sigmas off.
+# Residual, in sigmas, that stands for an observation that a step makes invisible.
 _LOST = 1e3
-# Combinations known worse than this, relative to the best known one, are known to rounding only.
+# Relative information below which a combination is known to rounding only.
 _RANK = 1e-13
 
 State = TypeVar("State")
 
 
 class FreeParameterError(CalibrationError):
-    """A parameter that neither measurements nor priors say anything about.
+    """Error: neither measurements nor priors determine a parameter.
 
     Attributes
     ----------
     parameter : int
-        Its place among those of the problem.
+        Its index in the problem.
     """
 
     def __init__(self, parameter: int) -> None:
@@ -349,7 +344,7 @@ class FreeParameterError(CalibrationError):
 
 
 class Problem(Protocol[State]):
-    """What is solved: residuals of a state, and how a state moves."""
+    """A least-squares problem: residuals of a state, and steps of a state."""
 
     @property
     def n_parameters(self) -> int:
@@ -361,13 +356,13 @@ class Problem(Protocol[State]):
     def moved(self, state: State, step: FloatArray) -> State:
         """Return the state moved by a step (P,).
 
-        A RigError, here or in `blocks`, says that such a state cannot exist.
+        Raises RigError, as may `blocks`, if such a state cannot exist.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Solution(Generic[State]):
-    """What a solve found.
+    """Result of a solve.
 
     Attributes
     ----------
@@ -376,17 +371,17 @@ class Solution(Generic[State]):
     blocks : tuple of Block
         Residuals there.
     inliers : tuple of bool array, shape (N,)
-        For every block, the observations that were believed.
+        For every block, the mask of inlier observations.
     block_scales : tuple of float
         For every block, its noise as a multiple of the nominal one.
     scales : dict
-        The typical noise of every group of which noise was estimated.
+        The typical noise of every group whose noise was estimated.
     information : array, shape (P, P)
-        Of data and priors together, by the estimated noise.
+        Of data and priors together, at the estimated noise.
     covariance : array, shape (P, P)
         Inverse of `information`.
     cost : float
-        What was minimised, at the estimated noise.
+        Minimum of the cost, at the estimated noise.
     converged : bool
     n_iterations : int
     """
@@ -415,13 +410,13 @@ def solve(
     Parameters
     ----------
     problem : Problem
-        What is solved.
+        Problem to solve.
     start : State
-        Near enough to the solution for Newton's method.
+        Initial guess, near enough to the solution for Newton's method.
     reject : bool
-        Whether observations beyond five scales are left out.
+        Whether to leave out observations beyond five scales.
     remedy : callable, optional
-        Gives the message, with what the user should do, for a parameter that nothing is known of.
+        Gives the message, with the remedy, for a parameter that is not determined.
 
     Returns
     -------
@@ -430,7 +425,7 @@ def solve(
     Raises
     ------
     CalibrationError
-        If nothing is known about one of the parameters, or nothing can be seen from the start.
+        If a parameter is not determined, or nothing can be seen from the start.
     """
     try:
         return _solved(_Run(problem, start, reject))
@@ -453,7 +448,7 @@ def _solved(run: "_Run[State]") -> Solution[State]:
 def information_of(
     solution: Solution[State], n_parameters: int, wanted: Callable[[Block], bool]
 ) -> FloatArray:
-    """Return the part of a solution's information (P, P) that some of its blocks bring."""
+    """Return the contribution (P, P) of some blocks to a solution's information."""
     chosen = [i for i, block in enumerate(solution.blocks) if wanted(block)]
     return normal_equations(
         n_parameters,
@@ -471,7 +466,7 @@ def inverse(information: FloatArray) -> FloatArray:
     Raises
     ------
     CalibrationError
-        If nothing at all is known about one of the parameters.
+        If one of the parameters is not determined at all.
     """
     if not len(information):
         return information
@@ -484,7 +479,7 @@ def inverse(information: FloatArray) -> FloatArray:
 
 @dataclass(slots=True)
 class _Run(Generic[State]):
-    """A solve under way."""
+    """State of a running solve."""
 
     problem: Problem[State]
     state: State
@@ -507,7 +502,7 @@ class _Run(Generic[State]):
         self.scales = start_scales(self.blocks)
 
     def descend(self, small_step: float) -> None:
-        """Go down towards the minimum at the present scales and inliers, until steps are small."""
+        """Iterate towards the minimum at the present scales and inliers, until steps are small."""
         self.converged = not self.problem.n_parameters
         here = self._cost(self.blocks)
         for _ in range(_MAX_ITERATIONS):
@@ -517,13 +512,13 @@ class _Run(Generic[State]):
             there, step = self._lower(equations, here)
             in_sigmas = float(np.sqrt(step @ equations.information @ step))
             little = here - there <= _SMALL_FALL * here and in_sigmas < 1.0
-            # A damped step is short wherever it is taken.
+            # A damped step is always short: it is no sign of convergence.
             free = self.damping <= _FREE
             self.converged = free and (in_sigmas < small_step or little)
             here = there
 
     def rescale(self) -> bool:
-        """Estimate noise and outliers anew; say whether the minimum moves by it."""
+        """Estimate noise and outliers anew; return whether that moves the minimum."""
         before = self.scales, self.inliers
         equations = self._equations()
         freedom = freedoms(self.blocks, self.inliers, equations, inverse(equations.information))
@@ -535,7 +530,7 @@ class _Run(Generic[State]):
         return not (same and np.allclose(self.scales, before[0], rtol=_SAME_SCALE, atol=0.0))
 
     def solution(self) -> Solution[State]:
-        """Return what was found."""
+        """Return the result."""
         information = self._equations().information
         return Solution(
             state=self.state,
@@ -551,7 +546,7 @@ class _Run(Generic[State]):
         )
 
     def _lower(self, equations: NormalEquations, here: float) -> tuple[float, FloatArray]:
-        """Take one step down, as long as it may be; return the cost there and the step."""
+        """Take the longest step that lowers the cost; return the cost there and the step."""
         diagonal = np.diag(equations.information)
         while self.damping < _DAMPING_LIMIT:
             self.n_iterations += 1
@@ -563,7 +558,7 @@ class _Run(Generic[State]):
                 self.damping = max(self.damping * 0.1, _DAMPING_LEAST)
                 return there, step
             self.damping *= 10.0
-        # Nowhere down, to rounding: what slope is left means nothing.
+        # No decrease beyond rounding: the remaining gradient means nothing.
         self.damping = _DAMPING_START
         return here, np.zeros(self.problem.n_parameters)
 

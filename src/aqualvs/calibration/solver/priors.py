@@ -1,7 +1,4 @@
-"""What is known beforehand of a rig's numbers and of media, as residuals.
-
-What a user may know of a board's pose without its pictures, as residuals of it.
-"""
+"""Priors as residuals: of a rig's numbers, of the indices of media, and of a board's pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,14 +17,14 @@ ROLLS = "rolls"
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """The board's plane meets the dome's y axis at a measured distance (the paper's rail, 2.2).
+    """Prior on a pose: measured distance of the board's plane along the dome's y axis (paper, 2.2).
 
     Attributes
     ----------
     distance : float
         From the dome's centre, in metres.
     sigma : float
-        How well it is measured, in metres.
+        Its standard deviation, in metres.
     """
 
     distance: float
@@ -48,16 +45,16 @@ class KnownDistance:
 
 @dataclass(frozen=True, slots=True)
 class SquareBoard:
-    """The board stands square to the dome's axes, or should: some boards may not.
+    """Prior on a pose: the board stands square to the dome's axes, with possible outliers.
 
     Attributes
     ----------
     square : array, shape (3, 3)
         `dome_from_target` rotation of a board without tilt.
     lean_sigma, roll_sigma : float
-        How square boards are that were set up well, in radians about each axis; boards far beyond
-        it count little (Cauchy), so that the square majority decides. How a board leans (about x
-        and z) and how it is rolled (about y) are judged apart: a rail keeps the roll of all.
+        Standard deviations of well set up boards, in radians about each axis; boards far beyond
+        count little (Cauchy), so that the square majority decides. Tilt (about x and z) and roll
+        (about y) are judged separately: a rail keeps the roll of all.
     """
 
     square: FloatArray
@@ -65,7 +62,7 @@ class SquareBoard:
     roll_sigma: float
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
-        """Return the leaning of the board (about x and z), and its roll (about y)."""
+        """Return the tilt of the board (about x and z), and its roll (about y)."""
         del centre
         off_square = dome_from_target.rotation @ self.square.T
         tilt = tilt_of(off_square)
@@ -100,7 +97,7 @@ def tilt_of(off_square: FloatArray) -> FloatArray:
 
 
 def plane_distance(dome_from_target: SE3) -> float:
-    """Return where a board's plane (its z = 0) meets the dome's y axis, in metres; NaN if not."""
+    """Return where a board's plane (its z = 0) meets the dome's y axis, in metres, or NaN."""
     normal = dome_from_target.rotation[:, 2]
     if normal[1] == 0.0:
         return float("nan")
@@ -112,16 +109,16 @@ _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 
 
 def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty) -> list[Block]:
-    """Return how far a rig is from where it was known to be, in sigmas.
+    """Return the deviation of a rig from its prior, in sigmas.
 
     Parameters
     ----------
     start, rig : Rig
-        What `priors` is centred on, and the rig now.
+        Mean of the prior, and the present rig.
     free : sequence of str
-        Numbers that have the columns 0, 1, ... of the solve.
+        Numbers of the columns 0, 1, ... of the solve.
     priors : RigUncertainty
-        How well `start` is known; numbers it does not name have no prior.
+        Uncertainty of `start`; numbers that it does not name have no prior.
     """
     known = [name for name in free if name in priors.names]
     if not known:
@@ -133,14 +130,14 @@ def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty)
 def media_prior(
     start: FloatArray, media: FloatArray, sigma: FloatArray, columns: IntArray
 ) -> list[Block]:
-    """Return how far media are from where they were known to be, in sigmas.
+    """Return the deviation of media from their priors, in sigmas.
 
     Parameters
     ----------
     start, media : array, shape (M,)
-        Of the free media: what was known, and the indices now.
+        Indices of the free media: prior means, and present values.
     sigma : array, shape (M,)
-        How well; infinite where nothing is known.
+        Standard deviations of the prior; infinite where there is none.
     columns : int array, shape (M,)
         Of the media in the solve.
     """

@@ -1,4 +1,4 @@
-"""What `calibrate dome` and `calibrate camera` return."""
+"""Results of `calibrate dome` and `calibrate camera`: the solved rig and the fit of each view."""
 
 from dataclasses import dataclass
 
@@ -12,27 +12,27 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig, RigUncertainty
 
-# Views that a comparison takes, and the chance of a wrong verdict that the dome is needed.
+# Least number of views in a comparison, and its probability of a false positive.
 _FEWEST_COMPARED, _CHANCE = 3, 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class ViewFit:
-    """How one view fits.
+    """Fit of one view: pose, residuals and noise.
 
     Attributes
     ----------
     label : str
-        What messages call it.
+        Name in messages.
     view : View
     dome_from_target : SE3
         Pose of its target.
     covariance : array, shape (6, 6)
-        Of the step of `pose_steps.moved_target`; zero where the pose was exact.
+        Of the step of `bundle.moved_target`; zero if the pose was exact.
     residuals : array, shape (N, 2)
         Measured minus predicted pixels; NaN where the target's point cannot be seen.
     inliers : bool array, shape (N,)
-        Points that were believed.
+        Mask of points that were used.
     noise_px : float
         Estimated standard deviation of a coordinate.
     """
@@ -53,7 +53,7 @@ class ViewFit:
 
 @dataclass(frozen=True, slots=True)
 class SolvedMedium:
-    """Index of a medium with its uncertainty; 0 where it was taken as exact."""
+    """Index of a medium with its uncertainty, 0 if it was taken as exact."""
 
     name: str
     n: float
@@ -62,15 +62,15 @@ class SolvedMedium:
 
 @dataclass(frozen=True, slots=True)
 class HeldBack:
-    """How well corners are predicted that nothing was solved from: both models, same corners.
+    """Cross-validation of dome and bare lens: prediction of the same unused corners.
 
     Attributes
     ----------
     dome_px, bare_px : array, shape (V,)
         For every view held back, the root mean square distance of its predicted corners with the
-        dome, and with a bare lens free to sit anywhere.
+        dome, and with a bare lens of free pose.
     n_by_view : int array, shape (V,)
-        How many corners were predicted by both.
+        Numbers of corners that both predicted.
     """
 
     dome_px: FloatArray
@@ -104,10 +104,10 @@ class HeldBack:
 
     @property
     def p_value(self) -> float:
-        """Chance of such an advantage of the dome, if there were none.
+        """Probability of such an advantage of the dome by chance.
 
-        Student's test of the views' log ratios: what both models have in common cancels in a view,
-        and corners of one view are not independent. NaN with fewer than three views.
+        Student's test of the views' log ratios: errors that both models share cancel in a view, and
+        corners of one view are not independent. NaN with fewer than three views.
         """
         if self.n_views < _FEWEST_COMPARED:
             return float("nan")
@@ -116,33 +116,33 @@ class HeldBack:
 
     @property
     def dome_is_better(self) -> bool:
-        """Whether refraction shows: the bare lens is worse, view by view, by more than chance."""
+        """True if the bare lens is worse, view by view, by more than chance."""
         return self.p_value < _CHANCE
 
 
 @dataclass(frozen=True, slots=True)
 class DomeCalibration:
-    """A solved rig, and how far to trust it.
+    """Result of a dome calibration: the solved rig with its uncertainty.
 
     Attributes
     ----------
     rig : Rig
-        With lens, rotation, dome and intrinsics as solved; everything else as it was.
+        With lens, rotation, dome and intrinsics as solved; everything else unchanged.
     uncertainty : RigUncertainty
-        Joint covariance of all that was solved for or held, scaled by the residuals.
+        Joint covariance of all solved and held numbers, scaled by the residuals.
     media : tuple of SolvedMedium
         One for each set.
     views : tuple of ViewFit
     left_out : dict
-        Labels of views, or of what was given of them, that were not used, and why.
+        Labels of views, or of their measurements, that were not used, with the reason.
     noise_px : float
         Typical standard deviation of a corner's coordinate.
     rotation_is_solved : bool
-        Whether boards told the camera's rotation; if not it is that of the rig as given.
+        Whether boards determined the camera's rotation; if not, it is that of the given rig.
     held_back : HeldBack or None
-        None where it was not asked for, or there are too few views.
+        None if not requested, or if there are too few views.
     findings : tuple of str
-        In plain words: what the data determined, and what they could not.
+        In plain words: what the data determined, and what not.
     n_iterations : int
     """
 
@@ -164,7 +164,7 @@ class DomeCalibration:
 
     @property
     def n_points(self) -> int:
-        """Number of corners that were believed."""
+        """Number of inlier corners."""
         return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
 
 
@@ -184,7 +184,7 @@ def view_fit(
     inliers: BoolArray,
     scale: float,
 ) -> ViewFit:
-    """Return how a view fits, from its block of corners in a bundle."""
+    """Return the fit of a view, from its block of corners in a bundle."""
     if not len(covariance):
         covariance = np.zeros((6, 6))
     residuals = -CORNER_SIGMA_PX * block.residuals

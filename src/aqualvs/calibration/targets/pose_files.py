@@ -1,9 +1,10 @@
-"""`poses.csv`: what was measured of the boards' poses, one row a picture.
+"""`poses.csv`, the measured poses of boards, one row a picture; and the pictures of a command.
 
-Columns: `file`; `distance_mm`, where the board's plane meets the dome's y axis; and `T00` to `T23`,
-the first three rows of dome_from_board (translations in millimetres). Either may be left out.
+Columns of the file: `file`; `distance_mm`, where the board's plane meets the dome's y axis; and
+`T00` to `T23`, the first three rows of dome_from_board (translations in millimetres). Either the
+distance or the matrix may be left out.
 
-Which pictures the arguments of a command mean.
+`picture_paths` expands files, folders and patterns on the command line.
 """
 
 import csv
@@ -23,23 +24,23 @@ from aqualvs.special_files import refuse_special
 from aqualvs.yamlfile import read_text
 
 PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
-"""What a folder is searched for."""
+"""File name extensions of pictures in a folder."""
 
 
 def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
-    """Return the pictures that files, folders and patterns mean, each once.
+    """Return the pictures given by files, folders and patterns, each once.
 
     Parameters
     ----------
     arguments : sequence of str or Path
-        Pictures, folders of them, or patterns such as 'air/*.png'. What one argument means is
-        sorted naturally (`img2` before `img10`).
+        Pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one argument
+        are sorted naturally (`img2` before `img10`).
 
     Raises
     ------
     CalibrationError
-        If an argument means no picture, or two of the pictures have the same file name: poses and
-        reports know pictures by their names.
+        If an argument matches no picture, or two of the pictures have the same file name: poses
+        and reports identify pictures by their names.
     """
     paths = [path for argument in arguments for path in _meant(str(argument))]
     if not paths:
@@ -87,25 +88,25 @@ __all__ = ["BoardPose", "load_poses", "match_poses", "picture_paths"]
 _MM = 1e3
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 _COLUMNS = ("file", "distance_mm", *_MATRIX)
-# Digits that people keep leave a rotation this far from one.
+# Error of a rotation matrix by rounded digits.
 _ROTATION_TOLERANCE = 2e-3
-# Half a degree, or half a millimetre, between a row's distance and its matrix.
+# Tolerance between a row's distance and its matrix: half a degree, half a millimetre.
 _DISTANCE_TOLERANCE_MM = 1.0
-# Distances in other units: no board stands inside a dome, none is seen at 100 m.
+# Limits that reveal other units: no board stands inside a dome, none is seen at 100 m.
 _DISTANCE_MM = (30.0, 1e5)
 _METRES_BELOW = 15.0
 
 
 @dataclass(frozen=True, slots=True)
 class BoardPose:
-    """What was measured of a board's pose.
+    """Measured pose of a board, one row of the file.
 
     Attributes
     ----------
     name : str
         File name of the picture.
     distance : float or None
-        Where the board's plane meets the y axis of `dome`, in metres.
+        Distance along the y axis of `dome` to the board's plane, in metres.
     dome_from_board : SE3 or None
         The whole pose.
     """
@@ -194,7 +195,7 @@ def _pose(columns: list[str], row: list[str], place: str) -> BoardPose:
 
 
 def _number(key: str, cell: str, place: str) -> float | None:
-    """Return a cell's number; an empty cell is not known."""
+    """Return a cell's number; None for an empty cell."""
     if not cell:
         return None
     try:
@@ -233,7 +234,7 @@ def _matrix_pose(matrix: list[float | None], place: str) -> SE3 | None:
             f"{place}: T00 to T22 are no rotation ({what}); give the columns of dome_from_board "
             "with at least four decimals"
         )
-    # The nearest rotation, since digits were cut.
+    # The nearest rotation, because digits were rounded.
     left, _, right = np.linalg.svd(rotation)
     return SE3(left @ right, whole[:, 3] / _MM)
 
@@ -257,7 +258,7 @@ def _check_agreement(pose: SE3, distance_mm: float, place: str) -> None:
 def match_poses(
     poses: Sequence[BoardPose], names: Sequence[str], source: Path
 ) -> tuple[tuple[BoardPose, ...], tuple[str, ...]]:
-    """Return the pose of each picture, in the pictures' order, and what to remark.
+    """Return the pose of each picture, in the pictures' order, and remarks.
 
     Parameters
     ----------

@@ -1,15 +1,13 @@
-"""Put printed targets on pages: paper, ruler, words.
+"""Printed targets: black areas of boards and markers, layout on sheets of paper, PDF to scale.
 
-Lay out the markers of a calibration box (paper, 3.3): four planes, cut into sheets of paper.
-
-Frame `box`: origin at the middle of the open mouth, x right, y forward, z up.
-
-Where a target is black: rectangles of boards and markers, to print or to render.
-
-True-to-scale PDF of black rectangles and small text: all that printed targets need.
-
-Lengths are millimetres from a page's top-left corner, x right, y down. All rectangles of a page are
-one path, so that no viewer shows seams between neighbours; the file asks viewers not to scale it.
+- `board_rectangles` and `marker_rectangles`: the black areas, to print or to render.
+- `box_patches`: the markers of a calibration box (paper, 3.3), four planes cut into sheets of
+  paper. Frame `box`: origin at the middle of the open mouth, x right, y forward, z up.
+- `papers` and `sheet`: sizes of paper, and a page with a ruler of 100 mm and a caption.
+- `pdf_bytes`: a true-to-scale PDF of black rectangles and small text, all that printed targets
+  need. Lengths are millimetres from a page's top-left corner, x right, y down. All rectangles of a
+  page are one path, so that no viewer shows seams between neighbours; the file asks viewers not to
+  scale it.
 """
 
 import re
@@ -24,13 +22,13 @@ from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 
-# From marker to marker, in sides of a marker: enough light ring, and room for stripes to cross.
+# Pitch of markers, in sides of a marker: leaves a light ring and room for stripes to cross.
 _PITCH = 1.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxPlan:
-    """A box, open towards the vehicle and at its top.
+    """A marker box, open towards the vehicle and at its top.
 
     Attributes
     ----------
@@ -54,20 +52,20 @@ class BoxPlan:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A piece of a plane that one sheet of paper covers.
+    """Part of a plane that one sheet of paper covers.
 
     Attributes
     ----------
     plane : str
-        On which plane it lies.
+        Name of its plane.
     offset : (float, float)
-        Of its top-left corner from the plane's, right and down as seen from inside, in metres.
+        From the plane's top-left corner to its own, right and down as seen from inside, in metres.
     size : (float, float)
         Width and height, in metres.
     ids : tuple of int
-        Its markers.
+        Numbers of its markers.
     corners : array, shape (M, 2)
-        Their top-left corners from the patch's own, in metres.
+        Top-left corners of the markers, from the patch's own, in metres.
     """
 
     plane: str
@@ -79,7 +77,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class _Wall:
-    """A plane with axes right and down as seen from inside; `origin` is its top left."""
+    """Wall of the box with axes right and down as seen from inside; `origin` is its top left."""
 
     plane: Plane
     origin: FloatArray
@@ -91,14 +89,14 @@ class _Wall:
 def box_patches(
     plan: BoxPlan, rooms: Sequence[tuple[float, float]]
 ) -> tuple[MarkerSet, tuple[Patch, ...]]:
-    """Return a box's markers, and the pieces in which they can be printed.
+    """Return a box's markers, and the patches in which they can be printed.
 
     Parameters
     ----------
     plan : BoxPlan
         The box.
     rooms : sequence of (float, float)
-        Width and height that a sheet of paper can hold, in metres: upright and across. Infinite
+        Printable width and height of a sheet of paper, in metres: upright and across. Infinite
         for sheets as large as a plane.
 
     Raises
@@ -186,7 +184,7 @@ def _patches(
     marker: float,
     rooms: Sequence[tuple[float, float]],
 ) -> list[Patch]:
-    """Cut a wall's grid into blocks of whole cells that fit a sheet, the way that takes fewest."""
+    """Cut a wall's grid into the fewest blocks of whole cells that fit a sheet."""
     rows, columns = placed.shape[:2]
     numbers = first + np.arange(rows * columns).reshape(rows, columns)
     ways = [_block(room, pitch, rows, columns) for room in rooms if min(room) >= pitch]
@@ -210,7 +208,7 @@ def _patches(
 
 
 def _block(room: tuple[float, float], pitch: float, rows: int, columns: int) -> tuple[int, int]:
-    """Return how many rows and columns of cells a sheet holds."""
+    """Return the numbers of rows and columns of cells on a sheet."""
     return int(min(room[1] / pitch + 1e-9, rows)), int(min(room[0] / pitch + 1e-9, columns))
 
 
@@ -245,7 +243,7 @@ def marker_rectangles(family: str, number: int, corner: FloatArray, size: float)
     family : str
         Name of the dictionary.
     number : int
-        Which marker of it.
+        Number of the marker in it.
     corner : array, shape (2,)
         The marker's top-left corner, in the unit of `size`.
     size : float
@@ -255,7 +253,7 @@ def marker_rectangles(family: str, number: int, corner: FloatArray, size: float)
     cell = size / len(cells)
     rectangles = []
     for row, values in enumerate(cells):
-        # Runs of dark cells; the light ends close a run at either side.
+        # Runs of dark cells; light cells at both ends close the runs.
         edges = np.flatnonzero(np.diff(np.concatenate([[1.0], values, [1.0]])))
         for first, after in edges.reshape(-1, 2):
             x, y = corner + cell * np.array([first, row])
@@ -273,11 +271,11 @@ class Text:
     Attributes
     ----------
     x, y : float
-        Where it begins, on its base line, in millimetres.
+        Start of its base line, in millimetres.
     size : float
-        Height of its letters' em, in millimetres.
+        Size of the font (em), in millimetres.
     words : str
-        Latin letters.
+        The text, in Latin letters.
     """
 
     x: float
@@ -288,14 +286,14 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """One page.
+    """Page of the PDF file.
 
     Attributes
     ----------
     width, height : float
         In millimetres.
     rectangles : array, shape (N, 4)
-        x, y, width, height of what is black, in millimetres.
+        x, y, width, height of black rectangles, in millimetres.
     texts : tuple of Text
     """
 
@@ -326,7 +324,7 @@ def pdf_bytes(pages: Sequence[Page], title: str) -> bytes:
 
 
 def _content(page: Page) -> str:
-    """Return a page's drawing: millimetres, y down."""
+    """Return the PDF content stream of a page; coordinates are millimetres, y down."""
     scale = f"{_POINTS_PER_MM:.8f}"
     height = f"{page.height * _POINTS_PER_MM:.4f}"
     lines = [f"{scale} 0 0 -{scale} 0 {height} cm", "0 g"]
@@ -347,7 +345,7 @@ def _encoded(text: str) -> bytes:
 
 
 def _file(objects: Sequence[str]) -> bytes:
-    """Return the file of these objects; the last one is its information."""
+    """Return a PDF file of these objects; the last one is the document information."""
     body = b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"
     places = []
     for i, text in enumerate(objects):
@@ -373,12 +371,12 @@ PAPERS_MM: dict[str, tuple[float, float]] = {
 """Width and height of papers, upright."""
 
 FIT = "fit"
-"""Paper that is cut to what is printed on it."""
+"""Paper that is cut to the size of the print."""
 
 _EDGE_MM = 8.0
-"""What printers leave white around a page."""
+"""Margin that printers leave white."""
 _STRIP_MM = 14.0
-"""Below what is printed: ruler and words."""
+"""Strip below the print for ruler and caption."""
 _RULER_MM = 100.0
 _TEXT_MM = 3.2
 _HAIR_MM = 0.2
@@ -386,14 +384,14 @@ _HAIR_MM = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """Paper, in one of its two orientations.
+    """Sheet of paper in one of its two orientations.
 
     Attributes
     ----------
     size_mm : (float, float) or None
         Width and height; None for paper that fits.
     name : str
-        How messages call it.
+        Name in messages.
     """
 
     size_mm: tuple[float, float] | None
@@ -401,13 +399,13 @@ class Paper:
 
     @property
     def room_mm(self) -> tuple[float, float]:
-        """Width and height that can be printed on, less the ruler's strip."""
+        """Printable width and height, less the ruler's strip."""
         if self.size_mm is None:
             return np.inf, np.inf
         return self.size_mm[0] - 2.0 * _EDGE_MM, self.size_mm[1] - 2.0 * _EDGE_MM - _STRIP_MM
 
     def page_mm(self, width: float, height: float) -> tuple[float, float]:
-        """Return the page's size for something of this size."""
+        """Return the page's size for a print of this size."""
         if self.size_mm is not None:
             return self.size_mm
         wide = max(width, _RULER_MM + 60.0)
@@ -448,7 +446,7 @@ def papers(word: str) -> tuple[Paper, Paper]:
 
 
 def best_paper(word: str, width: float, height: float, what: str) -> Paper:
-    """Return the orientation that has room for something of this size, in millimetres.
+    """Return the orientation that has room for a print of this size, in millimetres.
 
     Raises
     ------
@@ -466,18 +464,18 @@ def best_paper(word: str, width: float, height: float, what: str) -> Paper:
 
 
 def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words: str) -> Page:
-    """Return a page with something in its middle, a ruler to check the scale, and words.
+    """Return a page with a print in its middle, a ruler to check the scale, and a caption.
 
     Parameters
     ----------
     paper : Paper
-        With room for it.
+        With room for the print.
     rectangles : array, shape (N, 4)
-        x, y, width, height of what is black, from its own top left, millimetres.
+        x, y, width, height of the black areas, from the print's top left, millimetres.
     size : (float, float)
-        Width and height of the whole, light border included, in millimetres.
+        Width and height of the print, light border included, in millimetres.
     words : str
-        What it is, in small print.
+        Caption, in small print.
     """
     width, height = paper.page_mm(*size)
     left, top = 0.5 * (width - size[0]), _EDGE_MM
@@ -504,7 +502,7 @@ def ruler(x: float, y: float) -> FloatArray:
 
 
 def outline(x: float, y: float, width: float, height: float) -> FloatArray:
-    """Return the rectangles (4, 4) of a hairline along which to cut; its middle is the cut."""
+    """Return the rectangles (4, 4) of a hairline to cut along, in its middle."""
     half = 0.5 * _HAIR_MM
     return np.array(
         [

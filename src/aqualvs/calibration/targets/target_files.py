@@ -1,12 +1,9 @@
-"""Read and write what describes targets: `board.yaml`, `box.yaml` and `target.yaml`.
+"""Target files `board.yaml`, `box.yaml` and `target.yaml`: schema, reading, checks, writing.
 
-Files speak millimetres, types metres. docs/targets.md explains every key.
+Lengths are millimetres in the files, metres in the types. docs/targets.md explains every key.
 
-The text of target files: tolerant of notes, strict about everything else.
-
-What `board.yaml`, `box.yaml` and `target.yaml` may contain, key by key.
-
-What must hold for markers at known places: sizes, order, planes, units.
+The reader tolerates free text in notes and is strict about everything else: every key, and for
+markers at known places their sizes, corner order, planes and units.
 """
 
 import difflib
@@ -32,14 +29,14 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text
 
-# Free text that people write without quotes, colons and all, which YAML would trip over.
+# Keys of free text, often written without quotes but with colons, which YAML would reject.
 _FREE_TEXT = re.compile(
     r"^(frame|corner_order|note):[ \t]+(?![\"'|>\[{&*!%@`])(?P<text>\S.*?)[ \t]*$", re.MULTILINE
 )
 
 
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
-    """Return the keys and values of a YAML file; `what` says what it should be.
+    """Return the keys and values of a YAML file; `what` names its kind in messages.
 
     Raises
     ------
@@ -88,7 +85,7 @@ class _Part(BaseModel):
 
 
 class BoardFile(_Part):
-    """`board.yaml`."""
+    """Schema of `board.yaml`."""
 
     kind: Literal["chessboard", "charuco"] | None = None
     squares_x: Count | None = None
@@ -104,14 +101,14 @@ class BoardFile(_Part):
 
 
 class PlanePart(_Part):
-    """One of `planes`: normal . X = d."""
+    """Schema of one of `planes`: normal . X = d."""
 
     normal: Triple
     d: Number
 
 
 class MarkerPart(_Part):
-    """One of `markers`."""
+    """Schema of one of `markers`."""
 
     id: Annotated[int, Field(ge=0)]
     plane: str | None = None
@@ -120,13 +117,13 @@ class MarkerPart(_Part):
 
 
 class MediumPart(_Part):
-    """`medium`: what the pictures were taken in."""
+    """Schema of `medium`, in which the pictures were taken."""
 
     n_outside_nominal: Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 
 
 class MarkersFile(_Part):
-    """`box.yaml` and `target.yaml`."""
+    """Schema of `box.yaml` and `target.yaml`."""
 
     frame: str | None = None
     planes: dict[str, PlanePart] = {}
@@ -246,12 +243,12 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-# A ruler's error, as a share of the marker and in millimetres.
+# Tolerance of a ruler, as a share of the marker and in millimetres.
 _SIDE_TOLERANCE = (0.02, 0.2)
 _PLANE_TOLERANCE_MM = 0.5
 _SMALLEST_MM = 3.0
-# A box whose markers are all nearer to its origin than this, or a target this near to the dome's
-# centre, is given in other units: no vehicle fits in, no dome is so small.
+# Limits that reveal other units: a box with all markers nearer to its origin holds no vehicle, and
+# no dome is small enough for a target this near to its centre.
 _SMALLEST_BOX_MM = 100.0
 _NEAREST_TARGET_MM = 30.0
 _UNITS = {1e-3: "metres", 1e-1: "centimetres"}
@@ -367,7 +364,7 @@ def _check_extent(corners: FloatArray, frame: str) -> None:
 
 
 def _check_facing(file: MarkersFile, corners: FloatArray, frame: str) -> None:
-    """Markers face the viewer: the dome's centre, or the inside of a box of several planes."""
+    """Check that markers face the dome's centre, or the inside of a box of several planes."""
     if frame == "box" and len({part.plane for part in file.markers}) < 2:
         return
     viewer = corners.reshape(-1, 3).mean(axis=0) if frame == "box" else np.zeros(3)
@@ -390,7 +387,7 @@ _FRAME_TEXTS = {
     "dome": "dome (origin at the dome's centre, x right, y forward, z up), mm",
     "plate": "plate (x right, y down, origin at its top left), mm; NOT the dome: measure its place",
 }
-# A board's squares that no camera would be calibrated with.
+# Unlikely sizes of a board's squares.
 _SQUARE_MM = (3.0, 1000.0)
 
 
@@ -479,7 +476,7 @@ def load_box(path: str | Path) -> tuple[MarkerSet, float | None]:
     markers : MarkerSet
         In `box`; every marker lies on one of the planes.
     n_nominal : float or None
-        Index that the file says the pictures were taken in.
+        Stated index of the medium of the pictures.
 
     Raises
     ------
@@ -586,7 +583,7 @@ def save_markers(markers: MarkerSet, path: str | Path, *, note: str = "") -> Non
 
 
 def _marker_text(markers: MarkerSet, i: int) -> str:
-    """Return one marker, its corners on one line: YAML's own style would take thirty."""
+    """Return one marker, its corners on one line instead of YAML's thirty."""
     corners = [_plain(corner * _MM) for corner in markers.corners[i]]
     size = _to_mm(float(np.linalg.norm(markers.corners[i, 1] - markers.corners[i, 0])))
     plane = markers.plane_names[i]
@@ -607,7 +604,7 @@ def _yaml(content: dict[str, Any]) -> str:
 
 
 def _to_mm(length: float) -> float:
-    # Nine decimals keep a picometre and drop the noise of the conversion.
+    # Nine decimals keep a picometre and drop rounding errors of the conversion.
     return round(float(length) * _MM, 9)
 
 

@@ -1,9 +1,9 @@
-"""What calibration pictures show: boards, and markers at known places.
+"""Calibration targets, boards and markers at known places, and views of them.
+
+A `View` is the known points of a target that were found in one picture, with their pixels.
 
 Frame `board` is OpenCV's: x right, y down, z into the board, origin at the outer corner of the
 top-left square. Lengths in metres.
-
-What one picture of a target says: known points of the target and the pixels they are seen at.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,22 +19,22 @@ from aqualvs.geometry.planes import Plane
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Points of one target, found in one picture.
+    """View of a target: its points found in one picture.
 
     Attributes
     ----------
     name : str
         File name of the picture, for messages and reports.
     ids : int array, shape (N,)
-        Which point of the target: corner of a board, or four times the index of a marker plus the
+        Points of the target: corner of a board, or four times the index of a marker plus the
         corner's place.
     points : array, shape (N, 3)
         The points in the target's own frame (`board`, `box`, or `dome` for an index target), in
         metres.
     pixels : array, shape (N, 2)
-        Where they were found, in `image`.
+        Their measured places, in `image`.
     notes : tuple of str
-        What a user should know of how they were found.
+        Remarks for the user on the detection.
     """
 
     name: str
@@ -49,7 +49,7 @@ class View:
 
     @property
     def middle(self) -> FloatArray:
-        """Mean (3,) of the points, which small turns of the target leave in its place."""
+        """Mean (3,) of the points, the centre of small turns of the target."""
         middle: FloatArray = np.add.reduce(self.points) / len(self.points)
         return middle
 
@@ -61,7 +61,7 @@ class View:
 DICTIONARIES: dict[str, int] = {
     name: getattr(cv2.aruco, name)
     for name in sorted(dir(cv2.aruco))
-    # OpenCV has an older spelling of the AprilTag families, 36h11 for 36H11 and the like.
+    # OpenCV accepts an older spelling of the AprilTag families, 36h11 for 36H11 and the like.
     if name.startswith("DICT_") and name.replace("h", "H") == name
 }
 """Marker dictionaries by name; `dictionary_id` knows further spellings of AprilTag families."""
@@ -73,7 +73,7 @@ def dictionary_id(name: str) -> int | None:
 
 
 class BoardKind(StrEnum):
-    """What is printed on a board."""
+    """Kind of pattern on a board."""
 
     CHESSBOARD = "chessboard"
     """Squares alone; it must be seen whole."""
@@ -105,7 +105,7 @@ class Board:
     Raises
     ------
     CalibrationError
-        If such a board cannot be.
+        If such a board is impossible.
     """
 
     kind: BoardKind
@@ -157,13 +157,13 @@ class Board:
     @property
     def n_markers(self) -> int:
         """Number of markers, one in each light square; 0 on a chessboard."""
-        # The first square is dark where their number is odd, so the odd one carries no marker.
+        # With an odd number of squares the first is dark, so the extra one carries no marker.
         has_markers = self.kind is BoardKind.CHARUCO
         return self.squares[0] * self.squares[1] // 2 if has_markers else 0
 
     @property
     def first_is_light(self) -> bool:
-        """Whether the top-left square is light."""
+        """True if the top-left square is light."""
         return self.legacy_pattern and self.squares[1] % 2 == 0
 
     @property
@@ -186,13 +186,13 @@ class Board:
         return self.square * corners
 
     def marker_squares(self) -> IntArray:
-        """Return columns and rows (M, 2) of the light squares, which hold markers 0 to M - 1."""
+        """Return columns and rows (M, 2) of the light squares of markers 0 to M - 1."""
         column, row = np.meshgrid(np.arange(self.squares[0]), np.arange(self.squares[1]))
         light = (column + row) % 2 == (0 if self.first_is_light else 1)
         return np.stack([column[light], row[light]], axis=-1).astype(np.int64)
 
     def light_beyond_corners(self) -> BoolArray:
-        """Return for each inner corner (N,) whether the square towards +x, +y of it is light."""
+        """Return the mask (N,) of inner corners with a light square towards +x, +y."""
         n_x, n_y = self.corner_grid
         i = np.arange(n_x * n_y)
         light: BoolArray = (i % n_x + i // n_x) % 2 == (0 if self.first_is_light else 1)
@@ -210,7 +210,7 @@ class Board:
         return np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
 
     def describe(self) -> str:
-        """Return a few words for messages."""
+        """Return a short description for messages."""
         what = f"{self.kind} of {_by(self.squares)} squares of {_mm(self.square)}"
         return f"{what}, {self.dictionary}" if self.dictionary else what
 
@@ -230,7 +230,7 @@ class MarkerSet:
     corners : array, shape (M, 4, 3)
         In `frame`, metres; top-left, top-right, bottom-right, bottom-left of the upright marker.
     plane_names : tuple of str or None, length M
-        On which plane each marker lies.
+        Plane of each marker.
     planes : dict of str to Plane
         The planes that carry markers, in `frame`.
     """
@@ -247,7 +247,7 @@ class MarkerSet:
         return len(self.ids)
 
     def points(self) -> FloatArray:
-        """Return all corners (4 M, 3); rows are what `View.ids` of a marker view count."""
+        """Return all corners (4 M, 3); their row is the id in `View.ids` of a marker view."""
         return self.corners.reshape(-1, 3)
 
 

@@ -1,13 +1,14 @@
-"""The index of the medium, frame by frame, from a target that is fixed on the vehicle.
+"""Estimator of the medium's refractive index, frame by frame, from a target fixed on the vehicle.
 
-Section 2.2 of the paper solves for the index alone. Here a target that is not quite where it is
-said to be, and a camera that is known only so well, count as what they are: see `index_filter`.
+Section 2.2 of the paper solves for the index alone. Here the uncertainty of the target's place and
+of the camera's numbers counts too; see `water_index.filter`.
 
-Has the index jumped? A two-sided cumulative sum over the frames' normalised surprises.
+A jump of the index is detected by a two-sided cumulative sum over the normalised innovations of the
+frames (`StepTest`; Page 1954, Continuous inspection schemes, Biometrika 41, 100,
+doi:10.1093/biomet/41.1-2.100).
 
-Page (1954), Continuous inspection schemes, Biometrika 41, 100, doi:10.1093/biomet/41.1-2.100.
-
-The index of a medium from a set of pictures, as `calibrate water` reports it.
+`calibrate_water` applies the estimator to a set of pictures, as `aqualvs calibrate water` reports
+it.
 """
 
 import math
@@ -43,27 +44,26 @@ from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig, RigUncertainty
 
-# A change of one standard deviation of a frame is what is looked for.
+# Change to be detected: one standard deviation of a frame.
 _ALLOWANCE = 0.5
-# False alarms of independent normal surprises are exp(2 * 0.5 * 21) frames apart: years at 25 fps.
+# Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at 25 fps.
 _LIMIT = 20.0
-# No single frame counts more, so that one wrong picture never rings; four in a row do.
+# Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
 _LARGEST = 7.0
-# Compression repeats its errors over a group of pictures: what frames say is correlated that long.
+# Compression repeats its errors over a group of pictures: frames are correlated that long.
 _BLOCK = 12
 _MEMORY = 100
 
 
 @dataclass(slots=True)
 class StepTest:
-    """Sums up surprises until they cannot be chance.
+    """Two-sided cumulative sum (CUSUM) test of the innovations of frames.
 
     Attributes
     ----------
     inflation : float
-        By how much the spread of the surprises exceeds 1 over blocks of frames, 1 at least: what
-        the noise of corners has to be multiplied by, because neighbouring corners and frames err
-        together.
+        Standard deviation of the innovations over blocks of frames, at least 1: factor on the
+        noise of corners, because the errors of neighbouring corners and frames are correlated.
     """
 
     inflation: float = 1.0
@@ -73,13 +73,13 @@ class StepTest:
     _n_blocks: int = 0
 
     def add(self, surprise: float) -> int:
-        """Take the surprise of a frame in standard deviations.
+        """Add the innovation of a frame, in standard deviations.
 
         Returns
         -------
         int
-            How many frames ago, this one included, the change that rings the alarm began; 0 while
-            there is none.
+            Number of frames since the start of the change, this one included, if it raises the
+            alarm; else 0.
         """
         for side, sign in enumerate((1.0, -1.0)):
             bounded = min(max(sign * surprise, -_LARGEST), _LARGEST)
@@ -95,11 +95,11 @@ class StepTest:
 
     @property
     def quiet(self) -> bool:
-        """Whether nothing has been summed up."""
+        """True while both sums are zero."""
         return not any(self._lengths)
 
     def forget(self) -> None:
-        """Begin anew, as after a jump; the inflation stays."""
+        """Reset the sums, as after a jump; keep the inflation."""
         self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
 
     def _spread(self, surprise: float) -> None:
@@ -109,42 +109,42 @@ class StepTest:
         self._n_blocks += 1
         square = min(float(np.sum(self._block)) ** 2 / _BLOCK, 9.0)
         share = 1.0 / min(self._n_blocks + 8, _MEMORY)
-        # Surprises are over the inflated noise already: what they still exceed 1 by comes on top.
+        # Innovations are in units of the inflated noise: a spread above 1 raises the inflation.
         squared = self.inflation**2 * (1.0 + share * (square - 1.0))
         self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
         self._block = []
 
 
-# Noise of a corner before residuals tell, the least a first frame can tell of it, and the least.
+# Noise of a corner before any residuals, least estimate from a first frame, and least of all.
 _NOMINAL_NOISE, _FIRST_NOISE, _LEAST_NOISE = 0.1, 0.03, 0.005
 _NOISE_MEMORY = 100
 _FIRST_ROUNDS = 4
-# A frame that surprises so much waits for the next ones instead of being believed.
+# A frame with a larger innovation waits for the next ones before it is used.
 _WAIT = 4.0
-# Frames that can be taken back when a step is found.
+# Number of frames that can be taken back after a step.
 _KEPT = 50
 _MISFIT = 2.0
-# Last frames of a run that tell how far the index has jumped, and the most a frame can cost.
+# Number of last frames of a run that determine the size of a jump, and largest cost of a frame.
 _TELLING, _GROSS = 5, 16.0
 
 
 @dataclass(slots=True)
 class IndexEstimator:
-    """Recursive estimate of the index of the medium; time comes from the data.
+    """Recursive estimator of the index of the medium; time comes from the data.
 
     One estimator serves one target, one rig and one dive. Started in air (`IndexPrior.air`), it
-    learns the target's place better than a ruler tells, and keeps that in the water.
+    learns the target's place better than by a ruler, and keeps that in the water.
 
     Attributes
     ----------
     rig : Rig
         Behind a dome.
     uncertainty : RigUncertainty
-        How well it is known.
+        Of the rig.
     options : IndexOptions
-        What is assumed of target and medium.
+        Assumptions about target and medium.
     prior : IndexPrior or None
-        What is known of the medium that the first frame sees; `set_prior` gives a later one.
+        Prior of the index at the first frame; `set_prior` gives a later one.
     steps : list of IndexStep
         All alarms so far.
 
@@ -178,15 +178,15 @@ class IndexEstimator:
         self._model = self._model_about(np.zeros(3))
 
     def add(self, time: float, view: View) -> IndexReading:
-        """Take a frame and return what is known after it.
+        """Add a frame and return the reading after it.
 
         Parameters
         ----------
         time : float
-            In seconds; frames that are older than the last one are refused.
+            In seconds; frames older than the last one are refused.
         view : View
-            Points of the target in `dome` (metres) and where they were seen. Corners that are
-            missing, NaN or wrong do no harm while most are right.
+            Points of the target in `dome` (metres) and their pixels. Corners that are missing,
+            NaN or wrong do no harm if most are right.
         """
         known = () if self._state is None else self._state.ids
         frame = Frame.of(time, view, known)
@@ -201,14 +201,14 @@ class IndexEstimator:
             return self._reading(time, view.name, f"no camera sees the target so ({error})")
 
     def set_prior(self, prior: IndexPrior | None) -> None:
-        """Give what is known of the medium as the last frame saw it, say from a thermometer."""
+        """Set a prior of the index at the last frame, for example from a thermometer."""
         self.prior, self._contradicted, self._since_prior = prior, False, 0.0
         if self._state is not None:
             self._state = self._state.anchored()
 
     @property
     def state(self) -> IndexState | None:
-        """Joint estimate with the prior, None before the first frame that counts."""
+        """Joint estimate with the prior, None before the first used frame."""
         state = self._own
         if state is None or self.prior is None or self._contradicted:
             return state
@@ -227,12 +227,12 @@ class IndexEstimator:
         return self._model.camera_names
 
     def residuals(self, view: View) -> FloatArray:
-        """Return measured less predicted pixels (M, 2) of a view by what is known now.
+        """Return measured minus predicted pixels (M, 2) of a view by the present estimate.
 
         Raises
         ------
         CalibrationError
-            Before the first frame that counts.
+            Before the first used frame.
         """
         if self.state is None:
             raise CalibrationError("no picture shows enough of the target yet; add one that does")
@@ -277,7 +277,7 @@ class IndexEstimator:
         self._last_time = frame.time
         noise = self._noise * self._test.inflation
         seen = compare(self._model, state, frame, noise)
-        # Corners that fit one by one may still be those of a plate that has moved a little.
+        # Corners that fit one by one may still be those of a plate that has moved slightly.
         self._n_lost = 0 if seen.fits and seen.misfit < _MISFIT else self._n_lost + 1
         if not seen.fits:
             return self._reading(frame.time, name, _not_there(seen))
@@ -303,7 +303,7 @@ class IndexEstimator:
         return self._reading(seen.frame.time, name, n_frame=n + seen.shift, update=update)
 
     def _jump(self, name: str, began: int) -> IndexReading:
-        """Take the last frames back and believe them again, the index free to have jumped."""
+        """Take the last frames back and use them again with a free jump of the index."""
         since = list(self._recent)[-began:]
         since = since[_onset(np.array([s.shift / s.sigma for _, s in since])) :]
         self._recent.clear()
@@ -393,9 +393,9 @@ class IndexEstimator:
 
 
 def _onset(surprises: FloatArray) -> int:
-    """Return the first of a run's frames (K,) that lies beyond the jump which ends the run.
+    """Return the first of a run's frames (K,) after the jump.
 
-    Least squares of a change of mean from zero; what no mean explains counts no more than gross.
+    By truncated least squares of a change of the mean from zero.
     """
     after = float(np.median(surprises[-_TELLING:]))
     without = np.minimum(surprises**2, _GROSS)
@@ -417,26 +417,26 @@ _DEFAULT_OPTIONS = IndexOptions()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterCalibration:
-    """A rig in its medium.
+    """Result of a calibration of the water's index: a rig in its medium.
 
     Attributes
     ----------
     rig : Rig
-        With the index found, that of the last picture.
+        With the index found at the last picture.
     uncertainty : RigUncertainty
-        Of the rig's numbers, `n_water` and what it owes to the others among them.
+        Of the rig's numbers, with `n_water` and its covariance with the others.
     sigma, sigma_random : float
-        Standard deviation of the index, and the part that more pictures reduce.
+        Standard deviation of the index, and its part that more pictures reduce.
     observable : bool
-        False where the index does not rest on the pictures; `remarks` says why.
+        False if the pictures do not determine the index; `remarks` says why.
     steps : tuple of IndexStep
         Alarms.
     readings : tuple of IndexReading
-        What was known after each picture.
+        Estimate after each picture.
     rms_px : float
-        Root mean square residual of the corners that counted.
+        Root mean square residual of the used corners.
     remarks : tuple of str
-        What a user should know, one sentence each.
+        Remarks for the user, one sentence each.
     """
 
     rig: Rig
@@ -469,17 +469,17 @@ def calibrate_water(
     Parameters
     ----------
     rig : Rig
-        Behind a dome; its own index is where the search begins when there is no prior.
+        Behind a dome; its own index is the initial guess without a prior.
     views : sequence of View
         Points of the target in `dome`, metres.
     times : sequence of float, optional
-        Of the pictures, in seconds, ascending. Without them all are of one moment.
+        Of the pictures, in seconds, ascending. Without them all pictures are simultaneous.
     uncertainty : RigUncertainty, optional
-        How well the rig is known; without it the rig is taken as exact.
+        Of the rig; without it the rig is taken as exact.
     prior : IndexPrior, optional
-        What is known of the medium in the first picture.
+        Prior of the index at the first picture.
     options : IndexOptions
-        What is assumed of the target and the medium.
+        Assumptions about target and medium.
 
     Returns
     -------
@@ -533,11 +533,11 @@ def _rms(readings: Sequence[IndexReading]) -> float:
 def _with_index(
     known: RigUncertainty, state: IndexState, camera_names: tuple[str, ...]
 ) -> RigUncertainty:
-    """Return the covariance of the rig's numbers as they were, and of the index found with them.
+    """Return the covariance of the rig's unchanged numbers and of the index.
 
-    The estimate of the camera's errors is left aside, as the rig keeps its numbers: errors of
-    these and of the index have the covariance that the state has between its two. Lasers are
-    correlated with the index by way of the camera alone.
+    The estimate of the camera's errors is not used, as the rig keeps its numbers: errors of these
+    and of the index have the covariance between the two in the state. Lasers are correlated with
+    the index through the camera alone.
     """
     old = known.only([name for name in known.names if name != N_WATER])
     camera = slice(FIRST_CAMERA, FIRST_CAMERA + len(camera_names))
@@ -554,7 +554,7 @@ def _with_index(
 
 
 def _solve(covariance: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve with a covariance that may be singular and whose units differ."""
+    """Solve with a covariance of different units that may be singular."""
     size = np.sqrt(np.diag(covariance))
     scaled = np.linalg.pinv(covariance / np.outer(size, size), hermitian=True)
     solved: FloatArray = scaled @ (right / size) / size

@@ -1,13 +1,12 @@
-"""One frame's say about the index of the medium: a robust, iterated Kalman update.
+"""Robust, iterated Kalman update of the medium's refractive index by one frame.
 
-The index may change from frame to frame. What else decides where the target is seen does not: its
-place on the vehicle, the camera's numbers, and how far a corner is always off (its printing, its
-detection). Known only as well as they are, these are estimated along with the index: frames
-average out the noise of the corners and never the constants.
+The index may change from frame to frame. The target's place on the vehicle, the camera's numbers
+and the constant error of each corner (printing, detection) do not. They are known with limited
+accuracy and are estimated along with the index: frames average out the noise of the corners, never
+the error of the constants.
 
-What an index estimate takes of a picture.
-
-How a target on the vehicle is seen through a medium: prediction and derivatives by a state.
+`Frame` holds the corners of a picture that the estimate uses, `IndexModel` predicts their pixels
+and the derivatives by the state, `compare` gives the innovation, `believe` the updated state.
 """
 
 from dataclasses import dataclass, field, replace
@@ -34,15 +33,15 @@ from aqualvs.optics.camera import parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 
 MIN_POINTS = 4
-"""Corners that a frame needs: with fewer, a bad one cannot be told from a good one."""
+"""Least number of corners of a frame: with fewer, an outlier cannot be recognised."""
 
 MOST_POINTS = 64
-"""Corners beyond these would cost time and add little."""
+"""Greatest number of corners: more cost time and add little."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Corners of one picture that the estimate can use.
+    """Corners of one picture for the estimate.
 
     Attributes
     ----------
@@ -51,9 +50,9 @@ class Frame:
     ids : tuple of int
         Corners.
     points : array, shape (M, 3)
-        Where `target.yaml` has them, in `dome`, metres.
+        Places by `target.yaml`, in `dome`, metres.
     pixels : array, shape (M, 2)
-        Where they were found.
+        Measured places.
     """
 
     time: float
@@ -63,7 +62,7 @@ class Frame:
 
     @classmethod
     def of(cls, time: float, view: View, known: tuple[int, ...] = ()) -> "Frame":
-        """Return the finite corners of a view, at most `MOST_POINTS` with those that are known."""
+        """Return the finite corners of a view, at most `MOST_POINTS` together with known ones."""
         finite = np.all(np.isfinite(view.pixels), axis=1) & np.all(np.isfinite(view.points), axis=1)
         _, first = np.unique(view.ids, return_index=True)
         once = np.zeros(len(view), np.bool_)
@@ -84,15 +83,15 @@ class Frame:
 
 
 WIDE = 0.2
-"""Standard deviation of an index that is not known at all, or has just jumped."""
+"""Standard deviation of an unknown index, or of one that has just jumped."""
 BLIND = 1e-6
-"""Below this motion of the picture, pixels per unit of index, nothing is seen at all."""
+"""Motion of the picture, in pixels per unit of index, below which the index is unobservable."""
 LINEAR = 1e-4
 """Steps of the index up to this are linear to far below the noise of a corner."""
 
 _LOWEST, _HIGHEST = 1.0, 1.7
 _NEWTON = 30
-# Changes of a camera's number up to this many standard deviations are added linearly.
+# Changes of the camera's numbers up to this many standard deviations are linearised.
 _NEARLY = 0.02
 
 
@@ -102,7 +101,7 @@ class Line(NamedTuple):
     Attributes
     ----------
     residuals : array, shape (2M,)
-        Measured less predicted pixels.
+        Measured minus predicted pixels.
     slopes : array, shape (2M, D)
         Derivative of the prediction by the state's mean.
     """
@@ -113,20 +112,20 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class IndexModel:
-    """How a target on the vehicle is seen through media of different index.
+    """Model of a target on the vehicle, seen through media of different index.
 
     Attributes
     ----------
     rig : Rig
         Behind a dome; its own `n_water` plays no part.
     uncertainty : RigUncertainty
-        How well the camera's numbers are known.
+        Of the camera's numbers.
     pose_sigmas : array, shape (6,)
-        How well the target's place is known: turn about its middle (radians), shift (metres).
+        Standard deviations of the target's place: turn about its middle (radians), shift (metres).
     sigma_corner : float
-        What a corner is always off, standard deviation in pixels.
+        Standard deviation of the constant error of a corner, in pixels.
     middle : array, shape (3,)
-        What the target turns about, in `dome`.
+        Centre of the target's turn, in `dome`.
     camera_names : tuple of str
         Numbers of the camera that are uncertain, in the state's order.
 
@@ -159,7 +158,7 @@ class IndexModel:
         object.__setattr__(self, "_moved", _MovedRig(self.rig, uncertain, scale))
 
     def first(self, frame: Frame, n: float) -> IndexState:
-        """Return the state before a first frame, its index looked for from `n` on."""
+        """Return the state before a first frame, with the index searched from `n`."""
         camera = self.uncertainty.of(self.camera_names)
         blank = first_state(frame.time, n, WIDE, self.pose_sigmas, camera)
         return first_state(
@@ -167,24 +166,25 @@ class IndexModel:
         ).with_corners(frame.ids, self.sigma_corner)
 
     def jumped(self, state: IndexState, frame: Frame) -> IndexState:
-        """Return the state after a jump of the index to where a frame has it."""
+        """Return the state after a jump of the index to the value by a frame."""
         n = self.nearest(state, frame)
         line = self.line(at_index(state, n, slopes_too=True), frame)
         return self.settled(state, line, frame).stepped(n, WIDE)
 
     def settled(self, state: IndexState, line: Line, frame: Frame) -> IndexState:
-        """Return a state whose corners' errors hold for the picture that `line` predicts."""
+        """Return a state with corner errors for the picture that `line` predicts."""
         predicted = frame.pixels - line.residuals.reshape(-1, 2)
         visible = np.isfinite(predicted[:, 0])
         ids = frame.where(visible).ids
         return state.with_corners_at(ids, predicted[visible], self.sigma_corner) if ids else state
 
     def line(self, state: IndexState, frame: Frame) -> Line:
-        """Return the prediction of a frame near a state; residuals are NaN where none is seen.
+        """Return the prediction of a frame near a state; residuals are NaN for unseen corners.
 
-        Slopes are those at the constants' first guesses and at `state.n_of_slopes`: taken anew
-        for every frame they would differ by the noise of the estimate, and seem to tell apart what
-        no frame can (first-estimates Jacobian, Huang et al. 2010, doi:10.1177/0278364909353640).
+        Derivatives are taken at the constants' first guesses and at `state.n_of_slopes`. Taken
+        anew for every frame they would vary with the noise of the estimate, and make
+        unobservable combinations appear observable (first-estimates Jacobian, Huang et al. 2010,
+        doi:10.1177/0278364909353640).
         """
         slopes = np.zeros((len(frame.ids), 2, len(state.mean)))
         first_corner = FIRST_CAMERA + len(self.camera_names)
@@ -205,10 +205,10 @@ class IndexModel:
         return Line(residuals.reshape(-1), slopes.reshape(-1, len(state.mean)))
 
     def slope_uncertainty(self, state: IndexState, frame: Frame) -> float:
-        """Return the relative standard deviation of a change of index for what a state leaves open.
+        """Return the relative standard deviation of a change of index by the state's uncertainty.
 
-        The constants decide how far the picture moves with the index: a product of unknowns that a
-        joint Gaussian does not hold.
+        The derivative of the picture by the index depends on the constants: a product of unknowns
+        that a joint Gaussian does not represent.
         """
         mean, size = state.mean, FIRST_CAMERA + len(self.camera_names)
         reference = self._slope_at(mean[:size], state.n, frame)
@@ -249,10 +249,10 @@ class IndexModel:
         return known
 
     def nearest(self, state: IndexState, frame: Frame) -> float:
-        """Return the index that puts most corners where they are, all constants as they are.
+        """Return the index that fits most corners, with all constants fixed.
 
-        Newton's method on the weighted median of what the corners say one by one: half of them
-        may be wrong.
+        Newton's method on the weighted median of the corners' single estimates: half of them may
+        be wrong.
         """
         n = min(max(state.n, _LOWEST), _HIGHEST)
         for _ in range(_NEWTON):
@@ -266,7 +266,7 @@ class IndexModel:
 
 @dataclass(slots=True)
 class _MovedRig:
-    """A rig moved by small changes of its numbers; making one takes longer than a projection."""
+    """Cache of a rig moved by small changes: making a rig takes longer than a projection."""
 
     rig: Rig
     names: tuple[str, ...]
@@ -278,7 +278,7 @@ class _MovedRig:
         self._step, self._last = np.zeros(len(self.names)), self.rig
 
     def near(self, step: FloatArray) -> tuple[Rig, FloatArray]:
-        """Return the rig moved by nearly `step`, and what is left of that to be added linearly."""
+        """Return the rig moved by nearly `step`, and the remainder to be added linearly."""
         if np.any(np.abs(step - self._step) > _NEARLY * self.sigmas):
             self._last = rig_moved_by(self.rig, self.names, step)
             self._step = step.copy()
@@ -293,7 +293,7 @@ def at_index(state: IndexState, n: float, *, slopes_too: bool = False) -> IndexS
 
 
 def median_shift(line: Line) -> float:
-    """Return the weighted median of the changes of index that corners, each alone, ask for."""
+    """Return the weighted median of the changes of index by each corner alone."""
     slopes, residuals = line.slopes[:, N].reshape(-1, 2), line.residuals.reshape(-1, 2)
     weights = np.sum(slopes**2, axis=1)
     seen = np.isfinite(residuals[:, 0]) & (weights > BLIND**2)
@@ -301,7 +301,7 @@ def median_shift(line: Line) -> float:
         return 0.0
     shifts = np.sum(slopes[seen] * residuals[seen], axis=1) / weights[seen]
     order = np.argsort(shifts)
-    # Slopes, not their squares: corners that move most would outvote all others.
+    # Weights are slopes, not their squares: else the corners that move most would dominate.
     along = np.cumsum(np.sqrt(weights[seen])[order])
     return float(shifts[order[np.searchsorted(along, 0.5 * along[-1])]])
 
@@ -309,28 +309,28 @@ def median_shift(line: Line) -> float:
 _REJECT = 5.0
 _REJECTED = 1e-6
 _PASSES = 5
-# Square of a normal deviate that half of all lie below.
+# Median of the square of a normal deviate.
 _HALF = 0.4549
 
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """How a frame differs from what a state predicts.
+    """Innovation: difference between a frame and the prediction by a state.
 
     Attributes
     ----------
     frame : Frame
         Its corners that fit.
     n_points : int
-        Corners before the misfits were left out.
+        Number of corners before the misfits were left out.
     shift, sigma : float
-        Change of the index that explains the frame best, and the standard deviation it should
-        have if there was none. Infinite sigma where the index cannot be seen.
+        Change of the index that explains the frame best, and its expected standard deviation
+        without a change. Infinite sigma if the index is not observable.
     sigma_frame : float
         Part of `sigma` that is the frame's own noise.
     misfit : float
-        Squared residuals that no change of index explains, in terms of their covariance and over
-        their number: about 1.
+        Squared residuals that no change of index explains, normalised by their covariance and
+        number: about 1.
     """
 
     frame: Frame
@@ -342,23 +342,23 @@ class Innovation:
 
     @property
     def fits(self) -> bool:
-        """Whether most of the target is where the state has it."""
+        """True if most of the target is where the state predicts it."""
         return 2 * len(self.frame.ids) > self.n_points and len(self.frame.ids) >= MIN_POINTS
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """A state after a frame.
+    """Updated state after a frame.
 
     Attributes
     ----------
     state : IndexState
     used : int
-        Corners that counted.
+        Number of used corners.
     rms : float
         Root mean square residual of a coordinate of those, in pixels.
     noise : float
-        Noise of a coordinate that the residuals speak for, in pixels.
+        Noise of a coordinate estimated from the residuals, in pixels.
     """
 
     state: IndexState
@@ -368,7 +368,7 @@ class Update:
 
 
 def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) -> Innovation:
-    """Return how a frame differs from what a state predicts.
+    """Return the innovation of a frame: its difference from the prediction by a state.
 
     Parameters
     ----------
@@ -398,7 +398,7 @@ def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
 
 
 def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) -> Update:
-    """Return the state after a frame whose corners fit it.
+    """Return the state updated by a frame whose corners fit it.
 
     Parameters
     ----------
@@ -431,10 +431,10 @@ def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
 
 
 class _KalmanStep(NamedTuple):
-    """A state's new mean, what is left of the residuals, and what that should be.
+    """Kalman update: new mean of a state, remaining residuals, and their expected squares.
 
-    `left` and `expected` (2M,) are in pixels and their squares; `information` is what the frame
-    says of the index if all else was known.
+    `left` and `expected` (2M,) are in pixels and their squares; `information` is that of the frame
+    on the index if all else was known.
     """
 
     mean: FloatArray
@@ -485,14 +485,14 @@ def _spread(state: IndexState, line: Line, noise: float) -> FloatArray:
 
 
 def _left_over(state: IndexState, line: Line, noise: float) -> FloatArray:
-    """Lengths (M,) of residuals that no change of index explains, in standard deviations."""
+    """Return lengths (M,) of residuals that no change of index explains, in standard deviations."""
     left = line.residuals - line.slopes[:, N] * median_shift(line)
     spread = _spread(state, line, noise)
     return _lengths(left / np.sqrt(np.diag(spread) - _by_index(spread, line)[0]))
 
 
 def _by_index(spread: FloatArray, line: Line) -> tuple[FloatArray, float, FloatArray]:
-    """Variances (2M,) that a free index explains, that index's variance, weights (2M,) for it."""
+    """Return variances (2M,) explained by a free index, its variance, and its weights (2M,)."""
     slopes = line.slopes[:, N]
     if float(np.sum(slopes**2)) < BLIND**2:
         return np.zeros_like(slopes), np.inf, np.zeros_like(slopes)
@@ -502,7 +502,7 @@ def _by_index(spread: FloatArray, line: Line) -> tuple[FloatArray, float, FloatA
 
 
 def _best_shift(state: IndexState, line: Line, noise: float) -> tuple[float, float, float]:
-    """Change of index by generalised least squares, its variance, and what it leaves over."""
+    """Return the change of index by generalised least squares, its variance and the residuals."""
     if not len(line.residuals):
         return 0.0, np.inf, np.inf
     spread = _spread(state, line, noise)

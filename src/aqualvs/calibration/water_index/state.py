@@ -1,8 +1,8 @@
-"""What an index estimate knows: the index and the constants of rig and target, jointly Gaussian.
+"""State of the index estimate: index and constants of rig and target, jointly Gaussian.
 
-What is known of a medium's refractive index before a camera has looked at it.
-
-What an index estimate reports: options, readings, alarms, and what they mean in words.
+With it: the prior of a medium's index, before a camera has looked at it (`IndexPrior`, from air or
+from temperature and salinity), and the options, readings, alarms and remarks that an estimate
+reports.
 """
 
 import math
@@ -29,7 +29,7 @@ _STEP_NM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class IndexPrior:
-    """An index and how well it is known.
+    """Prior of a refractive index.
 
     Attributes
     ----------
@@ -38,12 +38,12 @@ class IndexPrior:
     sigma : float
         Standard deviation, positive.
     source : str
-        Where it comes from, for reports.
+        Its origin, for reports.
 
     Raises
     ------
     OptionError
-        If the index cannot be or sigma is not positive.
+        If the index is impossible or sigma is not positive.
     """
 
     n: float
@@ -62,10 +62,10 @@ class IndexPrior:
 
     @classmethod
     def air(cls, n_air: float = N_AIR) -> "IndexPrior":
-        """Return what is known of air: a vehicle on deck that looks at its target learns from it.
+        """Return the prior of air: a vehicle on deck that looks at its target learns from it.
 
-        The target's place and the lens are then known as well as this index makes them, and keep
-        that when the vehicle goes into the water.
+        The accuracy that target place and lens reach with this index is kept when the vehicle goes
+        into the water.
         """
         return cls(n_air, _SIGMA_AIR, "air")
 
@@ -81,7 +81,7 @@ class IndexPrior:
         sigma_wavelength_nm: float = 5.0,
         n_air: float = N_AIR,
     ) -> "IndexPrior":
-        """Return what temperature and salinity say, by Quan & Fry (1995).
+        """Return the prior from temperature and salinity, by Quan & Fry (1995).
 
         Parameters
         ----------
@@ -90,10 +90,10 @@ class IndexPrior:
         sigma_temperature_c, sigma_salinity_permille : float
             Standard deviations of the two.
         wavelength_nm, sigma_wavelength_nm : float
-            Of the light that the target is seen in. 5 nm change the index by 2e-4: look at the
+            Of the light in which the target is seen. 5 nm change the index by 2e-4: look at the
             target in the colour of the lasers (the green channel).
         n_air : float
-            Index of air relative to vacuum, which the formula is multiplied by.
+            Index of air relative to vacuum, a factor on the formula.
 
         Raises
         ------
@@ -115,20 +115,21 @@ class IndexPrior:
 
 
 N, ANCHOR, BEFORE = 0, 1, 2
-"""Index now; when the prior was given; before the last step."""
+"""Present index; index when the prior was given; index before the last step."""
 N_INDICES = 3
 POSE = slice(3, 9)
 FIRST_CAMERA = 9
 FAR = 0.02
-"""Changes of the index from which on slopes are taken anew."""
+"""Change of the index from which derivatives are taken anew."""
 
-# Motion of the picture over which corners' errors stay the same, and up to which nobody asks.
+# Correlation length of corners' errors over the motion of the picture, and motion below which
+# errors are kept.
 _SAME_PX, _STILL_PX = 0.4, 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class IndexState:
-    """A joint Gaussian; never changed in place.
+    """State of the estimate, a joint Gaussian; immutable.
 
     Attributes
     ----------
@@ -137,16 +138,16 @@ class IndexState:
     mean : array, shape (D,)
         Three indices (`N`, `ANCHOR`, `BEFORE`); errors of the target's place: a turn about its
         middle (radians) and a shift (metres) in `dome`; errors of the camera's numbers; and for
-        each corner, what its pixel is always off (x and y).
+        each corner, the constant error of its pixel (x and y).
     covariance : array, shape (D, D)
     ids : tuple of int
-        Corners that have such entries, in their order.
+        Corners with such entries, in order.
     random_variance : float
         Of the index now if all constants were known: the part that more frames reduce.
     n_of_slopes : float
-        Index for which derivatives are taken, see `IndexModel.line`.
+        Index at which derivatives are taken, see `IndexModel.line`.
     seen_at : array, shape (K, 2)
-        Pixels of the corners at which their own errors hold; NaN where nothing holds yet.
+        Pixels of the corners for which their errors are valid; NaN before the first.
     """
 
     time: float
@@ -169,16 +170,16 @@ class IndexState:
 
     @property
     def step(self) -> tuple[float, float]:
-        """Index now less that before the last step, and its standard deviation.
+        """Change of the index at the last step, and its standard deviation.
 
-        Constants that shift both alike cancel.
+        Errors of the constants that shift both indices alike cancel.
         """
         c = self.covariance
         variance = c[N, N] + c[BEFORE, BEFORE] - 2.0 * c[N, BEFORE]
         return float(self.mean[N] - self.mean[BEFORE]), float(np.sqrt(max(variance, 0.0)))
 
     def later(self, time: float, drift: float) -> "IndexState":
-        """Return the state at another time, the index a random walk of `drift` per root second."""
+        """Return the state at another time: a random walk of the index, `drift` per root second."""
         grown = drift**2 * max(time - self.time, 0.0)
         covariance = self.covariance.copy()
         covariance[N, N] += grown
@@ -190,7 +191,7 @@ class IndexState:
         )
 
     def anchored(self) -> "IndexState":
-        """Return the state with the index now kept as that which a prior speaks of."""
+        """Return the state with the present index copied to the anchor, for a later prior."""
         return self._copied(ANCHOR)
 
     def stepped(self, n: float, sigma: float) -> "IndexState":
@@ -204,13 +205,13 @@ class IndexState:
         )
 
     def with_slopes_near(self) -> "IndexState":
-        """Return the state with derivatives taken anew if the index has gone far since."""
+        """Return the state with new derivatives if the index has changed much since the last."""
         if abs(self.n - self.n_of_slopes) <= FAR:
             return self
         return replace(self, n_of_slopes=self.n)
 
     def with_corners(self, ids: tuple[int, ...], sigma_px: float) -> "IndexState":
-        """Return the state with entries for corners that it does not know yet."""
+        """Return the state with entries for new corners."""
         new = tuple(i for i in ids if i not in self.ids)
         if not new:
             return self
@@ -229,17 +230,17 @@ class IndexState:
     def with_corners_at(
         self, ids: tuple[int, ...], pixels: FloatArray, sigma_px: float
     ) -> "IndexState":
-        """Return the state with corners' errors that hold where the corners are seen.
+        """Return the state with corner errors valid at the pixels of the corners.
 
-        What a detector is off depends on where in its pixel a corner lies: where the picture has
-        moved by a good part of a pixel, fresh errors replace the old ones.
+        The error of a detector depends on the place of a corner within its pixel: after a motion of
+        the picture by a good part of a pixel, new errors replace the old ones.
 
         Parameters
         ----------
         ids : tuple of int
             Corners of a picture, all known.
         pixels : array, shape (M, 2)
-            Where they are predicted.
+            Their predicted places.
         sigma_px : float
             Standard deviation of the errors.
         """
@@ -267,7 +268,7 @@ class IndexState:
         return replace(self, mean=mean, covariance=covariance)
 
     def given_anchor(self, n: float, sigma: float) -> "IndexState":
-        """Return the state if the anchor is known to be `n` within `sigma` (a Kalman update)."""
+        """Return the state after a Kalman update of the anchor with `n` and `sigma`."""
         reach = self.covariance[:, ANCHOR]
         variance = reach[ANCHOR] + sigma**2
         return replace(
@@ -295,7 +296,7 @@ def first_state(
     time : float
         In seconds.
     n, sigma : float
-        Where the index is looked for, and how far around.
+        Initial guess of the index, and its standard deviation.
     pose_sigmas : array, shape (6,)
         Of the target's place: turn (radians) and shift (metres).
     camera : array, shape (C, C)
@@ -310,31 +311,32 @@ def first_state(
     return IndexState(time, mean, covariance, (), sigma**2, n, np.zeros((0, 2)))
 
 
-# Beyond so many standard deviations the target is not where it should be.
+# Number of standard deviations beyond which the target counts as moved.
 _MOVED = 4.0
 _LOST_FRAMES = 10
-# Corners that are off by so many times what was expected of them.
+# Ratio of the corners' errors to the expected ones that is reported.
 _CROOKED = 2.0
-# Fresh water and sea water are 0.008 apart: an index known half as well still says which.
+# Fresh water and sea water differ by 0.008: an index known to half of that still separates them.
 _LARGEST_SIGMA = 4e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexOptions:
-    """What is assumed of the target and the medium.
+    """Options: assumptions about target and medium.
 
     Attributes
     ----------
     sigma_place : float
-        How well the target's place on the vehicle is known, along each axis of `dome`, in metres.
+        Standard deviation of the target's place on the vehicle, along each axis of `dome`, in
+        metres.
     sigma_turn : float
         The same of its turn about each axis, in radians.
     sigma_corner_px : float
-        What a corner is always off, by its printing and its detection.
+        Standard deviation of a corner's constant error, by its printing and its detection.
     drift : float
         Random walk of the index per root second.
     smallest_step : float
-        Steps below this ring no alarm.
+        Smallest step that raises an alarm.
     largest_sigma : float
         Without a prior, an index known less well than this is called unobservable.
 
@@ -359,9 +361,9 @@ class IndexOptions:
 
     @classmethod
     def of_target(cls, place_sigma_mm: float, turn_sigma_deg: float) -> Self:
-        """Return the options for a target whose place on the vehicle is known so well.
+        """Return the options for a target with given uncertainties of its place on the vehicle.
 
-        An index counts as observable where it still tells fresh water from sea water.
+        An index counts as observable if it separates fresh water from sea water.
         """
         return cls(
             sigma_place=place_sigma_mm / 1e3,
@@ -371,7 +373,7 @@ class IndexOptions:
 
     @property
     def pose_sigmas(self) -> FloatArray:
-        """Turn and shift of the target, shape (6,)."""
+        """Standard deviations of turn and shift of the target, shape (6,)."""
         return np.array([self.sigma_turn] * 3 + [self.sigma_place] * 3)
 
 
@@ -386,7 +388,7 @@ class IndexStep:
     size, sigma : float
         Change of the index and its standard deviation.
     by_medium : bool
-        False where the corners moved as no index moves them: then the target or the lens has
+        False if no change of index explains the corners' motion: then the target or the lens has
         moved, and `size` means nothing.
     """
 
@@ -409,7 +411,7 @@ class IndexStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexReading:
-    """What is known of the index after a frame.
+    """Estimate of the index after a frame.
 
     Attributes
     ----------
@@ -418,29 +420,29 @@ class IndexReading:
     time : float
         In seconds.
     refused : str
-        Why the frame was left out; empty where it counts.
+        Reason why the frame was left out; empty for a used one.
     n, sigma : float
-        Index of the medium now and its standard deviation, prior included; NaN and infinite
-        before the first frame that counts, where there is no prior.
+        Present index of the medium and its standard deviation, prior included; NaN and infinite
+        before the first used frame without a prior.
     sigma_random : float
-        Part of `sigma` that more frames reduce. Changes are seen to about this.
+        Part of `sigma` that more frames reduce; about the smallest visible change.
     n_pictures, sigma_pictures : float
         `n` and `sigma` without the prior.
     n_frame, sigma_frame : float
-        From this frame alone, with all constants as they are known by now, and its noise.
+        From this frame alone, with the present constants, and its noise.
     n_points : int
-        Corners that counted.
+        Number of used corners.
     rms_px : float
         Root mean square residual of their coordinates.
     observable : bool
-        Whether the index rests on the pictures: False where they say less than the prior, or,
-        without one, less than `IndexOptions.largest_sigma`.
+        Whether the pictures determine the index: False if they give less information than the
+        prior, or, without one, than `IndexOptions.largest_sigma`.
     prior_used : bool
-        False without a prior, and where it contradicts the pictures.
+        False without a prior, and if it contradicts the pictures.
     step : IndexStep or None
-        The alarm, in the frame that rings it.
+        The alarm, in the frame that raises it.
     remarks : tuple of str
-        What a user should know, one sentence each.
+        Remarks for the user, one sentence each.
     """
 
     name: str
@@ -461,34 +463,34 @@ class IndexReading:
     remarks: tuple[str, ...]
 
     def __bool__(self) -> bool:
-        """Whether the frame counted."""
+        """Return whether the frame was used."""
         return not self.refused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Knowledge:
-    """All that decides whether an index is observable and what is to be said of it.
+    """Data that decide whether an index is observable, and its remarks.
 
     Attributes
     ----------
     own, joint : IndexState or None
-        Without and with the prior; None before the first frame that counts.
+        Without and with the prior; None before the first used frame.
     prior : IndexPrior or None
         As given.
     contradicted : bool
-        Whether it disagrees with the pictures.
+        Whether the prior disagrees with the pictures.
     since_prior : float
-        Variance that the index has gathered since the prior was given, by drift and steps.
+        Variance of the index added by drift and steps since the prior was given.
     sigma_frame : float
         Noise of the index from one frame.
     decentring : float
         Distance of the lens from the dome's centre, metres.
     n_lost : int
-        Frames since the target was last where it should be.
+        Number of frames since the target was last at its place.
     moved : bool
-        Whether a step was none of the medium's.
+        Whether a step was not caused by the medium.
     n_camera : int
-        Uncertain numbers of the camera in the states.
+        Number of the camera's uncertain numbers in the states.
     options : IndexOptions
         As given.
     """
@@ -507,19 +509,19 @@ class Knowledge:
 
     @property
     def observable(self) -> bool:
-        """Whether the index rests on the pictures."""
+        """True if the pictures determine the index."""
         if self.own is None or self.joint is None or self.moved or self.n_lost >= _LOST_FRAMES:
             return False
         if self.prior is None or self.contradicted:
             return self.own.sigma < self.options.largest_sigma
         alone = math.sqrt(self.prior.sigma**2 + self.since_prior)
-        # After a step the prior speaks of another medium; what it taught about the target stays.
+        # After a step the prior is of another medium; its information on the target stays valid.
         stepped = alone > self.options.largest_sigma
         sigma = self.joint.sigma if stepped else self.own.sigma
         return sigma < min(alone, self.options.largest_sigma)
 
     def remarks(self) -> tuple[str, ...]:
-        """Return what a user should know, one sentence each."""
+        """Return remarks for the user, one sentence each."""
         found = [self._about_sight(), self._about_prior(), self._about_place()]
         if self.n_lost >= _LOST_FRAMES:
             found.append(
@@ -587,9 +589,9 @@ class Knowledge:
 
 
 def contradicts(own: IndexState, prior: IndexPrior, before: bool) -> bool:
-    """Return whether pictures and prior disagree; `before` is what this said last.
+    """Return whether pictures and prior disagree; `before` is the last answer.
 
-    They do beyond four standard deviations, and cease to below three.
+    With hysteresis: they disagree beyond four standard deviations, and agree again below three.
     """
     apart = abs(float(own.mean[ANCHOR]) - prior.n)
     sigma = math.hypot(math.sqrt(own.covariance[ANCHOR, ANCHOR]), prior.sigma)

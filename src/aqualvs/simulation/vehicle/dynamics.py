@@ -1,7 +1,8 @@
-"""A rigid body in moving water (Fossen 2011, Handbook of marine craft hydrodynamics, ch. 6-8).
+"""Compiled dynamics of a vehicle in moving water, and its autopilot.
 
-With nu the body's velocity, nu_r that relative to the water and v_c, a_c velocity and
-acceleration of the water, all along body axes and diagonal matrices,
+Rigid body (Fossen 2011, Handbook of marine craft hydrodynamics, ch. 6-8): with nu the body's
+velocity, nu_r that relative to the water and v_c, a_c velocity and acceleration of the water, all
+along body axes and diagonal matrices,
 
     (M_RB + M_A) nu' = tau - C_RB(nu) nu - C_A(nu_r) nu_r - D(nu_r) nu_r - g
                        + M_A (a_c - omega x v_c) + m_displaced a_c,
@@ -10,11 +11,10 @@ the last term being the Froude-Krylov force of waves on a body much shorter than
 state is a row of 13 numbers: position in the world (north, east, down), attitude as the unit
 quaternion (w, x, y, z) of world_from_body, velocity and turning rate along body axes.
 
-The vehicle's own autopilot: ArduSub's depth hold (mode_althold.cpp), compiled.
-
-Roll and pitch are held at zero and depth where it is; the sticks ask for rates of descent and of
-turning, forward and right go straight to the thrusters. It knows attitude, rates and depth as
-they are: what an estimator makes of good sensors is better than what it is asked to hold.
+Autopilot: ArduSub's depth hold (mode_althold.cpp). Roll and pitch are held at zero and depth at its
+present value; the sticks set rates of descent and of turning; forward and right go straight to
+the thrusters. The autopilot gets the true attitude, rates and depth: a good estimator's errors are
+smaller than the errors of control.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ Turn = tuple[Vec, Vec, Vec]
 
 
 class Body(NamedTuple):
-    """The numbers of a hull and its thrusters.
+    """Numbers of a hull and its thrusters, for kernels.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Body(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Memory that the integrator borrows: `slopes` (4, 13), `probe` (13,), `wrench` (3, 6)."""
+    """Working memory of the integrator: `slopes` (4, 13), `probe` (13,), `wrench` (3, 6)."""
 
     slopes: FloatArray
     probe: FloatArray
@@ -63,7 +63,7 @@ class Work(NamedTuple):
 
 
 def make_work() -> Work:
-    """Return fresh memory for the integrator."""
+    """Return working memory for the integrator."""
     return Work(np.zeros((4, N_STATE)), np.zeros(N_STATE), np.zeros((3, 6)))
 
 
@@ -175,7 +175,7 @@ def wrench_of(thrusts: FloatArray, allocation: FloatArray, out: FloatArray) -> N
 def _stage(
     y: FloatArray, k: int, t: float, left: float, body: Body, flow: Flow, work: Work
 ) -> None:
-    """Write slope k; `left` of the step from the old to the wanted wrench is still to come."""
+    """Write slope k; `left` is the remaining share of the step to the wanted wrench."""
     for i in range(6):
         wanted = work.wrench[1, i]
         work.wrench[2, i] = wanted + (work.wrench[0, i] - wanted) * left
@@ -199,9 +199,9 @@ def advance(
     flow: Flow,
     work: Work,
 ) -> None:
-    """Carry state and thrusts on by one Runge-Kutta step while thrusts approach `wanted`.
+    """Advance state and thrusts by one Runge-Kutta step while thrusts approach `wanted`.
 
-    All thrusters have one lag, so their wrench decays exactly; the fourth order holds.
+    All thrusters have one lag, so the decay of their wrench is exact and the order remains four.
     """
     half = np.exp(-0.5 * h / body.lag)
     wrench_of(thrusts, body.allocation, work.wrench[0])
@@ -235,7 +235,7 @@ def coast(
     flow: Flow,
     work: Work,
 ) -> None:
-    """Carry state (13,) and thrusts (n_thrusters,) on by `n` steps without an autopilot."""
+    """Advance state (13,) and thrusts (n_thrusters,) by `n` steps without an autopilot."""
     for i in range(n):
         advance(y, thrusts, wanted, t + i * h, h, body, flow, work)
 
@@ -256,7 +256,7 @@ _MOST_DEPTH_ERROR = 0.5
 
 
 class Pilot(NamedTuple):
-    """The numbers of an autopilot.
+    """Numbers and working memory of an autopilot, for kernels.
 
     Attributes
     ----------
@@ -269,7 +269,7 @@ class Pilot(NamedTuple):
     inputs : array, shape (6,)
         Memory for the motor inputs.
     wanted : array, shape (n,)
-        Memory for the thrusts asked for, in newtons.
+        Memory for the requested thrusts, in newtons.
     """
 
     gains: FloatArray
@@ -280,7 +280,7 @@ class Pilot(NamedTuple):
 
 
 def pack_pilot(model: VehicleModel) -> Pilot:
-    """Return a model's autopilot as kernels need it."""
+    """Return a model's autopilot for kernels."""
     own, sticks, curve = model.autopilot, model.sticks, model.curve
     gains = [own.angle, *own.rate, *own.rate_integral, own.depth, own.climb, own.climb_integral]
     gains += [own.input_time, own.acceleration, own.settle]
@@ -301,13 +301,13 @@ def _clip(value: float, most: float) -> float:
 
 @inline_borrowing_kernel
 def _past(value: float, dead: float) -> float:
-    """Return what of a deflection is past the dead zone, rescaled to reach 1 (ArduPilot)."""
+    """Return a deflection beyond the dead zone, rescaled to reach 1 (ArduPilot)."""
     return float(np.copysign(max(abs(value) - dead, 0.0) / (1.0 - dead), value))
 
 
 @inline_borrowing_kernel
 def thrust_of(command: float, curve: FloatArray) -> float:
-    """Return the thrust in newtons that a command of -1 to 1 tends to."""
+    """Return the steady thrust in newtons of a command of -1 to 1."""
     x = _past(_clip(command, 1.0), curve[_DEAD])
     most = curve[_FORWARD] if x > 0.0 else curve[_REVERSE]
     return float(most * x * (curve[_AUTOPILOT_LINEAR] + (1.0 - curve[_AUTOPILOT_LINEAR]) * abs(x)))
@@ -332,7 +332,7 @@ def _rate_loop(
 def _hold_heading(
     effort: FloatArray, heading: float, h: float, m: FloatArray, g: FloatArray
 ) -> float:
-    """Return the turning rate that stick and held heading ask for."""
+    """Return the turning rate requested by stick and held heading."""
     asked = g[_FULL_TURN] * effort[3]
     m[TURN_RATE] += (asked - m[TURN_RATE]) * (1.0 - np.exp(-h / g[_INPUT]))
     m[SINCE_TURN] = m[SINCE_TURN] + h if asked == 0.0 else 0.0
@@ -373,10 +373,10 @@ def euler_of(r: tuple[Vec, Vec, Vec]) -> Vec:
 
 @inline_borrowing_kernel
 def mix_inputs(pilot: Pilot) -> None:
-    """Turn `pilot.inputs` into `pilot.wanted` as ArduSub's AP_Motors6DOF does.
+    """Convert `pilot.inputs` to `pilot.wanted` like ArduSub's AP_Motors6DOF.
 
-    Roll, pitch and depth are one group, yaw, forward and right another; a group that asks more
-    than a thruster has is scaled down as a whole.
+    Roll, pitch and depth are one group, yaw, forward and right another; a group that exceeds the
+    range of a thruster is scaled down as a whole.
     """
     inputs, mixing, n = pilot.inputs, pilot.mixing, pilot.mixing.shape[0]
     upright, level = 1.0, 1.0
@@ -395,12 +395,12 @@ def mix_inputs(pilot: Pilot) -> None:
 
 @inline_borrowing_kernel
 def steer(y: FloatArray, effort: FloatArray, h: float, memory: FloatArray, pilot: Pilot) -> None:
-    """Write the thrusts that the autopilot asks for to `pilot.wanted`."""
+    """Write the thrusts requested by the autopilot to `pilot.wanted`."""
     g = pilot.gains
     r = turn_of(y)
     roll, pitch, heading = euler_of(r)
     turn = _hold_heading(effort, heading, h, memory, g)
-    # Rates about body axes that turn the heading while roll and pitch stay.
+    # Rates about body axes that change the heading at constant roll and pitch.
     _rate_loop(ROLL, -g[_ANGLE] * roll + turn * r[2][0], y[10], _MOST_ROLL_PITCH, h, memory, pilot)
     _rate_loop(
         PITCH, -g[_ANGLE] * pitch + turn * r[2][1], y[11], _MOST_ROLL_PITCH, h, memory, pilot
@@ -429,18 +429,18 @@ def fly(
     flow: Flow,
     work: Work,
 ) -> None:
-    """Carry the vehicle on by `n` steps of `h` seconds under one effort.
+    """Advance the vehicle by `n` steps of `h` seconds under one effort.
 
     Parameters
     ----------
     y : array, shape (13,)
-        State; see `vehicle_kernels`.
+        State, see the docstring of this module.
     thrusts : array, shape (n_thrusters,)
         In newtons.
     memory : array, shape (N_MEMORY,)
         Of the autopilot.
     effort : array, shape (4,)
-        What the sticks ask for; see `Sticks.asked`.
+        Request of the sticks; see `Sticks.asked`.
     """
     for i in range(n):
         steer(y, effort, h, memory, pilot)

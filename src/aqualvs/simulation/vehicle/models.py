@@ -20,7 +20,7 @@ from aqualvs.simulation.vehicle.water_motion import GRAVITY
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 
 _COS45 = math.sqrt(0.5)
-# A thruster takes part in a motion if it has so much of its unit force or of its lever in it.
+# Least share of a thruster's unit force or lever in a motion that it takes part in.
 _TAKES_PART = 0.2
 # Columns of the mixing table.
 ROLL, PITCH, YAW, DOWN, FORWARD, RIGHT = range(6)
@@ -28,14 +28,14 @@ ROLL, PITCH, YAW, DOWN, FORWARD, RIGHT = range(6)
 
 @dataclass(frozen=True, slots=True)
 class Thruster:
-    """A thruster.
+    """Thruster of a vehicle.
 
     Attributes
     ----------
     position : (float, float, float)
         In body axes, in metres.
     direction : (float, float, float)
-        Unit vector along which it pushes the vehicle when it runs forward.
+        Unit vector of its force on the vehicle when it runs forward.
     """
 
     position: Vec
@@ -44,10 +44,10 @@ class Thruster:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThrustCurve:
-    """Thrust over command, and how fast it follows.
+    """Thrust over command, and its lag.
 
-    Beyond the dead band the thrust is greatest * (linear x + (1 - linear) x²), x being the rest of
-    the command's travel.
+    Beyond the dead band the thrust is greatest * (linear x + (1 - linear) x²), where x is the share
+    of the remaining travel.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class ThrustCurve:
         Greatest thrust either way, in newtons. The defaults are a T200's at 14 V, 4.52 and 3.52
         kgf (Blue Robotics' chart; 5.25 and 4.10 kgf at 16 V).
     dead_band : float
-        Share of the command's travel that does nothing. 0.07 is 28 of 400 µs.
+        Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
     linear : float
         0.6 follows the same chart at 12 V within 3 % of the greatest thrust, both ways.
     lag : float
@@ -79,15 +79,15 @@ class ThrustCurve:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sticks:
-    """What the vehicle makes of stick positions, as ArduSub 4.5 and later of MANUAL_CONTROL.
+    """Response of the vehicle to stick positions, as of ArduSub 4.5 and later to MANUAL_CONTROL.
 
-    Its parameters are RCn_MIN 1100 and RCn_MAX 1900 us and, but for those below, as ArduSub has
-    them after a reset. No axis has an expo.
+    Its parameters are RCn_MIN 1100 and RCn_MAX 1900 us and, except for those below, ArduSub's after
+    a reset. No axis has an expo.
 
     Attributes
     ----------
     gain : float
-        Pilot gain (JS_GAIN_DEFAULT): share of everything that a full stick asks for.
+        Pilot gain (JS_GAIN_DEFAULT): share of the full range at full stick.
     turning_rate : float
         At a pulse of 1900 us, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
     climb_rate : float
@@ -120,12 +120,12 @@ class Sticks:
             raise OptionError(f"sticks: trims {self.trims} us; choose 1400 to 1600")
 
     def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
-        """Return what stick positions ask for in depth hold.
+        """Return the request of stick positions in depth hold.
 
         Parameters
         ----------
         x, y, z, r : int
-            As MANUAL_CONTROL has them: z from 0 (down) over 500 to 1000 (up).
+            As in MANUAL_CONTROL: z from 0 (down) over 500 to 1000 (up).
 
         Returns
         -------
@@ -188,21 +188,20 @@ class Autopilot:
     Attributes
     ----------
     angle : float
-        Rate asked for by an angle's error, in rad/s per rad.
+        Requested rate per error of the angle, in rad/s per rad.
     rate, rate_integral : (float, float, float)
         Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
     depth : float
-        Climb rate asked for by a depth's error, in m/s per metre.
+        Requested climb rate per error of the depth, in m/s per metre.
     climb, climb_integral : float
         Motor input per m/s, and per m/s and second.
     input_time : float
-        Time constant in which turning rates that are asked for come in, in seconds
-        (ATC_INPUT_TC).
+        Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
     acceleration : float
-        With which climb rates come in, in m/s² (PILOT_ACCEL_Z).
+        Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
     settle : float
-        So long after the last turn that was asked for, the heading held is the present one, in
-        seconds (ArduSub's mode_althold.cpp).
+        Time after the last requested turn during which the held heading follows the present one,
+        in seconds (ArduSub's mode_althold.cpp).
     """
 
     angle: float = 4.5
@@ -218,18 +217,18 @@ class Autopilot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleModel:
-    """A vehicle's parameters, in SI units.
+    """Parameters of a vehicle, in SI units.
 
     Attributes
     ----------
     name : str
-        How reports call it.
+        Name in reports.
     mass : float
         In air, in kg.
     inertia : (float, float, float)
         About forward, right and down, in kg m².
     buoyancy : float
-        In newtons; the displaced mass follows from it.
+        In newtons; it gives the displaced mass.
     centre_of_buoyancy : (float, float, float)
         In body axes, in metres; above the centre of gravity is negative.
     added_mass, linear_drag, quadratic_drag : tuple of 6 floats
@@ -239,7 +238,7 @@ class VehicleModel:
     curve : ThrustCurve
         Of every thruster.
     sticks : Sticks
-        What an effort asks for.
+        Response to the sticks.
     autopilot : Autopilot
         Gains of the vehicle's own loops.
     dome_position : (float, float, float)
@@ -273,7 +272,7 @@ class VehicleModel:
 
     @property
     def weight(self) -> float:
-        """In newtons."""
+        """Weight in newtons."""
         return self.mass * GRAVITY
 
     @property
@@ -285,8 +284,8 @@ class VehicleModel:
     def scaled(self, mass: float = 1.0, drag: float = 1.0) -> "VehicleModel":
         """Return a vehicle with other mass and drag, by these factors.
 
-        Inertia goes with the mass, and buoyancy too: a vehicle is trimmed before it dives, so the
-        difference of buoyancy and weight stays.
+        Inertia scales with the mass. Buoyancy changes with the weight so that their difference
+        stays: a vehicle is trimmed before it dives.
         """
         if not (mass > 0.0 and drag > 0.0):
             raise OptionError(
@@ -302,14 +301,14 @@ class VehicleModel:
         )
 
     def allocation(self) -> FloatArray:
-        """Force and moment on the body of every thruster's unit thrust, shape (6, n)."""
+        """Return force and moment on the body by unit thrust of every thruster, shape (6, n)."""
         positions = np.array([one.position for one in self.thrusters])
         directions = np.array([one.direction for one in self.thrusters])
         moments = np.cross(positions, directions)
         return np.ascontiguousarray(np.vstack([directions.T, moments.T]))
 
     def mixing(self) -> FloatArray:
-        """Share of each motor input that every thruster takes, shape (n, 6): -1, 0 or 1.
+        """Return factors of each motor input for every thruster, shape (n, 6): -1, 0 or 1.
 
         Columns: roll, pitch, yaw, down, forward, right. As in ArduSub's frames, upright thrusters
         do roll, pitch and depth, level ones the rest.
@@ -344,7 +343,7 @@ def _scaled6(values: Six, factor: float) -> Six:
 
 
 def _level_four(x: float, y: float, z: float) -> tuple[Thruster, ...]:
-    """Motors 1 to 4 of ArduSub's vectored frames: front right, front left, rear right, rear left.
+    """Return motors 1 to 4 of ArduSub's vectored frames: front right and left, rear right and left.
 
     The front ones run in reverse to go forward.
     """
@@ -395,10 +394,10 @@ BLUEROV2 = VehicleModel(
 """BlueROV2 with six thrusters: Wu 2018, "6-DoF modelling and control of a remotely operated
 vehicle", Flinders University.
 
-Nothing but buoyancy rights its pitch. Its level thrusters are placed 10 mm below the centre of
-gravity, not some 70 mm: with those and a centre of buoyancy 20 mm up, half of the thrust would turn
-the model over. Above about 0.5 m/s ahead its pitch is unstable all the same: the Munk moment of
-added mass beats the righting one.
+Only buoyancy stabilises its pitch. Its level thrusters are placed 10 mm below the centre of
+gravity, not about 70 mm: with that and a centre of buoyancy 20 mm up, half of the thrust would turn
+the model over. Above about 0.5 m/s ahead its pitch is unstable nevertheless: the Munk moment of the
+added mass exceeds the righting moment.
 """
 
 VIDEORAY = VehicleModel(

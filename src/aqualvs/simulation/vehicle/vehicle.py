@@ -1,6 +1,7 @@
-"""A simulated vehicle in its water: move its sticks, and it goes as ArduSub's depth hold would.
+"""A simulated vehicle in its water, controlled by sticks as under ArduSub's depth hold.
 
-What a simulated vehicle tells of itself: depth and attitude, with the faults of sensors.
+Its telemetry holds depth and attitude with the errors of sensors: noise, bias, slow drift and a
+limited rate (`Sensors`, `Telemetry`).
 """
 
 import math
@@ -34,17 +35,17 @@ from aqualvs.simulation.vehicle.water_motion import GRAVITY, WaterMotion
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
-    """Faults of a sensor, in the unit of what it senses.
+    """Errors of a sensor, in the unit of its quantity.
 
     Attributes
     ----------
     noise : float
-        Standard deviation of a reading by itself.
+        Standard deviation of the white noise of a reading.
     bias : float
         Constant error.
     wander, wander_time : float
-        Standard deviation of a slow error, and the time in seconds in which it forgets itself
-        (first-order Gauss-Markov).
+        Standard deviation and correlation time in seconds of a slow error (first-order
+        Gauss-Markov).
     rate : float
         Readings a second.
     """
@@ -85,17 +86,17 @@ class Sensors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Telemetry:
-    """What the vehicle tells, as MAVLink would carry it.
+    """Telemetry of the vehicle, as MAVLink would carry it.
 
     Attributes
     ----------
     time_s : float
-        When it was read, in the vehicle's time.
+        Time of the reading, in the vehicle's time.
     armed : bool
     obeys : bool
-        Whether it is in a mode in which it takes efforts.
+        Whether its mode accepts stick positions.
     lapsed : bool
-        Whether no effort has come for so long that it holds still by itself.
+        Whether it holds still because no stick positions have come for a time.
     depth : float
         Metres, down positive.
     heading, roll, pitch : float
@@ -113,12 +114,12 @@ class Telemetry:
 
 
 class Reading:
-    """One sensor over time.
+    """Readings of one sensor over time.
 
     Parameters
     ----------
     sensor : Sensor
-        Its faults.
+        Its errors.
     rng : Generator
         Source of its noise.
     """
@@ -132,7 +133,7 @@ class Reading:
         self._value = math.nan
 
     def of(self, truth: float, time_s: float) -> float:
-        """Return the latest reading; a new one where one is due."""
+        """Return the latest reading; a new one if it is due."""
         if time_s >= self._due - 1e-9:
             sensor = self._sensor
             left = math.exp(-(time_s - self._last_s) / sensor.wander_time)
@@ -150,7 +151,7 @@ _STILL = np.zeros(4)
 
 
 class StickPositions(Protocol):
-    """Where the sticks stand, -1 to 1 of their full deflection."""
+    """Positions of the sticks, -1 to 1 of full deflection."""
 
     @property
     def forward(self) -> float:
@@ -185,7 +186,7 @@ def level_pose(position: FloatArray, heading: float) -> SE3:
 
 
 class SimulatedVehicle:
-    """A vehicle that obeys a pilot's sticks.
+    """Simulated vehicle under a pilot's sticks.
 
     The world is north, east, down from the still surface; the body forward, right, down. The same
     model, water, sticks and `rng` give the same dive.
@@ -199,19 +200,19 @@ class SimulatedVehicle:
     rng : Generator
         Source of the sensors' noise.
     world_from_body : SE3
-        Where it starts, at rest; it holds this heading and depth.
+        Initial pose, at rest; it holds this heading and depth.
     sensors : Sensors, optional
-        Faults of its sensors.
+        Errors of its sensors.
     latency : float
-        Time that stick positions take to arrive, in seconds.
+        Delay of stick positions, in seconds.
     lapse : float
-        So long after the last ones have come it holds still, in seconds (FS_PILOT_TIMEOUT).
+        Time after the last ones until it holds still, in seconds (FS_PILOT_TIMEOUT).
 
     Attributes
     ----------
     armed, obeys : bool
-        Disarmed, its thrusters stand still; if it does not obey, it holds heading and depth
-        whatever it is asked. Both may be set, as a pilot would.
+        Disarmed, its thrusters stand still; if it does not obey, it holds heading and depth and
+        ignores the sticks. Both may be set, as by a pilot.
     """
 
     def __init__(
@@ -274,7 +275,7 @@ class SimulatedVehicle:
 
     @property
     def thrusts(self) -> FloatArray:
-        """What every thruster gives, shape (n,), in newtons."""
+        """Thrust of every thruster, shape (n,), in newtons."""
         return self._thrusts.copy()
 
     @property
@@ -285,16 +286,16 @@ class SimulatedVehicle:
 
     @property
     def lapsed(self) -> bool:
-        """Whether no effort has come for `lapse` seconds."""
+        """True if no stick positions have come for `lapse` seconds."""
         return self._time - self._heard >= self.lapse - 1e-9
 
     def step(self, sticks: StickPositions | None, dt: float) -> None:
-        """Send stick positions now, or none, and let `dt` seconds pass.
+        """Send stick positions, or none, and advance by `dt` seconds.
 
         Raises
         ------
         OptionError
-            If time stands still or runs backwards, or a position is no number.
+            If `dt` is not positive, or a position is no number.
         """
         if not dt > 0.0:
             raise OptionError(f"vehicle: step of {dt:g} s; it must be positive")
@@ -303,7 +304,7 @@ class SimulatedVehicle:
             if not all(map(math.isfinite, parts)):
                 raise OptionError(f"vehicle: sticks {list(parts)}; every part must be a number")
             x, y, down, r = (round(1000 * min(max(part, -1.0), 1.0)) for part in parts)
-            # The vertical axis of MANUAL_CONTROL has half of the others' units.
+            # The vertical axis of MANUAL_CONTROL has half the range of the others.
             asked = self.model.sticks.asked(x, y, 500 - round(0.5 * down), r)
             self._coming.append((self._time + self.latency, np.array(asked)))
         end = self._time + dt
@@ -313,7 +314,7 @@ class SimulatedVehicle:
         self._take_what_has_come()
 
     def telemetry(self) -> Telemetry:
-        """Return what the vehicle tells of itself now."""
+        """Return the present telemetry."""
         r = self.pose.rotation
         truth = (
             float(self._state[POSITION + 2]),
@@ -337,7 +338,7 @@ class SimulatedVehicle:
         )
 
     def _engage(self) -> None:
-        """Hold depth and heading as they are."""
+        """Hold the present depth and heading."""
         self._memory[:] = 0.0
         self._memory[DEPTH] = self._state[POSITION + 2]
         self._memory[HEADING] = self.heading
@@ -348,7 +349,7 @@ class SimulatedVehicle:
             self._heard, self._effort = self._coming.popleft()
 
     def _next_change(self, end: float) -> float:
-        """Return when the effort in force next changes by itself or by one that comes."""
+        """Return the time of the next change of the stick positions in force."""
         arrives = self._coming[0][0] if self._coming else end
         ends = self._heard + self.lapse
         return min(arrives, ends if ends > self._time + 1e-9 else end)
@@ -376,7 +377,7 @@ class SimulatedVehicle:
 
 
 def pack_body(model: VehicleModel) -> Body:
-    """Return hull and thrusters of a model as kernels need them."""
+    """Return hull and thrusters of a model for kernels."""
     hull = np.zeros((N_ROWS, 6))
     hull[0] = (model.mass, model.mass, model.mass, *model.inertia)
     hull[1:4] = model.added_mass, model.linear_drag, model.quadratic_drag

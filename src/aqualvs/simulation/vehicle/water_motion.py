@@ -1,4 +1,4 @@
-"""How the water moves around a simulated vehicle, and what pulls at its tether.
+"""Motion of the water around a simulated vehicle, and the force of its tether.
 
 The world is north, east, down (NED) with its origin at the still surface. A current is the same
 everywhere and wanders slowly; waves are linear (Airy) waves in deep water, whose motion fades
@@ -38,7 +38,7 @@ class Waves:
     period : float
         In seconds; of irregular waves the middle one.
     direction : float
-        Where the waves go, in radians clockwise from north.
+        Direction of propagation, in radians clockwise from north.
     n : int
         Number of sine waves; 1 is a regular swell.
     spread : float
@@ -85,9 +85,9 @@ class Waves:
 class Tether:
     """A neutrally buoyant cable from a fixed point at the surface straight down to the vehicle.
 
-    Across the flow a piece of it is dragged like a cylinder; the vehicle's end carries what the
-    balance of moments about the upper end gives it, and the cable moves the less the nearer to
-    that end.
+    Each element of it has the drag of a cylinder across the flow; the force at the vehicle's end
+    follows from the balance of moments about the upper end; the cable's velocity falls linearly to
+    zero at that end.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Tether:
     diameter : float
         In metres; 7.6 mm is Blue Robotics' Fathom tether.
     drag : float
-        Drag coefficient across; about 1.2 for a smooth cylinder at these Reynolds numbers.
+        Drag coefficient across the flow; about 1.2 for a smooth cylinder at these Reynolds numbers.
     attached_at : (float, float, float)
         On the vehicle, in body axes (forward, right, down), in metres.
     pull : (float, float, float)
@@ -119,23 +119,23 @@ class Tether:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterMotion:
-    """Everything that moves in the water but the vehicle.
+    """Motion of the water: current, waves, and the tether that they move.
 
     Attributes
     ----------
     current : (float, float, float)
         Mean velocity of the water in world axes (north, east, down), in m/s.
     wander, wander_period : float
-        Standard deviation, in m/s along north and along east each, by which the current changes
-        over times of this length, in seconds.
+        Standard deviation of the current's slow changes, in m/s along north and along east each,
+        and their period, in seconds.
     waves : Waves, optional
-        None is a calm.
+        None for calm water.
     tether : Tether
         Drags and pulls at the vehicle.
     density : float
         In kg/m³.
     seed : int
-        Chooses the phases of waves and wander.
+        Seed of the phases of waves and wander.
     """
 
     current: Vec = (0.0, 0.0, 0.0)
@@ -154,7 +154,7 @@ class WaterMotion:
             )
 
     def pack(self) -> "Flow":
-        """Return it as kernels need it; the same seed gives the same water."""
+        """Return the water for kernels; the same seed gives the same water."""
         rng = np.random.default_rng([self.seed, 61])
         waves = self.waves.table(rng) if self.waves else np.zeros((0, _WAVE_COLUMNS))
         tether = self.tether
@@ -186,7 +186,7 @@ class WaterMotion:
 
 
 class Flow(NamedTuple):
-    """The numbers of `WaterMotion`.
+    """Numbers of `WaterMotion`, for kernels.
 
     Attributes
     ----------
@@ -251,7 +251,7 @@ _GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 
 @inline_borrowing_kernel
 def tether_force(stream: Vec, velocity: Vec, flow: Flow) -> Vec:
-    """Return what the tether does to the vehicle, in the world, in newtons.
+    """Return the force of the tether on the vehicle, in the world, in newtons.
 
     Parameters
     ----------
