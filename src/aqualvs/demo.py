@@ -1,4 +1,4 @@
-"""`aqualvs demo`: the bundled dive, measured and compared with its truth."""
+"""The command `aqualvs demo`: the bundled dive, measured and compared with its truth."""
 
 import importlib.resources
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""`aqualvs run`: from a dive to posture, points and report.
+"""The command `aqualvs run`: from a dive to posture, points and report.
 
-What watches over the lasers while a run goes on.
+`agreement_of` sets up the check of the lasers against each other during the run.
 """
 
 import time

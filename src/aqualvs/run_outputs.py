@@ -1,14 +1,11 @@
-"""What a run leaves behind: its folder's files, its report, and how it compares with the truth.
+"""Outputs of a run: the files of its folder, its report, and the comparison with the truth.
 
-The state of the net while a dive is run, if it is wanted.
+`RunWriters` writes all files frame by frame. Its parts, beside the folder itself:
 
-`dive.mcap`: the recording that a run writes on request.
-
-The video that shows what the scanner saw.
-
-What ignoring the dome would have made of a run, frame by frame.
-
-Everything that a run writes, frame by frame.
+- `RunBareLens`: `posture_bare.csv`, the posture without the dome model.
+- `RunOverlay`: `overlay.mp4`, the video of what the scanner detected.
+- `RunMcap`: `dive.mcap`, the recording, on request.
+- `RunNet`: the state of the net, on request.
 """
 
 import statistics

@@ -1,4 +1,7 @@
-"""Mission, controller and safety gate in one, fed frame by frame: no clock, no threads, no link."""
+"""Mission, controller and safety gate combined, updated frame by frame.
+
+Uses no clock, no threads and no link.
+"""
 
 import math
 from dataclasses import dataclass

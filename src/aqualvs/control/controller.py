@@ -1,4 +1,4 @@
-"""Holds range and yaw to the target; the sea and a target that is not square stay out of it.
+"""Controller of range and yaw to the target, and its parts: PID, swell filter, ramp and quiet zone.
 
 Signs: with the posture's yaw psi, n = (cos psi, sin psi) is the target's far normal along the
 body's (forward, right). A vehicle that moves by (u, v) and turns at r, with its dome `a` ahead of
@@ -6,14 +6,13 @@ the centre it turns about, closes in by
 
     c = -d(range)/dt = u cos psi + (v + a r) sin psi,      d(psi)/dt = -r.
 
-Range is held along the body's forward axis alone; motion to the side, and the dome's swing in a
-turn, are made up for beforehand.
+`RangeYawController` holds the range along the body's forward axis alone, whatever the sea and a
+target that is not square do; motion to the side, and the dome's swing in a turn, are compensated in
+advance.
 
-A PID controller for loops that are closed over frames: time comes with the measurement.
-
-A model of swell inside the loop: what comes back every few seconds is met before it is felt.
-
-Setpoints that change at a bounded speed, and turning rates that rest at zero.
+- `Pid`: a PID controller for loops that are closed over frames; the measurement brings its time.
+- `SwellFilter`: a model of swell inside the loop, which counteracts periodic disturbances.
+- `Ramp`: setpoints that change at a bounded speed; `QuietZone`: suppression of small turning rates.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""The area that a dive has seen, as a map of cells that a picture can be made of.
+"""Map of the area that a dive has seen, in cells.
 
-Down go depths. Across go bearings of the net, where the vehicle tells its heading: round a cage
-they are places. Else across go metres along the net by the speed asked for, which a current
-shifts.
+The vertical axis is depth. The horizontal axis is the bearing of the net, where the vehicle reports
+its heading: round a cage, bearings are places. Else it is the way along the net in metres by the
+speed asked for, which a current shifts.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""`follow.csv`: one row for every step of the controllers, on disk as soon as it is taken."""
+"""`follow.csv`: one row for every step of the controllers, on disk as soon as the step is taken."""
 
 import csv
 import io

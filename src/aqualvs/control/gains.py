@@ -1,6 +1,7 @@
-"""What a controller must know: the vehicle it steers, and how hard to steer it.
+"""Controller gains, facts about the vehicle that they are for, and the map from force to effort.
 
-From forces to efforts: thrusters have a dead band and a bent curve, controllers neither.
+Controllers compute forces; thrusters have a dead band and a curved response. `ThrustMap` inverts
+the response, and `DeadBandCrossing` crosses the dead band with hysteresis.
 """
 
 import math

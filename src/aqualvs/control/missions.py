@@ -1,8 +1,8 @@
-"""What a mission asks of the controllers, update by update; and the simplest one: hold.
+"""Missions: what the controllers are to hold, updated step by step; hold, follow and survey.
 
-Follow a net: constant distance, square to it, at a constant speed along it.
-
-Survey a net as one mows a lawn: along it, down a step, and back.
+- `HoldMission`: hold a range and yaw.
+- `FollowMission`: follow a net at a constant distance, square to it, at a constant speed along it.
+- `SurveyMission`: survey a net in legs, one at each depth, back and forth.
 """
 
 import math

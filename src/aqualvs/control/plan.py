@@ -1,4 +1,4 @@
-"""The plan file: what to do, how to stay safe, and what to do without the target."""
+"""The plan file: mission, safety limits, and behaviour without the target."""
 
 import math
 from dataclasses import dataclass

@@ -1,11 +1,11 @@
-"""The last word on every effort: what keeps vehicle and net whole, whoever steers.
+"""Safety gate for every effort, and detection of postures that do not respond to the efforts.
 
-The gate sits between controllers and vehicle. It never adds thrust towards the target, never arms,
-never changes the mode; docs/missions.md has its rules as a table.
+`SafetyGate` sits between controllers and vehicle, whoever steers, and protects vehicle and net. It
+never adds thrust towards the target, never arms, never changes the mode; docs/missions.md has its
+rules as a table.
 
-Whether a posture answers to what is done, or stands still while the vehicle moves.
-
-Independent of the pictures: it looks at postures, efforts and what the autopilot tells.
+`AnswerWatch` detects postures that stand still while the vehicle moves. It does not use the
+pictures: it compares postures, efforts and the autopilot's reports.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""From efforts to the stick positions that ArduSub makes them of: its dead zones taken out.
+"""Stick positions for efforts, with ArduSub's dead zones compensated.
 
 ArduSub 4.5 and later (joystick.cpp, Attitude.cpp, mode_althold.cpp, mode_poshold.cpp and
 RC_Channel.cpp of ArduPilot) turns `MANUAL_CONTROL` into pulses about 1500 us, 0.4 us times the

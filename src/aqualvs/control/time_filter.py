@@ -1,4 +1,4 @@
-"""Smoothing of range, pitch and yaw over time; optional, raw values stay available."""
+"""Time filter of range, pitch and yaw; optional, raw values stay available."""
 
 import math
 from dataclasses import dataclass, field, replace

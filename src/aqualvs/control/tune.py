@@ -1,4 +1,4 @@
-"""Gains for a vehicle model: the fastest that stay stable in the worst case.
+"""Gains for a vehicle model: the fastest that stay stable in the worst case, and their margins.
 
 Range: linearised about rest in still or moving water, the vehicle is 1 / (m s (s + b)) with the
 drag's slope b over mass, behind its thrusters' lag and the delay of picture, link and sampling.
@@ -9,9 +9,9 @@ the open loop is
            exp(-delay s),
 
 g = 1 + 0.8 b / k1, at most 2.2, and h = 1 + 1.2 b / k1, at most 6, being the controller's schedule
-in moving water. The shares k0 = 0.3 k1, ki = 0.25 k1² and that of H were chosen among some hundred:
-they let little of swell and of changes of the current through at given margins, over all three
-vehicles. So one number is left; it is the greatest for which the modulus margin stays at
+in moving water (`gain_schedule`). The ratios k0 = 0.3 k1, ki = 0.25 k1² and that of H were chosen
+among some hundred: they pass little of swell and of changes of the current at given margins, over
+all three vehicles. So one number is left; it is the greatest for which the modulus margin stays at
 `least_modulus` with the usual delay, and at `least_late_modulus` with the greatest, in every
 corner: mass and drag off by the factors asked for, water at rest and at the greatest current.
 
@@ -20,9 +20,8 @@ thrusters; L(s) = (kp s + ki) / s² / (lag s + 1) exp(-delay s) with ki = 0.15 k
 greatest for the same margin, the rate loop being as calculated or, in the thrusters' dead band,
 several times slower.
 
-What a controller should know of a simulated vehicle.
-
-How far a loop is from instability: the delay and the gain that may still be added to it.
+`facts_of` states what a controller should know of a simulated vehicle. `Margins` are the distances
+of a loop from instability, among them the delay and the gain that may still be added.
 """
 
 import itertools

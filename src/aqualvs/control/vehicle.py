@@ -1,8 +1,8 @@
-"""What the controllers know of a vehicle, whoever it is: a simulated one, or ArduSub by MAVLink.
+"""Interface of a vehicle for the controllers: state, efforts, and the setpoint to hold.
 
-Body axes are forward, right, down (FRD), at the vehicle's centre; yaw is clockwise from above.
-
-What pilot and controller agree on: the range and yaw to hold.
+A vehicle is a simulated one, or ArduSub by MAVLink. Body axes are forward, right, down (FRD), at
+the vehicle's centre; yaw is clockwise from above. `SetpointHolder` shares the range and yaw to hold
+between pilot and controller.
 """
 
 import math

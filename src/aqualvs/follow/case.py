@@ -1,6 +1,6 @@
-"""What is simulated in one run: vehicle, sea, net, delays; and how it becomes a loop.
+"""Setup of a simulated run (vehicle, sea, net, delays), and the three trials that judge a loop.
 
-The three trials that a loop is judged by: hold, step, follow; in one sea before one net.
+The trials are hold, step and follow, all in the same sea and before the same net.
 """
 
 import math

@@ -1,8 +1,7 @@
-"""`aqualvs follow --sim`: the loop in simulation, as a log, figures and a summary.
+"""The command `aqualvs follow --sim`: a simulated loop with log, figures and summary.
 
-A simulated loop on the pilot's page, in real time.
-
-What is told while a loop is simulated, and when it ends.
+`LoopPage` shows the loop on the pilot's page, in real time. `RunWatch` reports progress in the
+terminal and ends the run.
 """
 
 import math

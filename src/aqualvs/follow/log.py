@@ -1,7 +1,4 @@
-"""What a simulated loop did, frame by frame, with the truth beside it.
-
-How well a simulated loop did, from its log.
-"""
+"""Log of a simulated loop, frame by frame with the truth, and measures of its performance."""
 
 import csv
 import math

@@ -1,10 +1,10 @@
 """The closed loop in simulated time: frames, time filter, pilot, vehicle, water and net.
 
-What decides is what decides live: the time filter, `NetPilot` with mission, controller and safety
-gate, and the rules of the live pilot's watchdog. Delays are those of events: a frame is exposed,
-arrives a while later, and its effort reaches the vehicle after the wire's latency.
+Decisions are made by the code of a live run: the time filter, `NetPilot` with mission, controller
+and safety gate, and the rules of the live pilot's watchdog. Delays are those of events: a frame is
+exposed, arrives later, and its effort reaches the vehicle after the latency of the wire.
 
-The simulated vehicle behind the link that control knows.
+`SimulatedLink` gives the simulated vehicle the interface that the controllers use.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Many short dives with everything drawn at random: what the safety of the loop rests on."""
+"""Monte Carlo simulation of short dives: evidence for the safety of the loop."""
 
 import math
 from collections.abc import Iterable, Iterator

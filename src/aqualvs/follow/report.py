@@ -1,9 +1,8 @@
-"""The page and the summary of a simulated run.
+"""Page, summary and figures of a simulated run.
 
-Pictures of a loop over time, after figures 22 and 23 of the paper.
-
-Constantinou, Georgiades and Loizou, Robotics 2021, 10, 126. Matplotlib is asked for when a picture
-is drawn, and only its Agg canvas: no display is needed.
+The figures follow figures 22 and 23 of the paper (Constantinou, Georgiades and Loizou, Robotics
+2021, 10, 126). Matplotlib is imported when a figure is drawn, and only its Agg canvas: no display
+is needed.
 """
 
 import html

@@ -1,6 +1,7 @@
-"""A scanner that is sampled instead of run: the true posture with noise, and with losses.
+"""Models of the scanner for simulated loops: sampled postures, or the scanner on rendered pictures.
 
-A scanner that is run on rendered pictures: every frame goes through the real pipeline.
+`SampledEye` gives the true posture with noise and losses. `RenderedEye` renders every frame and
+measures in it by the real pipeline.
 """
 
 import math

@@ -1,6 +1,6 @@
-"""`aqualvs tune`: gains for a vehicle, with the margins they leave and a step in the simulator.
+"""The command `aqualvs tune`: gains for a vehicle, their margins, and a step of the range.
 
-A step of the range in the simulator: what tuning promises, tried on the whole vehicle.
+The step is simulated with the whole vehicle, to test what the linear model of tuning promises.
 """
 
 import math

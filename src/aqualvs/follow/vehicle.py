@@ -1,6 +1,6 @@
-"""`aqualvs follow SOURCE`: hold and follow with a real vehicle.
+"""The command `aqualvs follow SOURCE`: hold and follow with a real vehicle, with a log.
 
-The log of a real dive under control; the disk never holds the pilot up.
+A thread of its own writes the log, so that the disk never delays the pilot.
 """
 
 import contextlib

@@ -1,8 +1,7 @@
-"""`aqualvs live`: from a stream to pilot, autopilot and log.
+"""The command `aqualvs live`: from a stream to pilot, autopilot and recording.
 
-Following the water's index beside a live run, so that no frame waits for it.
-
-What a live run says in the terminal: one line that stays, or a line now and then in a log.
+`WaterFollower` tracks the water's refractive index in a thread of its own, so that no frame waits
+for it. `Console` reports in the terminal: a status line that stays, or occasional lines in a log.
 """
 
 import math

@@ -1,10 +1,8 @@
-"""Keeps account of how a live run goes.
+"""Health of a live run: rates, delays, lasers that moved, and frozen pictures.
 
-Notice a picture that stands still while its time stamps run on.
-
-Encoders and capture cards repeat their last picture when the camera fails; the stream looks alive.
-
-Watching for a laser that has moved, beside the live loop: a verdict takes its time.
+`FrozenPicture` detects a picture that stands still while its time stamps run on: encoders and
+capture cards repeat their last picture when the camera fails, and the stream looks alive.
+`DriftWatch` detects a laser that has moved, in a thread of its own, because its test takes long.
 """
 
 import itertools

@@ -1,10 +1,8 @@
-"""From the words of the command line to the outputs of a live run.
+"""Options of a live run: outputs, the vehicle file, and the pilot's page.
 
-The vehicle file: who the vehicle is on MAVLink, how it is steered, and who must be there.
-
-From the words of the command line to a vehicle on MAVLink.
-
-The pilot's page of `aqualvs live` and `follow`, where its packages are installed.
+The vehicle file states the vehicle's MAVLink identity, how it is steered, and which ground station
+must be present. `vehicle_setup` combines it with the command line. `serve_page` serves the pilot's
+page of `aqualvs live` and `follow`, if its packages are installed.
 """
 
 import math

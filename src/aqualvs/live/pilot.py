@@ -1,8 +1,7 @@
-"""The output that closes the loop: each sample becomes an effort, or none.
+"""The output that closes the control loop: each sample becomes an effort, or none.
 
-Stops the thrusters when the loop that steers them does not come round.
-
-What the pilot's page and the health list show of the pilot that aqualvs is.
+`Watchdog` stops the thrusters when no new effort comes in time. `PilotReport` describes each step
+for the pilot's page and the health list.
 """
 
 import logging

@@ -1,12 +1,13 @@
-"""The live loop: the latest frame in, a sample to every output; nothing stops it but its owner.
+"""The live loop: it measures the latest frame and hands a sample to every output.
 
-Making a scanner ready, so that the first frame of a stream does not wait for it.
+Only its owner ends the loop; faults of frames and outputs do not.
 
-Runs one output so that whatever happens to it disturbs nothing else.
-
-Handing frames from the thread that decodes to the one that measures, without adding delay.
-
-The thread that moves frames from a feed to the mailbox.
+- `FrameReader`: the thread that reads the feed and puts frames into the mailbox.
+- `Mailbox`: room for the latest frame, from the decoding thread to the measuring one, without
+  adding delay.
+- `LiveRunner`: the loop itself; `warm_up` loads the compiled kernels before it starts, so that the
+  first frame does not wait.
+- `OutputWorker`: a thread for each output, so that its faults do not affect anything else.
 """
 
 import logging

@@ -1,14 +1,12 @@
-"""The topics of a recording and the definitions of their messages, in ROS 2's language.
+"""Topics and message definitions of a recording, and the encoding of its messages (CDR).
 
-Pictures in a recording: JPEG, small; or PNG of the planes as they are, without loss.
+Definitions are in the message language of ROS 2. CDR, its encoding, is little-endian here, and
+implemented as far as these messages need it: primitives are aligned to multiples of their size,
+counted from the end of the four bytes at the start of every message. A sequence is its length as
+uint32, then its elements; an empty one has no gap after its length.
 
-A rig and the scanner's options as a recording keeps them.
-
-ROS 2's encoding of messages (CDR, little endian) as far as our messages need it.
-
-Primitives lie at multiples of their size, counted from the end of the four bytes that every message
-begins with. A sequence is its length as uint32, then its elements; an empty one has no gap after
-its length.
+Pictures are JPEG (small) or PNG of the planes as they are (lossless). The rig is recorded as the
+text of its file and its exact numbers; the scanner's options as JSON.
 """
 
 import json

@@ -1,25 +1,25 @@
-"""An MCAP file that is complete after every single step of writing it.
+"""An MCAP file that is valid after every single write, and the compressed chunks appended to it.
 
 The format ends in a summary and a footer, so a file that is merely appended to cannot be read until
-it has been closed. This one always has them. Its size runs ahead of the data:
+it has been closed. This file always has both. Its size runs ahead of the data:
 
 ::
 
     header, schemas, chunks | padding ........ | data end, summary | padding ..... | footer
                             ^ frontier                             ^ tail
 
-What is new goes into a padding, where no reader looks, all but its first nine bytes, and a smaller
-padding behind it. Then the nine bytes that were the old padding's head are replaced. They never
-straddle a page, and a system copies within a page in one go: whoever reads the file, and whenever
-the process is killed, sees the record whole or not at all. The summary's records are added in the
-same way. When one of the paddings is used up the file is made longer by its new footer alone, in
-one write behind a hole; that footer belongs to a second copy of the summary, because a footer in
-the middle of a summary is no valid file. Holes take no place on the disk.
+New data, except for its first nine bytes, is written into a padding, where no reader looks,
+together with the smaller padding behind it. Then the nine bytes that were the old padding's head
+are replaced. They never straddle a page, and a system copies within a page in one go: every reader,
+and every end of the process, finds the record whole or not at all. The summary's records are added
+in the same way. When one of the paddings is used up, the file is made longer by its new footer
+alone, in one write behind a hole; that footer belongs to a second copy of the summary, because a
+footer in the middle of a summary is no valid file. Holes take no space on the disk.
 
-After a loss of power the order in which pages reached the disk counts, and what was written since
-the last `sync` may be torn; `reader.py` leaves out chunks whose checksum is wrong.
+After a loss of power the order in which pages reached the disk counts, and data written since the
+last `sync` may be torn; `McapFile` leaves out chunks whose checksum is wrong.
 
-Chunks: messages of about half a second, compressed together.
+A `Chunk` holds the messages of about half a second, compressed together.
 """
 
 import contextlib

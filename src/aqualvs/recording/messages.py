@@ -1,9 +1,7 @@
-"""Samples as messages, for the recording and for Foxglove; definitions are in `encoding.py`.
+"""Messages of a recording and of Foxglove, and their creation from samples.
 
-All of them are in the frame `dome`, with angles in degrees as every border has them. Numbers that
-do not exist are NaN.
-
-From samples to the messages of a recording.
+Their definitions are in `encoding.py`. All are in the frame `dome`, with angles in degrees, as
+everywhere outside the library. Numbers that do not exist are NaN.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""The recorder of a live run: an output that loses nothing and holds nobody up.
+"""Recorders of dives: for `aqualvs run`, for a live run, and switchable during a live run.
 
-A recording that is written in the caller's own time, as `aqualvs run` does it.
-
-Recording on and off while a run goes on.
+`Recording` writes in the caller's own time. `Recorder` is an output of a live run with a thread of
+its own: it loses nothing and blocks nobody. `RecorderSwitch` starts and stops such recorders while
+the run goes on.
 """
 
 import errno

@@ -1,4 +1,4 @@
-"""A recorded dive, frame by frame, as the scanner found it."""
+"""A recorded dive, frame by frame, with the stripes that the scanner detected."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

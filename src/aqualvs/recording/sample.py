@@ -1,4 +1,4 @@
-"""What a live run hands to its outputs, frame by frame."""
+"""Samples: the result of one frame of a live run, as passed to its outputs."""
 
 from dataclasses import dataclass
 

@@ -1,12 +1,13 @@
-"""What goes wrong with files and folders, in one line that names the remedy.
+"""Writing of files: append and replace without torn results, one-line errors, and overwriting.
 
-A file that grows by whole pieces: a piece is in it entirely, or not at all.
+`AppendFile` appends a piece entirely or not at all. Errors of the operating system become one line
+that names the remedy (`writing`, `explain`).
 
-The one rule for what commands replace: what they wrote themselves, and only when asked.
-
-Every folder notes in `.aqualvs.json` which command wrote which of its files, and the size and
-checksum that the file had. A file that is not noted there, or has changed since, belongs to the
-user: no option replaces it. Rig files follow a rule of their own: `save_rig` keeps a dated copy.
+`Claim` is the one rule for overwriting: commands replace only files that they wrote themselves, and
+only when asked. Every folder notes in `.aqualvs.json` which command wrote which of its files, and
+the size and checksum that the file had. A file that is not noted there, or has changed since,
+belongs to the user: no option replaces it. Rig files follow a rule of their own: `save_rig` keeps a
+dated copy.
 """
 
 import contextlib

@@ -1,17 +1,15 @@
-"""The folder that a run writes, kept readable whenever and however the run ends.
+"""The folder of a run, readable at any time and however the run ends.
 
 ==================  ========================================================================
-`posture.csv`       one row for every frame, on disk when the frame is done
+`posture.csv`       one row for every frame, on disk as soon as the frame is done
 `posture_bare.csv`  the same without the dome model, for comparison
-`points.arrows`     the points while the run is under way; the next two stand for it at its end
+`points.arrows`     the points during the run; replaced by the next two files at its end
 `points.parquet`    every stripe point
 `points.ply`        the points on the target; both are `.part` until the run ends
 `run.yaml`          source, options, versions, rig, status and summary
 ==================  ========================================================================
 
-The report, the state of a net and the overlay video are written beside them by their own modules.
-
-`posture.csv`: one row for every frame, on disk as soon as the frame is done.
+Other modules write the report, the state of a net and the overlay video beside them.
 """
 
 import contextlib

@@ -1,8 +1,10 @@
-"""Scans of a run that is on disk, read back one by one from `posture.csv` and its points.
+"""The net's condition over a dive: evaluation scan by scan, its files, and scans of a stored run.
 
-The net's condition over a dive: from scans, one by one, to the files that tell of it.
+`NetPass` takes scans one by one and writes the files. `stored_scans` reads the scans of a run back
+from `posture.csv` and its points.
 
-What evaluates and draws is imported where it is used: every run reads this module, few want a net.
+Modules that evaluate and draw are imported where they are used, because every run imports this
+module and few evaluate a net.
 """
 
 import csv

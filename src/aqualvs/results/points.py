@@ -1,9 +1,8 @@
-"""`points.parquet` and `points.ply`, batch by batch.
+"""Stripe points of a run: `points.arrows` during it, `points.parquet` and `points.ply` at its end.
 
-`points.arrows`: the points of a run that is under way, as an Arrow IPC stream.
-
-Parquet cannot be read before its footer is written; a stream can be read up to its last whole
-batch, whatever happened after it.
+`points.arrows` is an Arrow IPC stream: it can be read up to its last whole batch, whatever happened
+after it, whereas Parquet cannot be read before its footer is written. All are written batch by
+batch.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
-"""What `aqualvs run` is asked to do, checked before anything is written.
+"""Request of `aqualvs run`, checked before anything is written, and `run.yaml`, its record.
 
-`run.yaml`: what was run, on what, with what, and how it went.
+`run.yaml` holds source, rig, options, versions, status and summary of a run.
 """
 
 import functools

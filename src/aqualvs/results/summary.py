@@ -1,7 +1,4 @@
-"""Summary numbers of a run, gathered frame by frame.
-
-Posture against truth.
-"""
+"""Summary of a run: counts and ranges, frame by frame, and the comparison with the truth."""
 
 import contextlib
 import csv

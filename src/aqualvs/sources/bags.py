@@ -1,6 +1,8 @@
-"""Images from MCAP files: Foxglove's messages, and those of ROS 1 and ROS 2.
+"""Images from ROS bags and MCAP files.
 
-Images from ROS bags: `.bag` of ROS 1, `.db3` and MCAP folders of ROS 2.
+Bags are `.bag` files of ROS 1, and `.db3` or MCAP folders of ROS 2, read by the package `rosbags`.
+Lone MCAP files hold images as messages of Foxglove, ROS 1 or ROS 2, read by the package `mcap`.
+Both give a `MessageSource` for one topic.
 """
 
 import contextlib

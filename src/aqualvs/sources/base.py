@@ -1,14 +1,12 @@
-"""What every source of frames offers.
+"""Interfaces of all sources of frames, and their common parts.
 
-How well a live run goes: rates, delays, drops, lasers, links.
-
-Frames as colour pictures, for overlays and people.
-
-Luma and chroma of a decoded picture, without copying where its layout allows.
-
-Packets for a decoder, made from bytes that came some other way than through FFmpeg.
-
-What a live run needs of a source of frames.
+- `FrameSource`: frames in order, all of the same size; for `run`.
+- `Feed`: the frames of a live run, from a stream that may stall, change its size or return.
+- `Health`, `PartHealth`, `StageDelay`: rates, delays and drops of a live run, and the state of its
+  lasers and links.
+- `planes_of`: luma and chroma of a decoded picture, not copied where its layout allows;
+  `bgr_of`: a frame as a colour picture for overlays and viewers.
+- `packet_with`: a packet for a decoder, from bytes that FFmpeg has not read itself.
 """
 
 from collections.abc import Iterator

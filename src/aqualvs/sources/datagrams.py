@@ -1,6 +1,7 @@
-"""UDP datagrams, taken from the system as they come.
+"""UDP datagrams: addresses, a receiver with its own thread, and detection of their content.
 
-Datagrams of one kind, told by their content.
+`Datagrams` takes datagrams from the system as they arrive. `Inbox` hands out those of one kind (RTP
+with H.264, MPEG-TS, bare H.264) until the content shows another kind.
 """
 
 import errno

@@ -1,8 +1,8 @@
-"""The little of H.264 that a receiver must read itself, to know whether a picture is missing.
+"""NAL units of H.264 and HEVC: their types, and the frame numbers that reveal lost pictures.
 
-Sections and tables are those of ITU-T H.264.
-
-Which units a packet of H.264 or HEVC holds, as far as it matters for cutting.
+Receivers read only what shows whether a picture is missing (`FrameNumbers`, H.264); the search for
+places to cut a video reads only the types of the units (`unit_reader`, H.264 and HEVC). Sections
+and tables without another source are those of ITU-T H.264.
 """
 
 import re

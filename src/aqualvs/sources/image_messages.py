@@ -1,6 +1,7 @@
-"""Images as ROS and Foxglove messages carry them.
+"""Image messages of ROS and Foxglove: conversion of their encodings, and decoding of the pictures.
 
-From the messages of ROS and Foxglove to images.
+Messages may be ROS messages, Foxglove messages in JSON or Foxglove messages in Protobuf; each
+becomes an `ImageMessage`, and `planes_of_message` decodes it to luma and chroma.
 """
 
 import base64

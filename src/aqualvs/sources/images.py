@@ -1,6 +1,7 @@
 """Frames from a folder or a list of images.
 
-Decoders of pictures that print what they think of a file: libpng, libjpeg, libtiff.
+libpng, libjpeg and libtiff print their warnings to the standard error of the process;
+`quiet_decoders` silences them while an image is read.
 """
 
 import contextlib

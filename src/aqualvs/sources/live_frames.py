@@ -1,10 +1,9 @@
-"""From the packets of a stream to numbered, timed frames.
+"""Numbered, timed frames from the packets of a live stream.
 
-Time since the start of a stream, from the stream's own clock.
-
-How a stream is received, for the pilot.
-
-A decoder that delivers sound pictures only, without delay.
+- `LiveFrames`: frames over reconnections and senders that start anew.
+- `LiveDecoder`: a decoder without delay that delivers undamaged pictures only.
+- `StreamClock`, `Unwrapper`: time since the start of the stream, from the stream's own clock.
+- `Reception`: the state of the reception, as shown to the pilot.
 """
 
 import statistics

@@ -1,6 +1,7 @@
-"""Reading recordings back, torn ones too.
+"""MCAP files: encoding of their records, and a reader that also reads truncated or damaged files.
 
-The records of an MCAP file as bytes (format 0, https://mcap.dev/spec).
+Records are those of format 0 (https://mcap.dev/spec). `McapFile` reads; the functions above it
+encode records for `aqualvs.recording`.
 """
 
 import contextlib

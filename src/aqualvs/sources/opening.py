@@ -1,8 +1,7 @@
-"""From a path or an address to the source that reads it.
+"""Choice of the source or feed for a path or an address; `PacedFeed`, a recording as a live feed.
 
-What reads streams, cameras and recordings is imported where it is used: most dives are videos.
-
-A recording as a live feed.
+Modules that read streams, cameras and recordings are imported where they are used, because most
+dives are videos.
 """
 
 import math

@@ -1,8 +1,6 @@
-"""Live video that FFmpeg receives: RTSP, SRT, HTTP, TCP, cameras of this machine.
+"""Live video received by FFmpeg: RTSP, SRT, HTTP, TCP, and cameras of this machine (Video4Linux).
 
-A connection that FFmpeg holds, read by a thread of its own.
-
-A camera of this machine, by Video4Linux.
+A thread of its own reads each connection (`Connection`), because FFmpeg may block without end.
 """
 
 import queue

@@ -1,6 +1,6 @@
-"""Packets of the Real-time Transport Protocol (RFC 3550), put in order.
+"""RTP: packets in order (RFC 3550), and pictures from the payload of H.264 (RFC 6184).
 
-Pictures from the RTP payload of H.264 (RFC 6184), single units, STAP-A and FU-A.
+Of RFC 6184, single NAL units, STAP-A and FU-A are read.
 """
 
 from dataclasses import dataclass

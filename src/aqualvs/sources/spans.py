@@ -1,12 +1,10 @@
-"""Parts of a dive that can be decoded by themselves, and how they are found.
+"""Spans of a dive that can be decoded independently, and readers of their frames.
 
-A part of a video must begin at a picture from which decoding can start as if nothing had been
-before. In H.264 and HEVC that is an instantaneous decoding refresh (IDR): by the standards (ITU-T
-H.264, 7.4.1.2.4; H.265, 7.4.2.2) no later picture refers to one before it, and none of those that
-follow it in the file is shown before it. Key frames that promise less are no place to cut. A dive
-about which any doubt is left stays in one piece.
-
-The frames of a part of a dive, read by themselves.
+A span of a video must begin at a picture from which decoding can start without any earlier picture.
+In H.264 and HEVC that is an instantaneous decoding refresh (IDR): by the standards (ITU-T H.264,
+7.4.1.2.4; H.265, 7.4.2.2) no later picture refers to one before it, and none that follows it in the
+file is shown before it. Other key frames promise less; the video is not cut there. If any doubt is
+left, the dive stays in one span.
 """
 
 import itertools

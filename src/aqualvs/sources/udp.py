@@ -1,8 +1,7 @@
 """Live video over UDP: RTP with H.264, MPEG-TS, or a bare H.264 byte stream.
 
-Session descriptions (RFC 8866) of RTP streams.
-
-From datagrams to frames, for each kind of content.
+`UdpFeed` listens on a port and picks the reader for the content: `RtpReader`, `TransportReader` or
+`BareReader`. `read_sdp` reads the session description (RFC 8866) of an RTP stream.
 """
 
 import base64

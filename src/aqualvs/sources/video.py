@@ -1,6 +1,6 @@
 """Frames from a video file or stream, decoded by FFmpeg through PyAV.
 
-Numbers of pictures, with gaps for lost ones.
+`Ledger` numbers the pictures by their packets, so that lost pictures leave a gap in the index.
 """
 
 import heapq

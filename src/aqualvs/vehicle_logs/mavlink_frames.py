@@ -1,9 +1,8 @@
-"""MAVLink frames out of a telemetry log, without parsing those that nobody asks for.
+"""MAVLink frames from a telemetry log; only frames of the wanted messages are decoded.
 
 A telemetry log is a chain of records: the time of receipt (UTC, microseconds, big-endian, 8 bytes)
-and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The chain is followed
-from header to header; only frames of wanted messages are checked and decoded, all of one kind at
-once.
+and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The reader follows the
+chain from header to header, and checks and decodes wanted frames only, all of one kind at once.
 """
 
 import re

@@ -1,6 +1,7 @@
-"""Angles over time as band-passed rates on an even grid, the form in which motions are compared.
+"""Angular motion as band-passed rates on an even grid, and the correlation of two such motions.
 
-How well two motions agree at every time offset, and at one offset in detail.
+`rates_of` computes the rates; `scores_of` scores the agreement at every time offset, `match_at`
+that at one offset, sample by sample.
 """
 
 import math

@@ -1,11 +1,9 @@
-"""A vehicle's log as a table of comma-separated values.
+"""Vehicle logs of any format (`read_vehicle_log`), and the reader of CSV tables.
 
-Columns, in any order: `time_s` (seconds on any clock) or `time` (UTC, ISO 8601); `depth_m`,
-positive down; `heading_deg`, clockwise from north; and, if known, `roll_deg` and `pitch_deg`. One
-of depth and heading must be there. An empty cell is a value that was not logged. Other columns are
-ignored, unless they look like one of these in another unit.
-
-Reading a vehicle's log, whatever its format.
+Columns of a table, in any order: `time_s` (seconds on any clock) or `time` (UTC, ISO 8601);
+`depth_m`, positive down; `heading_deg`, clockwise from north; and optionally `roll_deg` and
+`pitch_deg`. At least one of depth and heading is required. An empty cell is a value that was not
+logged. Other columns are ignored, unless they look like one of these in another unit.
 """
 
 import csv

@@ -1,12 +1,12 @@
-"""The offset between a dive's clock and the vehicle's, found from the motion that both saw.
+"""Time offset between a dive's clock and the vehicle's, from the motion seen by both, or from UTC.
 
 The net stands still: when the vehicle turns right, the net's far normal turns left in the dome's
 frame, and when its nose rises, the normal falls. So posture yaw changes opposite to heading, and
-posture pitch opposite to the vehicle's pitch. Rates are compared, between about 0.03 and 0.5 Hz:
-the bearing of the net itself, which changes as the vehicle moves along a cage, and the compass's
-drift are slower.
+posture pitch opposite to the vehicle's pitch. `find_time_offset` compares rates between about 0.03
+and 0.5 Hz: the bearing of the net itself, which changes as the vehicle moves along a cage, and the
+compass's drift are slower.
 
-The offset that clocks give: the log's UTC against the time that a video's container states.
+`offset_from_clocks` compares the log's UTC with the time that a video's container states.
 """
 
 import datetime

@@ -1,19 +1,17 @@
-"""MAVLink telemetry logs (`.tlog`), as ground stations write them.
+"""MAVLink telemetry logs (`.tlog`) of ground stations: signals, choice of the depth, and the clock.
 
-Which message is read for what, and why:
+Messages read for each signal, with reasons:
 
-- attitude and heading: `ATTITUDE`, which carries the autopilot's time and comes fastest. Where it
-  is missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then `VFR_HUD` (whole
-  ones).
+- attitude and heading: `ATTITUDE`, which carries the autopilot's time and comes at the highest
+  rate. Where it is missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then
+  `VFR_HUD` (whole degrees).
 - depth: `GLOBAL_POSITION_INT.relative_alt`, height above home, which ArduSub puts at the surface.
   `VFR_HUD.alt` is above mean sea level and 0 without a home; `AHRS2.altitude` comes from the spare
-  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, tells changes only: what the
-  pressure was at the surface, the log does not say.
+  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, shows changes only, because the
+  log does not contain the pressure at the surface. `choose_depth` takes the first that moves.
 - velocity: `LOCAL_POSITION_NED`, then `GLOBAL_POSITION_INT` in cm/s.
 
-Which of several depths in a log to believe.
-
-One clock for a telemetry log: the autopilot's, through reboots, with its place in UTC.
+`TelemetryClock` puts all messages on the autopilot's clock, through reboots, and places it in UTC.
 """
 
 import datetime

@@ -1,8 +1,8 @@
-"""What a vehicle wrote down of its own motion during a dive.
+"""A vehicle's log of its own motion: signals over time, and places on the net that were seen.
 
-One quantity over time, as a vehicle logged it.
-
-Where on the net the dive was looking: depth, heading and the net's bearing for dive times.
+- `VehicleLog`: all signals on one clock, and what is wrong with the file.
+- `Signal`: one quantity with its own time stamps, interpolated except across gaps.
+- `Places`: depth, heading and the net's bearing at dive times.
 """
 
 import math

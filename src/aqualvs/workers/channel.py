@@ -1,10 +1,8 @@
-"""How messages pass between the process that writes and those that measure.
+"""Messages between the writing process and the measuring processes: pipe and shared memory.
 
-Points are laid down in memory that both see, and the pipe between them only tells of it: a pipe
-holds less than the points of a few frames, so that both processes would be woken a dozen times for
-a block of them.
-
-What the processes of a crew send: blocks of measured frames, and how their parts ended.
+Messages are blocks of measured frames, and the `Ended` of each part. The points go into shared
+memory and the pipe only announces them: a pipe holds less than the points of a few frames, so that
+both processes would be woken a dozen times for each block.
 """
 
 import math

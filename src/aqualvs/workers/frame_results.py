@@ -1,8 +1,9 @@
-"""From frames to what a run writes of them, a few frames at a time.
+"""Results of frames, a few frames at a time: measurement with and without the dome, in blocks.
 
-What ignoring the dome costs: the same stripe points, triangulated as if by a bare lens.
-
-Blocks of consecutive frames, and a thread that reads them ahead.
+- `Meter`: measures blocks of consecutive frames.
+- `BareLensComparison`: the posture from the same stripe points, triangulated as if by a bare lens:
+  the error of ignoring the dome.
+- `in_blocks`, `read_ahead`: blocks of frames, and a thread that reads them ahead.
 """
 
 import contextlib

@@ -1,8 +1,7 @@
-"""Processes that measure a dive together, each some parts of it; what they find comes in order.
+"""A pool of processes that measure parts of a dive; results are yielded in the order of the dive.
 
-What the processes of a crew do: each measures parts of a dive by themselves.
-
-Which runs several processes can share, and how.
+`crew_work` decides whether and how processes can share a run; `Crew` begins them and collects their
+results; `serve` is the loop of each process.
 """
 
 import contextlib

@@ -1,6 +1,7 @@
 """A recording as the source of a run: its stripes are measured again, bit for bit.
 
-What reads recordings is imported where it is used: every run reads this module, few replay one.
+Modules that read recordings are imported where they are used, because every run imports this module
+and few replay a recording.
 """
 
 from collections.abc import Iterator, Set

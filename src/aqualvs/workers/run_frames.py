@@ -1,6 +1,6 @@
-"""What a run finds in the frames of a dive, by one process or by several.
+"""Results for the frames of a run, measured by one process or by several.
 
-The frames of a run: those of its window, and scans that stand for lost ones.
+Frames are those of the run's window; scans with a refusal stand for lost frames (`with_losses`).
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""How processes that measure begin; light to import."""
+"""Start methods of the measuring processes; light to import."""
 
 import contextlib
 import multiprocessing

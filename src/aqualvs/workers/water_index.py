@@ -1,6 +1,7 @@
-"""Following the water's index during a run, by a target on the vehicle (paper, 2.2).
+"""Tracking of the water's refractive index during a run, by a target on the vehicle (paper, 2.2).
 
-What calibrates is imported where it is used: every run reads this module, few follow the water.
+Calibration modules are imported where they are used, because every run imports this module and few
+track the water.
 """
 
 from pathlib import Path

@@ -1,8 +1,8 @@
-"""Who may see the pilot's page, and who may command from it.
+"""Access to the pilot's page: rules for viewing and commanding, limits, and checked commands.
 
-What the page may ask for: messages checked by type and size, and what they do.
-
-Limits on connections and on wrong tokens.
+Messages of a page are checked by type and size (`parse_message`) and carried out (`Controls`).
+`ConnectionLimits` bounds the connections that wait for a greeting; `TokenGate` checks one token at
+a time.
 """
 
 import asyncio

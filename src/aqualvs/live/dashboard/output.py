@@ -1,8 +1,7 @@
-"""The pilot's page as an output of a live run.
+"""The pilot's page as an output of a live run, and the start of its server.
 
-The camera's picture for the page: small, and cheap to make.
-
-From an address to the pilot's page, ready to be opened.
+The camera's picture is reduced for the page (`page_picture`), so that it is small and cheap to
+make.
 """
 
 import time

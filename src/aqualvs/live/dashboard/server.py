@@ -1,8 +1,6 @@
-"""The page's web server, in a thread of its own.
+"""The web server of the pilot's page, in a thread of its own, and the state that it sends as JSON.
 
-From a sample to what the page shows, as JSON.
-
-Hands the latest state and picture to every page that is open; slow pages skip some.
+`Hub` hands the latest state and picture to every open page; slow pages skip some.
 """
 
 import asyncio

@@ -1,20 +1,19 @@
-"""ArduSub by MAVLink: what it tells of itself, and our efforts to it.
+"""Link to a vehicle with ArduSub by MAVLink: its state, its pilot's sticks, and our efforts.
 
-Never arms or disarms, never changes the mode, never presses a button: what goes out is
-`MANUAL_CONTROL` with no button pressed, or a speed in GUIDED, and nothing else.
+The link never arms or disarms, never changes the mode and never presses a button: it sends only
+`MANUAL_CONTROL` without buttons, or a speed in GUIDED.
 
-Whether the pilot moves his sticks, as far as an onboard computer can see it.
-
-Two ways, for no one of them works everywhere:
+`PilotSticks` detects movements of the pilot's sticks, as far as an onboard computer can see them,
+from two messages, because neither arrives everywhere:
 
 - `MANUAL_CONTROL` of the ground station, where the router passes it on. The message's `target` is
   no target field to MAVLink's routing tables, so mavlink-router and ArduPilot's own routing treat
   it as broadcast.
-- `RC_CHANNELS` of the vehicle: what all senders together made of the stick channels. Ours are among
-  them, scaled by a pilot gain that is not told; whatever lies outside of what we sent in the last
-  second is the pilot's.
+- `RC_CHANNELS` of the vehicle: the stick channels that result from all senders together. Ours are
+  among them, scaled by a pilot gain that is not reported; values outside of what we sent in the
+  last second are the pilot's.
 
-Depth as ArduSub tells it, from the best message that there is.
+`DepthChoice` reads the depth from the best message available.
 """
 
 import contextlib

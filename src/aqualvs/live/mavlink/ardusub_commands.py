@@ -1,10 +1,9 @@
-"""What ArduSub is told: efforts as stick positions, or as speeds over the ground in GUIDED.
+"""Commands to ArduSub: efforts as stick positions, or as speeds over the ground in GUIDED.
 
-Whether the vehicle does what our sticks say, as far as it tells.
-
-ArduSub drops sticks of others than its ground station without a word, and answers nothing to those
-that it takes. What it makes of them shows in `RC_CHANNELS`: 400 us times the pilot gain for a full
-stick (joystick.cpp). Where no channels are told, a yaw stick must turn it.
+`StickResponse` checks whether the vehicle follows our sticks. ArduSub silently ignores sticks of
+senders other than its ground station, and does not acknowledge those that it accepts. Their effect
+shows in `RC_CHANNELS`: 400 us times the pilot gain for a full stick (joystick.cpp). Where no
+channels are reported, a yaw stick must turn the vehicle.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What ArduSub is set to, what that means for us, and what to set instead.
+"""ArduSub's parameters: what their values mean for us, and advice on what to set instead.
 
 Names and meanings are those of ArduSub's `Parameters.cpp`, `GCS.cpp` (MAV_), and
 `AP_RangeFinder_Params.cpp` (RNGFND1_); the second name is that of releases before 4.7.

@@ -1,4 +1,4 @@
-"""One MAVLink connection, kept alive: shared by all that talk to the autopilot."""
+"""A persistent MAVLink connection, shared by everything that talks to the autopilot."""
 
 import contextlib
 import importlib

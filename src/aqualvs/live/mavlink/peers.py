@@ -1,13 +1,12 @@
-"""Who speaks on a MAVLink connection, and which of them is the vehicle.
+"""Senders on a MAVLink connection: identification of the vehicle, and message signing.
 
-Anybody in the network may send to an open port. So senders are kept apart by their address: each
-has a parser of its own, and each system id belongs to the address where it was heard first, until
-nothing has come from there for a while. Nobody else can speak as the vehicle, or receive what is
-meant for it.
+Anybody in the network may send to an open port. So `PeerTable` keeps senders apart by their
+address: each has a parser of its own, and each system id belongs to the address where it was heard
+first, until that address has been silent for a while. Nobody else can speak as the vehicle, or
+receive its messages.
 
-MAVLink 2 signing by pymavlink: who does not have the key is not heard.
-
-https://mavlink.io/en/guide/message_signing.html
+`Signer` signs messages by MAVLink 2 with pymavlink, and ignores senders without the key
+(https://mavlink.io/en/guide/message_signing.html).
 """
 
 import hashlib

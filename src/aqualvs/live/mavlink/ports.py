@@ -1,8 +1,7 @@
-"""Ways to a MAVLink peer: UDP, TCP and serial ports that never wait.
+"""Addresses and ports of MAVLink peers: UDP, TCP and serial lines, all non-blocking.
 
-Where a MAVLink peer is, as pilots write it.
-
-A serial port by the system's own calls; POSIX only.
+Addresses have the forms that pymavlink and ground stations use (`parse_address`). The serial port
+uses system calls of POSIX only.
 """
 
 import errno

@@ -1,4 +1,4 @@
-"""What every output of a live run offers."""
+"""Interface of all outputs of a live run."""
 
 from typing import Protocol
 

@@ -1,9 +1,8 @@
-"""To ROS 2 without ROS: a publisher by Cyclone DDS that its subscribers take for one of theirs.
+"""ROS 2 topics without ROS: a publisher by Cyclone DDS, compatible with subscribers of ROS 2.
 
-The ROS 2 messages that are published, as types of Cyclone DDS.
-
-Names of the types, names, order and types of their members are those that ROS 2 uses (plain CDR,
-all types final), so that its subscribers match and read them.
+The messages are types of Cyclone DDS. Names of the types, and names, order and types of their
+members are those that ROS 2 uses (plain CDR, all types final), so that its subscribers match and
+read them.
 """
 
 import functools

@@ -1,9 +1,8 @@
 """Foxglove live: a WebSocket server that Foxglove connects to (extra `foxglove`).
 
-Topics and messages are those of a recording (`aqualvs.recording.encoding`), so that one
-layout shows both; frames and scene come in addition. Nothing is made that nobody watches.
-
-What Foxglove's 3D panel shows beside the points: frames, target plane, laser lines.
+Topics and messages are those of a recording (`aqualvs.recording.encoding`), so that one layout
+shows both. In addition there are coordinate frames and a scene for the 3D panel: target plane and
+laser lines beside the points. Messages that nobody watches are not made.
 """
 
 import math

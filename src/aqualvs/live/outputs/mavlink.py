@@ -1,4 +1,4 @@
-"""Posture to the autopilot and the pilot's station by MAVLink."""
+"""Posture to the autopilot and to the pilot's station by MAVLink."""
 
 import math
 from typing import Any

@@ -1,10 +1,9 @@
-"""To ROS 1: posture, range, cloud and diagnostics as topics of a node.
+"""ROS 1 output: posture, range, cloud and diagnostics as topics of a node in plain Python.
 
-A ROS 1 node in plain Python: known to roscore, found by subscribers.
-
-`rospy` would tie us to the Python of a ROS release (3.8 on Noetic), waits for roscore without end
-when it starts, never comes back when roscore was restarted, and can be started once in a process.
-What a publisher needs of the protocol is little (http://wiki.ros.org/ROS/Slave_API, Master_API).
+The node registers with roscore and serves its subscribers itself. `rospy` would tie us to the
+Python of a ROS release (3.8 on Noetic), waits for roscore without end when it starts, never
+reconnects after roscore was restarted, and can be started once in a process. The protocol of a
+publisher is small (http://wiki.ros.org/ROS/Slave_API, Master_API).
 """
 
 import http.client

@@ -1,13 +1,11 @@
-"""Connections of ROS 1 subscribers (TCPROS), all served by one thread.
+"""Messages of ROS 1 and connections to its subscribers (TCPROS), all served by one thread.
 
-A subscriber opens a connection for one topic, says who it is and what it expects in a header of
-`key=value` fields, gets one in return, and then messages, each behind its length
-(http://wiki.ros.org/ROS/TCPROS).
+A subscriber opens a connection for one topic, states its name and the type that it expects in a
+header of `key=value` fields, gets such a header in return, and then messages, each behind its
+length (http://wiki.ros.org/ROS/TCPROS).
 
-Messages as ROS 1 has them on the wire: definitions, checksums, bytes.
-
-Little endian and without padding; a string or list follows its length
-(http://wiki.ros.org/ROS/Connection%20Header and msg).
+Messages have definitions and checksums; their bytes are little-endian without padding, and a string
+or list follows its length (http://wiki.ros.org/ROS/Connection%20Header and msg).
 """
 
 import contextlib

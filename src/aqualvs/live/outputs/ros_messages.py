@@ -1,8 +1,6 @@
-"""What ROS is told, before it takes the form of ROS 1, of ROS 2 or of DDS.
+"""ROS messages before encoding for ROS 1, ROS 2 or DDS: pose, range, cloud and diagnostics.
 
-Frames and signs: forward, left, up at the dome's centre.
-
-From the dome's axes to those of ROS and MAVLink, and the target's plane as a ROS pose.
+Vectors of the dome are converted to the axes of ROS and MAVLink, all at the dome's centre:
 
 =======  =======  =======  ====  ================================
 frame    x        y        z     used by
@@ -12,7 +10,8 @@ FLU      forward  left     up    ROS (REP-103), Foxglove
 FRD      forward  right    down  MAVLink
 =======  =======  =======  ====  ================================
 
-Health as ROS's diagnostics: one status for each part, with figures.
+Messages are in FLU. `plane_pose` gives the target's plane as a ROS pose. Health becomes ROS
+diagnostics, one status with figures for each part of the run.
 """
 
 import math

@@ -1,7 +1,4 @@
-"""Posture as one line of JSON in a datagram, for whatever can read that.
-
-A live sample as one line of JSON.
-"""
+"""Posture as one line of JSON in a UDP datagram."""
 
 import errno
 import json
