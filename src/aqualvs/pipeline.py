@@ -53,7 +53,7 @@ def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunResult:
-    """How a run went.
+    """Result of a run.
 
     Attributes
     ----------

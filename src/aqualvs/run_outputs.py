@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 
 class RunNet:
-    """Evaluates the net as the frames come; does nothing where nobody asked.
+    """Evaluation of the net as the frames come; does nothing if not requested.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ MeasuredFrame = tuple[Rig, Scan, dict[SearchAxis, Returns]]
 
 
 class RunMcap(Closing):
-    """Writes `dive.mcap` while a run goes on, or does nothing; a context manager.
+    """Writer of `dive.mcap` during a run, or of nothing; a context manager.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class RunMcap(Closing):
 
 
 class _RecordedScanner:
-    """Measures as another scanner does, and records what it finds."""
+    """Scanner that measures as another one does, and records the results."""
 
     def __init__(self, mcap: RunMcap, scanner: ScansFrames) -> None:
         self._mcap, self._scanner = mcap, scanner
@@ -223,7 +223,7 @@ _FPS_WITHOUT_CLOCK = 25.0
 
 
 class RunOverlay(Closing):
-    """Writes `overlay.mp4` while a run goes on, or does nothing; a context manager.
+    """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ class RunOverlay(Closing):
 
 
 class RunBareLens(Closing):
-    """Writes `posture_bare.csv` while a run goes on, or does nothing for a rig without a dome.
+    """Writer of `posture_bare.csv` during a run; of nothing for a rig without a dome.
 
     Parameters
     ----------

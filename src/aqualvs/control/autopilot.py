@@ -35,7 +35,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What one step came to.
+    """Result of one step.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Decision:
 
 
 class NetPilot:
-    """Holds and follows by what the lasers see.
+    """Autopilot that holds and follows by the measured posture.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def _mission_says(guidance: Guidance) -> Reason | None:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What the controller takes; rates are None where no filter knows them."""
+    """Input of the controller; rates are None where no filter knows them."""
 
     range: float
     yaw: float

@@ -220,7 +220,7 @@ _FIRST_STEP_S = 0.04
 
 
 class SwellFilter:
-    """Passes what swings with about one period, and little else.
+    """Band-pass filter about one period, that of the swell.
 
     In parallel to a proportional gain it raises the loop's gain about that period alone (internal
     model principle; Francis and Wonham 1976, doi:10.1016/0005-1098(76)90006-6):
@@ -268,7 +268,7 @@ class SwellFilter:
 
 
 class Ramp:
-    """Follows a goal with bounded speed and acceleration, and stops on it.
+    """Setpoint that follows a goal with bounded speed and acceleration, and stops on it.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ class Ramp:
 
 
 class QuietZone:
-    """Leaves small turning rates out, so that the vehicle's own heading hold has its say.
+    """Suppression of small turning rates, so that the vehicle's own heading hold can act.
 
     From rest a rate must exceed `quiet`; one that has begun ends when it changes its sign.
 
@@ -348,7 +348,7 @@ _FORGETS_S = 1.0
 
 
 class RangeYawController:
-    """Efforts for a range, a yaw and a speed along the target.
+    """Controller of range, yaw and speed along the target, by efforts.
 
     A cascade for the range: its error asks for a closing speed, the speed's error for an
     acceleration; the integral is the force that current, tether and trim take. Drag is put in

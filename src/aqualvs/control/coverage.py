@@ -20,7 +20,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 
 
 class Across(StrEnum):
-    """What counts along the net."""
+    """Quantity of the map's horizontal axis."""
 
     BEARING = "bearing"
     """Of the net's far normal, in radians."""
@@ -30,7 +30,7 @@ class Across(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageOptions:
-    """How fine the map is.
+    """Resolution of the map, and the size of the field of view.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class CoverageOptions:
 
 @dataclass(frozen=True, slots=True)
 class CoverageMap:
-    """What has been seen.
+    """Map of what has been seen.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class CoverageMap:
 
 
 class Coverage:
-    """Gathers what a dive sees.
+    """Builder of the coverage map, step by step.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ empty."""
 
 
 class FollowLog:
-    """Writes the log, row by row.
+    """Writer of the log, row by row.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from aqualvs.errors import OptionError
 
 
 class Layout(StrEnum):
-    """How the level thrusters stand."""
+    """Arrangement of the horizontal thrusters."""
 
     VECTORED = "vectored"
     """Askew, in two pairs: one does forward plus right, the other forward minus right."""
@@ -120,7 +120,7 @@ class ThrustMap:
 
 
 class DeadBandCrossing:
-    """Efforts of one pair of thrusters: its dead band is crossed once, with hysteresis.
+    """Effort of one pair of thrusters, whose dead band is crossed once, with hysteresis.
 
     Where the thrust asked for changes its sign, the effort waits at the edge of the dead band, with
     the thrusters about to start, until the impulse that it owes is great, or the thrust is. What
@@ -206,7 +206,7 @@ class Drag:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleFacts:
-    """What is taken for granted of a vehicle.
+    """Assumed properties of a vehicle.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ class VehicleFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeGains:
-    """Of the cascade that holds the range.
+    """Gains of the cascade that holds the range.
 
     Attributes
     ----------
@@ -313,7 +313,7 @@ class RangeGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class YawGains:
-    """Of the loop that holds the yaw.
+    """Gains of the loop that holds the yaw.
 
     Attributes
     ----------

@@ -16,7 +16,7 @@ from aqualvs.scanning.posture import Posture
 
 
 class Stage(StrEnum):
-    """Where a mission is; the value is what logs say in `stage`."""
+    """Stage of a mission; the value is what logs write in `stage`."""
 
     IDLE = "idle"
     """Nobody steers."""
@@ -43,7 +43,7 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guidance:
-    """What a mission wants now.
+    """Present request of a mission.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Mission(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossOptions:
-    """What to do without the target.
+    """Behaviour without the target.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class LossOptions:
 
 
 class LossWatch:
-    """Tells whether the target is there, waited for, or gone.
+    """State of the target: present, waited for, or lost.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LegOptions:
-    """How far one goes along the net before turning round or ending; whichever comes first.
+    """End of a leg along the net: time, distance or sector, whichever comes first.
 
     Attributes
     ----------
@@ -378,7 +378,7 @@ _DEPTH_STEADY_S = 1.0
 
 
 class Turn(StrEnum):
-    """What happens at the end of a leg."""
+    """Action at the end of a leg."""
 
     BACK = "back"
     """The next leg goes the other way: a part of a net."""

@@ -90,7 +90,7 @@ class PlanFile(Part):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a plan file says.
+    """Contents of a plan file.
 
     Attributes
     ----------

@@ -102,7 +102,7 @@ _REFUSED_MODES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
-    """Where the gate steps in.
+    """Limits at which the gate intervenes.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class SafetyLimits:
 
 
 class SafetyGate:
-    """Lets efforts pass, changes them or stops them; pure, all time comes from outside.
+    """Gate that passes, changes or stops efforts; pure, all time comes from outside.
 
     It starts disengaged.
 
@@ -356,7 +356,7 @@ _GREATEST_TURN = math.radians(20.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerLimits:
-    """What counts as no answer.
+    """Limits beyond which a posture counts as not responding.
 
     Attributes
     ----------
@@ -412,7 +412,7 @@ class _Moment(NamedTuple):
 
 
 class AnswerWatch:
-    """Looks for postures that do not answer.
+    """Detector of postures that do not respond to efforts.
 
     `Reason.FROZEN` while postures repeat to the bit, or their noise has all but vanished: a picture
     that stands still. `Reason.NO_ANSWER` where the efforts must have brought the vehicle nearer, or
@@ -545,7 +545,7 @@ def _swing(values: list[float]) -> float:
 
 
 class _Noise:
-    """Compares the noise of the last postures with what it usually is."""
+    """Comparison of the noise of the last postures with the usual noise."""
 
     def __init__(self, quiet: float) -> None:
         self._quiet = quiet * quiet

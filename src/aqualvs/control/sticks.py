@@ -68,7 +68,7 @@ class StickChannel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickShaping:
-    """What ArduSub makes of sticks; the defaults are its own.
+    """ArduSub's conversion of sticks; the defaults are its own.
 
     Attributes
     ----------

@@ -53,7 +53,7 @@ class FilteredPosture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureFilterOptions:
-    """How the vehicle moves, and what the filter believes.
+    """Motion model and gate of the filter.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ class _Track:
 
 
 class _Motion:
-    """How a track moves on and takes measurements in."""
+    """Motion model: forecast of a track, and its update by measurements."""
 
     def __init__(self, options: PostureFilterOptions) -> None:
         accelerations = (

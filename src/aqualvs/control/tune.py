@@ -112,7 +112,7 @@ def _thrust_map(model: VehicleModel) -> ThrustMap:
 
 @dataclass(frozen=True, slots=True)
 class Turning:
-    """How late a vehicle's own autopilot follows a turning rate, in seconds.
+    """Lag of a vehicle's own autopilot behind a turning rate, in seconds.
 
     The shaping of the stick, the thrusters' lag, and the rate loop: inertia over the moment that it
     gives for a rate.
@@ -188,7 +188,7 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Of one loop.
+    """Stability margins of one loop.
 
     Attributes
     ----------
@@ -275,7 +275,7 @@ _LEAST_USABLE_MODULUS = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneOptions:
-    """What the loops must stand.
+    """Conditions under which the loops must stay stable.
 
     Attributes
     ----------
@@ -338,7 +338,7 @@ class TuneOptions:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """What tuning came to.
+    """Result of tuning.
 
     Attributes
     ----------

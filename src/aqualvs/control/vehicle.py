@@ -82,7 +82,7 @@ class SetpointHolder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """What a pilot's sticks would ask for, -1 to 1: what ArduSub's depth hold takes.
+    """Effort as by a pilot's sticks, -1 to 1, as ArduSub's depth hold takes it.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ NEUTRAL = Effort()
 
 
 class Mode(StrEnum):
-    """Who steers; what the pilot has chosen on the vehicle."""
+    """Flight mode that the pilot has chosen on the vehicle: who steers."""
 
     OURS = "ours"
     """A mode in which the vehicle takes our efforts (depth hold: it keeps its own depth)."""
@@ -124,7 +124,7 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """What a vehicle tells of itself; None where it does not, or has not of late.
+    """State as the vehicle reports it; None where it does not, or not recently.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class VehicleState:
 
 
 class VehicleLink(Protocol):
-    """Commands a vehicle and hears from it; never arms it, never changes its mode."""
+    """Interface to command a vehicle and read its state; never arms it or changes its mode."""
 
     @property
     def name(self) -> str:

@@ -161,7 +161,7 @@ CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """Runs of one vehicle.
+    """Trials of one vehicle.
 
     Parameters
     ----------

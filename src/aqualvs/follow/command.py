@@ -49,7 +49,7 @@ _N_SHARE = 50
 
 
 class LoopPage:
-    """Shows a loop step by step, and lets it run no faster than the clock.
+    """Page that shows a loop step by step, in real time at most.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aim:
-    """What the loop shall do: a plan file, or a range and yaw to hold.
+    """Aim of the loop: a plan file, or a range and yaw to hold.
 
     Attributes
     ----------
@@ -243,7 +243,7 @@ _DEFAULT_RANGE = 0.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimRequest:
-    """What to simulate.
+    """Request for a simulation.
 
     Attributes
     ----------

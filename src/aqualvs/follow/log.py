@@ -166,7 +166,7 @@ _GROWS, _GROWS_BY = 2.0, 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoldMeasures:
-    """Of a stretch with a constant setpoint.
+    """Measures of a period with a constant setpoint.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ class StepMeasures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffortMeasures:
-    """How often an effort turns round: thrusters wear by it, and shake the camera.
+    """Rate of an effort's reversals, which wear thrusters and shake the camera.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ JUMP = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyMeasures:
-    """Of a whole run.
+    """Safety measures of a whole run.
 
     Attributes
     ----------

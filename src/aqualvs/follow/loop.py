@@ -29,7 +29,7 @@ _TELLS_HZ = 10.0
 
 
 class SimulatedLink:
-    """Commands a simulated vehicle and hears from it, in its own time.
+    """Link to a simulated vehicle, in its own time.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ OnStep: TypeAlias = Callable[[float, float, Posture | Refusal, Decision, Vehicle
 
 
 class Eye(Protocol):
-    """Measures the net's posture from a vehicle."""
+    """Interface of a sensor that measures the net's posture from a vehicle."""
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
         """Return what the frame exposed now gives; None where there is no frame at all."""
@@ -104,7 +104,7 @@ class Eye(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """When frames come.
+    """Timing of the frames.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class _Arrival(NamedTuple):
 
 @dataclass(slots=True)
 class _Sight:
-    """What is known of the stream, as the live run and the pilot's watchdog know it."""
+    """State of the stream, as the live run and the pilot's watchdog know it."""
 
     patience_s: float
     coming: deque[_Arrival] = field(default_factory=deque)

@@ -73,7 +73,7 @@ class RandomDive:
 
 @dataclass(frozen=True, slots=True)
 class DiveResult:
-    """What one dive came to; `hold` counts from 10 s on, or the second half of a shorter one."""
+    """Result of one dive; `hold` counts from 10 s on, or the second half of a shorter one."""
 
     seed: int
     safety: SafetyMeasures
@@ -82,7 +82,7 @@ class DiveResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """How widely dives are drawn.
+    """Widths of the distributions that dives are drawn from.
 
     Attributes
     ----------

@@ -187,7 +187,7 @@ SETTLED_S = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:
-    """What was simulated, in the words of the page."""
+    """Setup of the simulation, as text of the page."""
 
     vehicle: str
     current: float

@@ -35,7 +35,7 @@ def net_scene(seed: int = 0) -> Scene:
 
 
 class RenderedEye:
-    """Renders what the camera sees from a vehicle, and measures in it.
+    """Sensor that renders the camera's picture from a vehicle, and measures in it.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ _GREATEST_ANGLE = math.radians(60.0)
 
 
 class Loss(StrEnum):
-    """How sight is lost."""
+    """Kind of loss of sight."""
 
     TARGET = "target"
     """Frames come, but nothing is measured in them."""
@@ -157,7 +157,7 @@ class PostureNoise:
 
 
 class SampledEye:
-    """Gives the true posture with noise.
+    """Sensor that gives the true posture with noise.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ _BAND = 0.05
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """What is tried.
+    """Options of the simulated step.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class StepOptions:
 
 @dataclass(frozen=True, slots=True)
 class StepAnswer:
-    """What came of it.
+    """Response to the step.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneRequest:
-    """What the command line asks for.
+    """Request of the command line.
 
     Attributes
     ----------

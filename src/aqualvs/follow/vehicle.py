@@ -43,7 +43,7 @@ _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 
 
 class FollowLogOutput:
-    """Writes what the pilot did, step by step; comes after the pilot among the outputs.
+    """Writer of the pilot's steps; comes after the pilot among the outputs.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class FollowLogOutput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FollowRequest:
-    """What to steer, and by what.
+    """Request to steer a vehicle.
 
     Attributes
     ----------

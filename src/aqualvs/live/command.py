@@ -38,7 +38,7 @@ _PATIENCE_S = 3.0
 
 
 class WaterFollower:
-    """Supplies the scanner for the water as it is known, from a thread that reads the target.
+    """Provider of the scanner for the present water; a thread reads the target.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ SWITCH_S = 0.0005
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeedRequest:
-    """How the source shall deliver, where it has a choice; see `open_feed`.
+    """Request for the delivery of a source, where it has a choice; see `open_feed`.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ def _size_px(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveRequest:
-    """What to run live.
+    """Request for a live run.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ _GAP_S = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrozenOptions:
-    """When a picture counts as frozen.
+    """Thresholds by which a picture counts as frozen.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class FrozenOptions:
 
 
 class FrozenPicture:
-    """Compares each picture of a stream with one a quarter of a second older.
+    """Detector of frozen pictures: compares each with one a quarter of a second older.
 
     The statistic is the 99 % quantile, over cells of 8 x 8 pixels in a quarter of the rows, of how
     much a cell's mean luma has changed. Means tell motion, and noise of the sensor, from what an
@@ -184,7 +184,7 @@ _VERDICT_EVERY_S, _PATIENCE_S = 5.0, 3.0
 
 
 class DriftWatch:
-    """Judges the lasers every few seconds, in a thread of its own.
+    """Detector of lasers that moved: tests every few seconds, in a thread of its own.
 
     Parameters
     ----------
@@ -262,7 +262,7 @@ _DARK_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class _Passed:
-    """What is kept of one frame."""
+    """Figures kept of one frame."""
 
     at_ns: int
     valid: bool
@@ -271,7 +271,7 @@ class _Passed:
 
 
 class HealthMonitor:
-    """Gathers figures frame by frame; `health` is cheap.
+    """Health statistics, gathered frame by frame; `health` is cheap.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class VehicleFile(Part):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleSetup:
-    """What a vehicle file says.
+    """Contents of a vehicle file.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputRequest:
-    """Which outputs a live run has; all are off by default.
+    """Request for outputs of a live run; all are off by default.
 
     Attributes
     ----------

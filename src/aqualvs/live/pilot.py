@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """Passes efforts on, and sends neutral after one that nobody renews.
+    """Watchdog of efforts: passes them on, and sends neutral after one that is not renewed.
 
     Neither a frame that takes seconds to measure nor a controller that hangs must leave thrust
     standing; the vehicle's own fail-safe comes later, and does not act while others send it sticks.
@@ -184,7 +184,7 @@ _GOODBYES, _GOODBYES_TO_STICKS = 3, 1
 
 
 class Pilot:
-    """Steers a vehicle by what the lasers see, as an output of a live run.
+    """Output of a live run that steers a vehicle by the measured posture.
 
     It starts disengaged and sends nothing. `engage` lets efforts pass; a mode change, the pilot's
     sticks, disarming and a silent vehicle end that until `engage` is called again. Then neutral

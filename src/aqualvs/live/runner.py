@@ -78,7 +78,7 @@ _log = logging.getLogger(__name__)
 
 
 class OutputWorker:
-    """Hands samples to an output, in a thread of its own unless the output never waits.
+    """Worker of one output: a thread of its own, unless the output never waits.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ _AGAIN_S = 1.0
 
 
 class FrameReader:
-    """Reads a feed in a thread of its own; a context manager.
+    """Reader of a feed in a thread of its own; a context manager.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ _SILENT_EVERY_S, _LOOK_EVERY_S, _HEALTH_EVERY_S = 0.1, 0.05, 0.1
 
 
 class ScannerSupply(Protocol):
-    """Gives the scanner to measure with; another one as the water's index is followed."""
+    """Provider of the scanner, which changes as the water's index is tracked."""
 
     @property
     def scanner(self) -> Scanner:
@@ -338,7 +338,7 @@ class ScannerSupply(Protocol):
 
 
 class FixedScanner:
-    """Always the same scanner.
+    """Provider of always the same scanner.
 
     Parameters
     ----------
@@ -358,7 +358,7 @@ class FixedScanner:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
-    """How the loop runs.
+    """Options of the live loop.
 
     Attributes
     ----------
@@ -376,7 +376,7 @@ class LiveOptions:
 
 
 class LiveRunner:
-    """Measures a feed as it comes and hands the answers on.
+    """Live loop: measures a feed as it comes and passes the results to the outputs.
 
     Parameters
     ----------

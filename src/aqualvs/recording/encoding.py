@@ -43,7 +43,7 @@ _PNG = [
 
 
 class PictureFormat(StrEnum):
-    """How pictures are kept."""
+    """Format of recorded pictures."""
 
     JPEG = "jpeg"
     PNG = "png"
@@ -208,7 +208,7 @@ _NS = 1_000_000_000
 
 
 class CdrWriter:
-    """Puts values together, in the order of the message's fields."""
+    """Writer of a CDR message, field by field in their order."""
 
     def __init__(self) -> None:
         self._content = bytearray(_HEAD)
@@ -253,7 +253,7 @@ class CdrWriter:
 
 
 class CdrReader:
-    """Takes a message apart, in the order of its fields.
+    """Reader of a CDR message, field by field in their order.
 
     Parameters
     ----------

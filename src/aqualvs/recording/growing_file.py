@@ -84,7 +84,7 @@ class Chunk:
 
 
 class ChunkBuilder:
-    """Gathers messages; `seal` compresses them."""
+    """Builder of a chunk: gathers messages; `seal` compresses them."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []

@@ -268,7 +268,7 @@ _RIG_AGAIN_NS, _RIG_EVERY_NS = 1_000_000_000, 60_000_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecorderOptions:
-    """What is recorded, and how safely.
+    """Options of a recording: its contents, and how often it is written.
 
     Attributes
     ----------
@@ -307,7 +307,7 @@ class RecorderOptions:
 
 
 class SampleEncoder:
-    """Makes the messages of each sample.
+    """Encoder of samples as messages.
 
     Parameters
     ----------
@@ -383,7 +383,7 @@ class SampleEncoder:
 
 
 class RecordClock:
-    """Gives every sample a time that rises, whatever the system's clock does.
+    """Clock of a recording: its times rise, whatever the system's clock does.
 
     That of the first sample is the system's; from there on the monotonic clock counts.
 

@@ -27,7 +27,7 @@ MAX_CHUNK_BYTES = 4 << 20
 
 
 class SampleChunks:
-    """Gathers the messages of samples in a chunk until it is due.
+    """Chunk under construction: gathers the messages of samples until it is due.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class SampleChunks:
 
 
 class Recording:
-    """Writes samples to a file that is readable at any time.
+    """Writer of samples to a file that is readable at any time.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ _PATIENCE_S = 4.0
 
 
 class Recorder:
-    """Writes samples to a file that is readable at any time, by a thread of its own.
+    """Writer of samples by a thread of its own, to a file that is readable at any time.
 
     Parameters
     ----------

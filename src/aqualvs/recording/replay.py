@@ -26,7 +26,7 @@ from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """What a recording holds of a frame.
+    """Frame as a recording holds it.
 
     Attributes
     ----------

@@ -12,7 +12,7 @@ from aqualvs.sources.base import Health
 
 @dataclass(frozen=True, slots=True)
 class Instants:
-    """When a frame passed the stages, by `time.monotonic_ns`.
+    """Times at which a frame passed the stages, by `time.monotonic_ns`.
 
     Attributes
     ----------

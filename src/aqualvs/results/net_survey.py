@@ -53,7 +53,7 @@ _NET_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class NetResult:
-    """What was found of a net and written.
+    """Result of a net's evaluation, as written to its files.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class NetResult:
 
 
 class NetPass:
-    """Takes a dive's scans in turn, and writes what they say of the net.
+    """Evaluation of a dive's net, scan by scan, and the writer of its files.
 
     Parameters
     ----------

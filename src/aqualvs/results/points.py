@@ -195,7 +195,7 @@ _VERTEX = np.dtype(
 
 
 class PointsExport:
-    """Writes `points.parquet` and `points.ply`; both appear whole, at the end, or not at all.
+    """Writer of `points.parquet` and `points.ply`; both appear whole at the end, or not at all.
 
     Rows are gathered to groups of always the same size, which a thread of its own writes: the files
     do not depend on how the points come, and memory does not grow with their number.

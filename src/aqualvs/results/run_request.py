@@ -36,7 +36,7 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "av")
 
 
 class Status(StrEnum):
-    """How a run stands; the value is what `run.yaml` says in `status`."""
+    """Status of a run, as `run.yaml` states it in `status`."""
 
     RUNNING = "running"
     """Under way, or killed before it could say otherwise."""
@@ -137,7 +137,7 @@ _INDEX_LIMITS = (1.0, 1.5)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Water:
-    """What the user says about the medium; all None leaves the rig's own index.
+    """Medium as stated by the user; all None leaves the rig's own index.
 
     Attributes
     ----------
@@ -206,7 +206,7 @@ class FrameWindow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunRequest:
-    """What to run.
+    """Request for a run: its inputs, outputs and options.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthComparison:
-    """How far the postures of a run are from the truth.
+    """Deviation of a run's postures from the truth.
 
     Attributes
     ----------

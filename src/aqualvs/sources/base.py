@@ -27,7 +27,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane, Planes
 
 
 class State(StrEnum):
-    """Of a part of the system; a pilot reads it as a colour."""
+    """State of a part of the system; pilots see it as a colour."""
 
     OK = "ok"
     WARN = "warn"
@@ -40,7 +40,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PartHealth:
-    """Of the stream, of one output, of one laser.
+    """Health of one part: the stream, an output or a laser.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class StageDelay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """Of a live run, over the last seconds.
+    """Health of a live run, over the last seconds.
 
     Attributes
     ----------
@@ -209,7 +209,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
 
 
 class Feed(Protocol):
-    """Frames as they come, from a stream that may stall, change its size, go and return.
+    """Frames of a live stream, which may stall, change its size, break off and return.
 
     Attributes
     ----------

@@ -32,7 +32,7 @@ _MAX_WAITING = 20_000
 
 @dataclass(frozen=True, slots=True)
 class UdpAddress:
-    """Where to listen.
+    """Address and port to listen on.
 
     Attributes
     ----------
@@ -83,14 +83,14 @@ def parse_udp(where: str) -> UdpAddress:
 
 
 class Datagram(NamedTuple):
-    """What came, and when by the monotonic clock (seconds)."""
+    """Content of a datagram, and its arrival by the monotonic clock (seconds)."""
 
     content: bytes
     arrival: float
 
 
 class Datagrams:
-    """Listens on a port; a thread of its own empties the system's buffer.
+    """Receiver on a UDP port; a thread of its own empties the system's buffer.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def transport_content(datagram: bytes) -> bytes | None:
 
 
 class Inbox:
-    """Datagrams of one kind, until something else comes.
+    """Queue of datagrams of one kind, until another kind arrives.
 
     Parameters
     ----------

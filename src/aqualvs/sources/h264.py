@@ -15,7 +15,7 @@ _START_CODE = b"\x00\x00\x01"
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """What comes before and with the first coded slice of a packet.
+    """Units of a packet up to its first coded slice.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ UnitReader: TypeAlias = Callable[[memoryview], Units]
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """Types of units by their number (ITU-T H.264, table 7-1; H.265, table 7-1)."""
+    """Codec's unit types by their number (ITU-T H.264, table 7-1; H.265, table 7-1)."""
 
     shift: int
     mask: int
@@ -127,7 +127,7 @@ def nal_units(data: bytes) -> list[bytes]:
 
 
 class FrameNumbers:
-    """Finds missing reference pictures by the numbers that pictures carry (7.4.3, `frame_num`).
+    """Detector of missing reference pictures by their frame numbers (7.4.3, `frame_num`).
 
     Needed where the transport does not tell of losses. A decoder copies the missing picture from
     another one and says nothing.
@@ -181,7 +181,7 @@ class FrameNumbers:
 
 
 class _Bits:
-    """Reads bits and Exp-Golomb codes (9.1) from a unit's payload; past its end come zeros."""
+    """Reader of bits and Exp-Golomb codes (9.1) of a unit's payload; zeros past its end."""
 
     def __init__(self, payload: bytes) -> None:
         raw = payload.replace(b"\x00\x00\x03", b"\x00\x00")

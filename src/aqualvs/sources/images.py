@@ -65,7 +65,7 @@ IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".
 
 
 class ImageSource(Closing):
-    """Images as frames, in natural order of their names (`img2` before `img10`).
+    """Source of images as frames, in natural order of their names (`img2` before `img10`).
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _DISAGREE_S = 5.0
 
 
 class Unwrapper:
-    """Continues a counter of fixed width past its end.
+    """Unwrapped counter: continues a counter of fixed width past its overflow.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ _SILENT_S = 0.5
 
 
 class Reception:
-    """What arrived and when; written by the source, read from another thread.
+    """Log of what arrived and when; written by the source, read from another thread.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ before the end of a gradual refresh."""
 
 
 class LiveDecoder:
-    """Decodes the pictures of a stream; after damage it waits for pictures free of it.
+    """Decoder for a stream; after damage it waits for undamaged pictures.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ class LiveDecoder:
 
 
 class LiveFrames:
-    """Decodes a stream, over reconnections: numbers rise, time never falls.
+    """Frames of a stream over reconnections: numbers rise, time never falls.
 
     Parameters
     ----------
@@ -479,7 +479,7 @@ class LiveFrames:
 
 
 class _Spacing:
-    """Learns the time between pictures."""
+    """Estimate of the time between pictures."""
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque(maxlen=15)

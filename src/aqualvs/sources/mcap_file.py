@@ -210,7 +210,7 @@ class StoredMessage:
 
 @dataclass(slots=True)
 class _Listing:
-    """What one end of a file tells of it.
+    """Contents of a file as stated by one of its ends.
 
     Attributes
     ----------

@@ -69,7 +69,7 @@ def choose_topic(where: str, topics: list[Topic], wanted: str | None) -> Topic:
 
 
 class MessageSource(Closing):
-    """Images of one topic as frames; satisfies `FrameSource`.
+    """Source of the images of one topic; satisfies `FrameSource`.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ class MessageSource(Closing):
 
 
 class _Clock:
-    """Times of images since the first one; they never fall."""
+    """Clock of a topic: times since the first image, which never fall."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
@@ -190,7 +190,7 @@ class _Clock:
 
 
 class _Video:
-    """Decodes packets that are numbered by their messages."""
+    """Decoder of packets that are numbered by their messages."""
 
     def __init__(self, codec: str) -> None:
         context = cast("VideoCodecContext", av.CodecContext.create(codec, "r"))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class PacedFeed:
-    """Frames of a file or folder, by their own clock or as fast as they are taken.
+    """Recording as a feed: its frames by their own clock, or as fast as they are taken.
 
     Parameters
     ----------

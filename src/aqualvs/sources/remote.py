@@ -29,7 +29,7 @@ _MAX_WAITING = 250
 
 
 class Connection:
-    """Opens a container and reads its first video in the background.
+    """Connection opened in the background, and the packets of its first video.
 
     FFmpeg waits without end where a network is silent, and can't be woken. So nobody waits for
     this thread: it ends by itself when FFmpeg's time runs out, and closes what it opened.
@@ -114,7 +114,7 @@ _PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
 
 
 class RemoteFeed:
-    """Frames from a container that FFmpeg opens, and opens again; satisfies `Feed`.
+    """Feed of a container that FFmpeg opens, and reopens; satisfies `Feed`.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ _OPEN_S, _SILENT_S = 5.0, 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraOptions:
-    """What is asked of a camera; what is left out, the camera chooses.
+    """Options requested of a camera; the camera chooses those left out.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ class CameraOptions:
 
 
 class CameraFeed(RemoteFeed):
-    """Frames from a camera; opened again when it is unplugged and comes back.
+    """Feed of a camera; reopened when it is unplugged and returns.
 
     Parameters
     ----------

@@ -92,7 +92,7 @@ class Ordered(NamedTuple):
 
 
 class RtpOrder:
-    """Puts the packets of one sender in order, and tells where some are lost.
+    """Reordering buffer for the packets of one sender, which also detects losses.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ class AccessUnit:
 
 
 class H264Depacketizer:
-    """Builds pictures from packets in order.
+    """Depacketizer of H.264: builds pictures from packets in order.
 
     Attributes
     ----------

@@ -38,7 +38,7 @@ _PATIENCE_S = 10.0
 
 
 class SpanKind(StrEnum):
-    """How the frames of a part are read."""
+    """Method by which the frames of a span are read."""
 
     WHOLE = "whole"
     """All of them, as a run reads them."""
@@ -74,7 +74,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class VideoSpans:
-    """How a video may be cut.
+    """Spans into which a video may be cut.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ def joint_checksum(checksums: Sequence[int]) -> int:
 
 
 class _Packets:
-    """What is known of the packets so far; takes note of the first doubt about cutting them."""
+    """Packets read so far, and the first reason found not to cut the video."""
 
     def __init__(self, stream: VideoStream) -> None:
         self._stream = stream
@@ -297,7 +297,7 @@ class UnlikeSurveyError(Exception):
 
 
 class VideoParts(Closing):
-    """Reads parts of a video, opened once for all of them; a context manager.
+    """Reader of spans of a video, opened once for all of them; a context manager.
 
     Parameters
     ----------

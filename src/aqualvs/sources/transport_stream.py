@@ -17,7 +17,7 @@ _MAX_BYTES = 16 << 20
 
 
 class TransportStream:
-    """Builds the pictures of the first video from packets of 188 bytes.
+    """Demultiplexer of the first video of an MPEG-TS, from packets of 188 bytes.
 
     Attributes
     ----------

@@ -135,7 +135,7 @@ def _parameter_sets(part: str, payload_type: int) -> bytes:
 
 
 class RtpReader:
-    """Reads RTP with H.264.
+    """Reader of RTP with H.264.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class RtpReader:
 
 
 class TransportReader:
-    """Reads MPEG-TS.
+    """Reader of MPEG-TS.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ class TransportReader:
 
 
 class BareReader:
-    """Reads H.264 without any container, cut into datagrams anywhere.
+    """Reader of H.264 without a container, cut into datagrams anywhere.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ _RETRY_S = 0.5
 
 
 class UdpFeed:
-    """Listens on a UDP port and takes what comes; satisfies `Feed`.
+    """Feed from a UDP port, whatever kind of stream arrives; satisfies `Feed`.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ from aqualvs.sources.spans import promised_duration
 
 
 class Ledger:
-    """Numbers pictures by the packets that announced them, so that lost ones leave a gap.
+    """Numbers of pictures by the packets that announced them; lost ones leave a gap.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ _NEIGHBOURS = 9
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """What an `FMT` record says of a kind of record.
+    """Format of one kind of record, as its `FMT` record describes it.
 
     Attributes
     ----------

@@ -124,7 +124,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """What a telemetry log holds of the wanted messages.
+    """Wanted messages of a telemetry log.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ _SHORTEST_GAP_S = 0.5
 
 
 class Interpolation(StrEnum):
-    """What a signal does between its samples."""
+    """Interpolation of a signal between its samples."""
 
     LINEAR = "linear"
     """Changes evenly."""

@@ -25,7 +25,7 @@ from aqualvs.workers.frame_results import Measured
 
 
 class Ended(Enum):
-    """How the measuring of a part ended."""
+    """Message that a part has ended, and its outcome."""
 
     WHOLE = auto()
     UNLIKE_SURVEY = auto()

@@ -33,7 +33,7 @@ _MIN_POINTS = 6
 
 
 class BareLensComparison:
-    """Measures a scan's posture again with the rig's camera out of its dome.
+    """Measurement of a scan's posture with the rig's camera out of its dome.
 
     Detection, classification and the choice of the target are taken over from the scan, so that
     the difference is that of the ray model alone (paper, section 5.4).
@@ -192,14 +192,14 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
 
 
 class _End:
-    """Stands for the end of the items, and what brought it about."""
+    """Mark of the end of the items, with the exception that caused it."""
 
     def __init__(self, fault: BaseException | None = None) -> None:
         self.fault = fault
 
 
 class ScansFrames(Protocol):
-    """What a run needs of a scanner."""
+    """Interface of a scanner for a run."""
 
     def process(self, frame: Frame) -> Scan:
         """Return the scan of one frame."""
@@ -207,7 +207,7 @@ class ScansFrames(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was found in a frame.
+    """Result of one frame.
 
     Attributes
     ----------
@@ -227,7 +227,7 @@ class Measured:
 
 
 class Meter:
-    """Measures frames, with the dome and without.
+    """Measurement of frames, with the dome and without.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ from aqualvs.workers.start_method import context, deaf_to_interrupts, interrupts
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of a span that are wanted.
+    """Wanted frames of a span.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrewWork:
-    """What a crew measures.
+    """Work of a pool: the dive, its parts, and what measures it.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ class _Hand:
 
 
 class Crew(Closing):
-    """Processes that measure the parts of a dive; a context manager that ends them.
+    """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ class ReplayedFrame(Frame):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayRequest:
-    """What to make of a recording.
+    """Request for a replay: what differs from the recorded run.
 
     Attributes
     ----------

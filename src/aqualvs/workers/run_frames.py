@@ -76,7 +76,7 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
 
 
 class RunMeasuring(Closing):
-    """Measures the frames of a dive; a context manager, within which processes are at work.
+    """Measurement of a dive's frames; a context manager, within which processes are at work.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ def parse_message(text: str) -> Message:
 
 
 class RecordButton(Protocol):
-    """What the page needs of a recorder."""
+    """Interface of a recorder for the page."""
 
     def start(self) -> None:
         """Begin a recording; does nothing while one is under way."""
@@ -90,7 +90,7 @@ class RecordButton(Protocol):
 
 
 class NoRecorder:
-    """Stands where nothing can be recorded."""
+    """Record button where nothing can be recorded."""
 
     def start(self) -> None:
         """Refuse."""
@@ -105,7 +105,7 @@ class NoRecorder:
 
 
 class Controls:
-    """What the page can move.
+    """Controls of the page: setpoint and recorder.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ _STATE_EVERY_S, _PICTURE_EVERY_S = 0.04, 0.08
 
 
 class Dashboard:
-    """Sends samples to the pages that are open; costs next to nothing while there is none.
+    """Output to the open pages; costs next to nothing while there is none.
 
     Parameters
     ----------

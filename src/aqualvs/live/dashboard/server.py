@@ -269,7 +269,7 @@ _log = logging.getLogger(__name__)
 
 
 class DashboardServer:
-    """Serves page and data until it is closed.
+    """Server of page and data until it is closed.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ _KEPT = 200
 
 
 class PilotSticks:
-    """Watches the pilot's sticks.
+    """Detector of movements of the pilot's sticks.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ _STUCK_SHARE, _DIVED_M = 0.1, 0.5
 
 
 class DepthChoice:
-    """Reads the depth; remembers which estimates stood still.
+    """Reader of the depth; remembers which estimates stood still.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArduSubOptions:
-    """How ArduSub is steered, and who must be there.
+    """Options of steering ArduSub, and of the ground station that must be present.
 
     Attributes
     ----------

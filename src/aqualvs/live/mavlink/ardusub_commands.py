@@ -35,7 +35,7 @@ _AXES = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
 
 
 class StickResponse:
-    """Compares our sticks with the channels and the turning that follow.
+    """Comparison of our sticks with the channels and the turning that follow.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class StickResponse:
 
 
 class _Pairs:
-    """What a stick said and what the vehicle answered, over the last seconds."""
+    """Stick positions and the vehicle's responses to them, over the last seconds."""
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[float, float, float]] = deque()
@@ -136,7 +136,7 @@ _MAX_SEQ = 256
 
 
 class Command(StrEnum):
-    """How ArduSub is steered; the value is what a user writes."""
+    """Kind of command that steers ArduSub; the value is the user's word for it."""
 
     STICKS = "sticks"
     """`MANUAL_CONTROL`: what a pilot's joystick would send."""
@@ -153,7 +153,7 @@ class Packable(Protocol):
 
 
 class Commander(Protocol):
-    """Puts efforts into messages."""
+    """Interface of a converter from efforts to messages."""
 
     def message(self, effort: Effort) -> Packable:
         """Return what to send for an effort of finite parts."""
@@ -165,7 +165,7 @@ def is_finite(effort: Effort) -> bool:
 
 
 class StickCommander:
-    """Efforts as `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
+    """Converter to `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class StickCommander:
 
 
 class GuidedCommander:
-    """Efforts as speeds in the body's axes, for a vehicle that knows where it is.
+    """Converter to speeds in the body's axes, for a vehicle that knows its position.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ _ASK_EVERY_S, _ASK_SELDOM_S, _ROUNDS = 1.0, 30.0, 5
 
 
 class Weight(StrEnum):
-    """How much an advice matters."""
+    """Importance of an advice."""
 
     FINE = "fine"
     CARE = "care"
@@ -47,7 +47,7 @@ class Weight(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What a setting of the vehicle means.
+    """Advice on a setting of the vehicle.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class StationRange:
 
 
 class ParameterWatch:
-    """Asks the vehicle for parameters now and then until it has told them; never waits.
+    """Requests for the vehicle's parameters, repeated until it has answered; never waits.
 
     Parameters
     ----------

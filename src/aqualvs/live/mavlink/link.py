@@ -76,7 +76,7 @@ class Received:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkOptions:
-    """Who we are on a connection, and who may speak to us.
+    """Own identity on a connection, and the peers that are heard.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class LinkOptions:
 
 
 class MavlinkLink:
-    """Sends and receives MAVLink 2 as an onboard computer.
+    """MAVLink 2 connection of an onboard computer.
 
     The constructor returns at once. A thread opens the connection, sends a heartbeat every second,
     takes in what comes, and opens the connection again whenever it breaks, a little later each time

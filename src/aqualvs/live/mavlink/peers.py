@@ -64,7 +64,7 @@ def load_key(path: Path) -> bytes:
 
 
 class Signer:
-    """Signs what one connection sends, and checks what it receives.
+    """Signer of what one connection sends; checks the signatures of what it receives.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ _MAGIC = (0xFD, 0xFE)
 
 @dataclass(frozen=True, slots=True)
 class _Claim:
-    """What a heartbeat says of the vehicle."""
+    """Statement of a heartbeat about the vehicle."""
 
     component: int
     kind: int
@@ -164,7 +164,7 @@ class _Home:
 
 @dataclass(slots=True)
 class _Contest:
-    """What heartbeats of the vehicle have said lately, and until when they contradict."""
+    """Recent statements of the vehicle's heartbeats, and the end of their contradiction."""
 
     now: dict[int, _Claim] = field(default_factory=dict)
     given_up_s: dict[_Claim, float] = field(default_factory=dict)
@@ -174,7 +174,7 @@ class _Contest:
 
 
 class PeerTable:
-    """Keeps the senders on a connection apart.
+    """Table of the senders on a connection, kept apart by address.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def parse_address(url: str) -> Address:
 
 
 class AllowedPeers:
-    """Addresses that are listened to.
+    """Addresses that are heard.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tup
 
 
 class _UdpPort:
-    """What both directions of UDP share: a datagram goes at once or not at all."""
+    """Common base of UDP ports: a datagram goes at once or not at all."""
 
     unsent = False
     lag_s = 0.0
@@ -323,7 +323,7 @@ class _UdpPort:
 
 
 class _UdpSender(_UdpPort):
-    """Sends to one address, and hears that alone."""
+    """Port that sends to one address and hears only that."""
 
     many = False
 
@@ -348,7 +348,7 @@ class _UdpSender(_UdpPort):
 
 
 class _UdpBroadcaster(_UdpPort):
-    """Sends to a broadcast address; hears whoever answers."""
+    """Port that sends to a broadcast address and hears all that answer."""
 
     many = True
 
@@ -408,7 +408,7 @@ class _UdpListener(_UdpPort):
 
 
 class StreamPort:
-    """What TCP and serial share: a message may go in parts, and the rest goes before the next."""
+    """Common base of TCP and serial ports: the rest of a partly sent message goes first."""
 
     refused_s: float | None = None
     many = whole = False

@@ -7,7 +7,7 @@ from aqualvs.sources.base import PartHealth
 
 
 class Output(Protocol):
-    """Takes samples; one small class for each kind of receiver.
+    """Interface of an output: a small class for each kind of receiver.
 
     Made by its constructor without waiting for a peer; a peer that is not there, goes or returns is
     no exception but told by `health`.

@@ -158,7 +158,7 @@ _SHORT_FAREWELL = (
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """What Cyclone DDS needs to be kept alive while it publishes."""
+    """Objects of Cyclone DDS that must stay alive while it publishes."""
 
     domain: Any
     participant: Any
@@ -174,7 +174,7 @@ class _Link:
 
 
 class DdsOutput:
-    """Publishes as ROS 2 does, whether ROS 2 is installed or not.
+    """Publisher of ROS 2 topics, whether ROS 2 is installed or not.
 
     Parameters
     ----------

@@ -216,7 +216,7 @@ _SELDOM_HZ = 1.0
 
 
 class FoxgloveOutput:
-    """Serves posture, points, picture, scene and health to any number of viewers.
+    """Server of posture, points, picture, scene and health to any number of viewers.
 
     Parameters
     ----------
@@ -349,7 +349,7 @@ class FoxgloveOutput:
 
 
 class _Viewers:
-    """Counts who watches; called by the server's threads."""
+    """Counter of viewers; called by the server's threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -383,7 +383,7 @@ class _Viewers:
 
 
 class _Rate:
-    """Says when something may be sent again."""
+    """Rate limit of a message."""
 
     def __init__(self, hz: float) -> None:
         # A tenth of a period early rather than a whole frame late.

@@ -42,7 +42,7 @@ range in mm/s. NaN where the filter has nothing to say."""
 
 
 class MavlinkOutput:
-    """Sends `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
+    """Output by `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
 
     Parameters
     ----------

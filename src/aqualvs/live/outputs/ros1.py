@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 class Ros1Node:
-    """Publishes topics; registers with roscore, whenever it is there.
+    """ROS 1 node that publishes topics; registers with roscore whenever that is there.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Ros1Node:
 
 
 class _SlaveApi:
-    """What roscore and subscribers may ask of a node; each answer is (code, message, value)."""
+    """Slave API of the node for roscore and subscribers; answers are (code, message, value)."""
 
     def __init__(self, node: Ros1Node) -> None:
         self._node = node
@@ -187,7 +187,7 @@ class _QuietHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
 
 
 class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
-    """Answers calls, each in a thread that nobody waits for."""
+    """Server of calls, each in a thread that nobody waits for."""
 
     daemon_threads = True
     block_on_close = False
@@ -215,7 +215,7 @@ class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
 
 
 class _Transport(xmlrpc.client.Transport):
-    """Gives up on a roscore that does not answer."""
+    """Transport with a timeout, for a roscore that does not answer."""
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
@@ -290,7 +290,7 @@ _NODE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
 class Ros1Output:
-    """Publishes as a ROS 1 node, whether ROS is installed on this machine or not.
+    """Publisher of ROS 1 topics, whether ROS is installed on this machine or not.
 
     Parameters
     ----------

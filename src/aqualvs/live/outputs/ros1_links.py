@@ -218,7 +218,7 @@ _log = logging.getLogger(__name__)
 
 
 class _RefusedError(Exception):
-    """What a subscriber expects cannot be given; the message is sent to it."""
+    """Refusal of a subscriber's request; the message is sent to the subscriber."""
 
 
 class _Link:
@@ -255,7 +255,7 @@ class _Link:
 
 
 class Ros1Links:
-    """Serves subscribers of some topics.
+    """Server of the subscribers of some topics.
 
     Parameters
     ----------

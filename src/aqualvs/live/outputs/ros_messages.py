@@ -323,7 +323,7 @@ POINT_TYPE = np.dtype(
 
 
 class Topic(StrEnum):
-    """What is published; the value is the last part of its topic's name."""
+    """Published topic; the value is the last part of its name."""
 
     POSTURE = "posture"
     FILTERED = "posture_filtered"
@@ -412,7 +412,7 @@ Message: TypeAlias = PoseMessage | RangeMessage | CloudMessage | DiagnosticsMess
 
 
 class MessageMaker:
-    """Turns samples into messages, the diagnostics once in a while.
+    """Converter of samples to messages; diagnostics once per period.
 
     Parameters
     ----------

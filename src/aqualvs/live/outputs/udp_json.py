@@ -173,7 +173,7 @@ _REFUSED_FOR_S = 3.0
 
 
 class UdpJsonOutput:
-    """Sends every sample to every receiver.
+    """Output that sends every sample to every receiver.
 
     Parameters
     ----------
