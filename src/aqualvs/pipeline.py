@@ -26,7 +26,7 @@ from aqualvs.workers.water_index import WaterFollowingScanner
 
 
 def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
-    """Return what watches over the lasers of a rig, None where there is nothing to watch.
+    """Return the check of a rig's lasers against each other, None if there is nothing to check.
 
     One laser agrees with itself; and where refraction at the dome is left out, the lasers disagree
     for that reason alone.
@@ -156,7 +156,7 @@ def run(
 
 
 def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
-    """Run a dive, tell how it went line by line, and return the exit code.
+    """Run a dive, print its results line by line, and return the exit code.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
 
 
 def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
-    """Return what the command prints at the end."""
+    """Return the lines that the command prints at the end."""
     lines = [f"{request.source}: {result.tally.n_frames} frames in {result.elapsed_s:.1f} s"]
     lines += result.tally.lines()
     lines += result.water_lines
@@ -208,7 +208,7 @@ def _replay(request: RunRequest) -> Replay | None:
 
 
 def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
-    """Return what measures and follows the water, None where nobody asked for that.
+    """Return the scanner that tracks the water's index, None if that is not requested.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None
 
 
 def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork | None:
-    """Return how processes can share the dive; None where one alone can do what is asked."""
+    """Return how processes can share the dive; None where one process must measure all of it."""
     alone = request.overlay or request.mcap or request.index_target is not None
     if alone or request.n_processes < 2:
         return None
@@ -231,7 +231,7 @@ def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork |
 
 
 def agreement_for(request: RunRequest, rig: Rig) -> LaserAgreement | None:
-    """Return what watches over the lasers of a dive, None where a run watches nothing.
+    """Return the check of a dive's lasers against each other, None if there is none.
 
     Raises
     ------

@@ -116,7 +116,7 @@ class NetPilot:
         filtered: Motion | None,
         state: VehicleState,
     ) -> Decision:
-        """Return what to send for one frame, or for a silent stream.
+        """Return the effort for one frame, or for a silent stream.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class NetPilot:
         return posture
 
     def _guide(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Ask the mission; it stands still while nobody steers."""
+        """Update the mission; it pauses while disengaged."""
         if not self.engaged:
             return _IDLE
         return self.mission.update(now_s, posture, state)
@@ -199,7 +199,7 @@ class NetPilot:
         filtered: Motion | None,
         guidance: Guidance,
     ) -> Effort | None:
-        """Return what the controller wants; None, and the controller at rest, where it must not."""
+        """Return the controller's effort; None, and the controller at rest, if it must not act."""
         motion = _motion(posture, filtered)
         if guidance.setpoint is None or guidance.stage.halts:
             return None
@@ -218,7 +218,7 @@ class NetPilot:
         )
 
     def _settle(self, asked: Effort | None, effort: Effort, reason: Reason | None) -> None:
-        """Tell the controller what became of its effort."""
+        """Report the sent effort to the controller."""
         self._asked = asked
         if asked is None or (reason is not None and effort == NEUTRAL):
             self.controller.pause()

@@ -53,7 +53,7 @@ class PidOptions:
     longest_step: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse what cannot work.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class Pid:
     def engage(
         self, time_s: float, setpoint: float, measured: float, output: float, forward: float = 0.0
     ) -> None:
-        """Start such that the output goes on from `output`: the integral takes what is missing.
+        """Start such that the output continues from `output`: the integral takes the difference.
 
         Parameters
         ----------
@@ -143,7 +143,7 @@ class Pid:
         self._integral *= kept
 
     def applied(self, output: float) -> None:
-        """Take in what the actuator really did with the last output, where others limit it."""
+        """Correct the last output by the value that the actuator applied, where it is limited."""
         if math.isfinite(output):
             self._output = output
 
@@ -248,11 +248,11 @@ class SwellFilter:
 
     @property
     def amplitude(self) -> float:
-        """Of what swings now."""
+        """Present amplitude of the filter's output."""
         return math.hypot(self._output, self._sum)
 
     def update(self, step: float, value: float) -> float:
-        """Return what of `value` swings; unchanged if `step` seconds are not positive.
+        """Return the swinging part of `value`; unchanged if `step` seconds are not positive.
 
         Backward Euler: any step is stable.
         """
@@ -415,7 +415,7 @@ class RangeYawController:
         self._effort = Effort()
 
     def pause(self) -> None:
-        """Stop: neutral until the next update, which goes on with what it knew of the current."""
+        """Stop: neutral until the next update, which starts with the known current."""
         if self._running:
             self._stopped_s = self._time_s
         self._running = False
@@ -426,7 +426,7 @@ class RangeYawController:
         self._let_go()
 
     def engage(self, time_s: float, range: float, yaw: float, effort: Effort) -> None:
-        """Take over from somebody who steers, without a jump.
+        """Take over from a human pilot without a jump.
 
         Parameters
         ----------
@@ -449,7 +449,7 @@ class RangeYawController:
         self._turn.engage(time_s, 0.0, 0.0, -effort.yaw * vehicle.turning_rate)
 
     def applied(self, effort: Effort) -> None:
-        """Take in what was sent in place of the last effort."""
+        """Correct the last effort by the one that was sent in its place."""
         vehicle = self.gains.vehicle
         forward, _ = vehicle.thrust.forces(effort.forward, effort.right)
         self._speed.applied(forward / vehicle.mass)
@@ -506,7 +506,7 @@ class RangeYawController:
         self._quiet.reset()
 
     def _start(self, time_s: float, range: float, yaw: float) -> None:
-        """Begin at a posture, with what is still known of the disturbance."""
+        """Begin at a posture, with the remembered part of the disturbance."""
         if not 0.0 <= time_s - self._stopped_s <= self.gains.memory:
             self._speed.reset()
             self._turn.reset()
@@ -566,13 +566,13 @@ class RangeYawController:
         return True
 
     def _mending(self, range: float) -> float:
-        """Return the closing speed that mends the range's error."""
+        """Return the closing speed that corrects the range's error."""
         gains = self.gains.range
         wanted = gains.position * (range - self._range_ramp.seen)
         return min(max(wanted, -gains.greatest_speed), gains.greatest_speed)
 
     def _against_drag(self, ahead: float) -> tuple[float, tuple[float, float]]:
-        """Return the acceleration that keeps a speed, beyond what the integral gives.
+        """Return the acceleration that keeps a speed, in addition to the integral.
 
         The integral keeps the vehicle in its place: it tells how fast the water passes there. With
         it come the factors on the gains in that water: drag damps the vehicle as the speed's gain

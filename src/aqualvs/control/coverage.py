@@ -128,7 +128,7 @@ class Coverage:
         decision: Decision,
         state: VehicleState,
     ) -> None:
-        """Take in one step; without a posture or a depth nothing is seen."""
+        """Add one step; without a posture or a depth nothing is seen."""
         step = now_s - self._last_s
         step = step if 0.0 < step <= self.LONGEST_STEP_S else 0.0
         self._last_s = now_s

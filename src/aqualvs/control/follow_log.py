@@ -150,7 +150,7 @@ def follow_row(
 def _seen(
     posture: Posture | Refusal | None, decision: Decision, state: VehicleState
 ) -> dict[str, str]:
-    """Return what depends on a posture and its setpoint."""
+    """Return the cells that depend on a posture and its setpoint."""
     wanted = decision.guidance.setpoint
     row = {}
     if wanted is not None:

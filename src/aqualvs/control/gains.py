@@ -48,7 +48,7 @@ class ThrustMap:
     layout: Layout = Layout.VECTORED
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be turned round.
+        """Refuse maps that cannot be inverted.
 
         Raises
         ------
@@ -231,7 +231,7 @@ class VehicleFacts:
     dome_forward: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a vehicle that cannot exist.
+        """Refuse impossible vehicles.
 
         Raises
         ------

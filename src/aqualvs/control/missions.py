@@ -70,7 +70,7 @@ class Mission(Protocol):
         """Whether it needs a vehicle that can move sideways."""
 
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Return what to do now.
+        """Return the present guidance.
 
         Parameters
         ----------
@@ -105,7 +105,7 @@ class LossOptions:
     give_up: float = 10.0
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class LossWatch:
         self._last_s, self._away_s, self._back_s = math.nan, 0.0, 0.0
 
     def update(self, now_s: float, there: bool) -> Stage | None:
-        """Take in whether there is a posture at this time; return the stage."""
+        """Update by the presence of a posture at this time; return the stage."""
         step = now_s - self._last_s
         step = step if 0.0 < step <= self.LONGEST_STEP_S else 0.0
         self._last_s = now_s
@@ -252,7 +252,7 @@ class LegOptions:
     sector: Sector | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -415,7 +415,7 @@ class SurveyOptions:
     patience: float = 20.0
 
     def __post_init__(self) -> None:
-        """Refuse what has no end or no direction.
+        """Refuse surveys without end or direction.
 
         Raises
         ------
@@ -481,7 +481,7 @@ class SurveyMission:
         self._watch.restart()
 
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Return what leg or change of depth asks for."""
+        """Return the guidance of the leg or the change of depth."""
         lost = self._watch.update(now_s, posture is not None)
         if self.i_leg >= len(self._options.depths) or lost is not None:
             over = self.i_leg >= len(self._options.depths)

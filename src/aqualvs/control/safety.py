@@ -45,7 +45,7 @@ class Reason(StrEnum):
 
     @property
     def words(self) -> str:
-        """What to tell the pilot."""
+        """Text for the pilot."""
         return _WORDS[self]
 
     @property
@@ -204,7 +204,7 @@ class SafetyGate:
         range_rate: float | None = None,
         doubt: Reason | None = None,
     ) -> tuple[Effort, Reason | None]:
-        """Return what may be sent, and why it differs from what was asked.
+        """Return the effort that may be sent, and the reason if it differs from the request.
 
         Parameters
         ----------
@@ -290,7 +290,7 @@ class SafetyGate:
         return gentle + max(firm - gentle, 0.0) * min(within / _FIRM_WITHIN_M, 1.0)
 
     def _guarded(self, effort: Effort, near: float, closing: float) -> tuple[Effort, Reason | None]:
-        """Return the effort without what brings the target too close."""
+        """Return the effort without the part that brings the target too close."""
         limits = self.limits
         left = near - limits.least_range
         if left < 0.0:
@@ -452,14 +452,14 @@ class AnswerWatch:
         self._heading, self._told = 0.0, math.nan
 
     def done(self, now_s: float, effort: Effort, wanted: float | None = None) -> None:
-        """Take in which effort was sent, and for which range in metres."""
+        """Add a sent effort, and the range in metres that it was for."""
         self._wanted = math.inf if wanted is None else wanted
         if effort != NEUTRAL:
             self._pushed_s = now_s
         self._effort = effort
 
     def see(self, now_s: float, posture: Posture, state: VehicleState) -> Reason | None:
-        """Take in a new posture; return why it is not to be trusted, None if it may be.
+        """Add a new posture; return why it cannot be used, None if it can.
 
         Parameters
         ----------
@@ -558,7 +558,7 @@ class _Noise:
         self._n = 0
 
     def vanished(self, posture: Posture) -> bool:
-        """Take in a posture; return whether the noise has all but vanished."""
+        """Add a posture; return whether the noise has almost vanished."""
         self._postures.append((posture.range, posture.pitch, posture.yaw))
         if len(self._postures) < 3:
             return False

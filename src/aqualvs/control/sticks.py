@@ -92,7 +92,7 @@ class StickShaping:
     right: StickChannel = field(default_factory=StickChannel)
 
     def sticks(self, effort: Effort, *, keeps_place: bool = False) -> Sticks:
-        """Return the stick positions at which ArduSub does what an effort says.
+        """Return the stick positions that make ArduSub carry out an effort.
 
         An effort of 1 is a full stick, one of 0 the middle of the dead zone, and what is between
         is in proportion to what the vehicle does. Pulses are whole microseconds.
@@ -200,7 +200,7 @@ PARAMETERS: tuple[str, ...] = (
 
 
 def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
-    """Return the shaping of a vehicle that told its parameters.
+    """Return the shaping of a vehicle by its reported parameters.
 
     Parameters
     ----------

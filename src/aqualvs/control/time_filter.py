@@ -130,7 +130,7 @@ class PostureFilter:
         self._rival: _Track | None = None
 
     def update(self, time_s: float, posture: Posture | Refusal) -> FilteredPosture | None:
-        """Take in what one frame gave, and return the state at its time.
+        """Update by the measurement of one frame, and return the state at its time.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class PostureFilter:
         return track
 
     def _take(self, time_s: float, measured: FloatArray, cov: FloatArray) -> bool:
-        """Update the track by a measurement that fits, else its rival; tell whether it entered."""
+        """Update the track or its rival by a measurement; return whether it entered the track."""
         if self._track is None:
             self._track = self._motion.started(time_s, measured, cov)
             return True

@@ -52,7 +52,7 @@ from aqualvs.simulation.vehicle.models import FORWARD, RIGHT, YAW, VehicleModel
 
 
 def facts_of(model: VehicleModel) -> VehicleFacts:
-    """Return what a controller should know of a simulated vehicle, its pilot gain included."""
+    """Return the properties of a simulated vehicle for its controller, with the pilot gain."""
     sticks, shaping = model.sticks, shaping_of_model(model)
     return VehicleFacts(
         name=model.name,
@@ -67,7 +67,7 @@ def facts_of(model: VehicleModel) -> VehicleFacts:
 
 
 def shaping_of_model(model: VehicleModel) -> StickShaping:
-    """Return what a link must take out of a simulated vehicle's sticks."""
+    """Return the stick shaping of a simulated vehicle, which a link must compensate."""
     sticks, own = model.sticks, StickShaping()
     yaw, forward, right = sticks.trims
     return StickShaping(
@@ -142,7 +142,7 @@ def turning_of(model: VehicleModel) -> Turning:
 
 
 def tidy(value: float) -> float:
-    """Return a number rounded to what a file for people should hold: four digits."""
+    """Return a number rounded to four digits, for readable files."""
     return float(f"{value:.4g}")
 
 
@@ -309,7 +309,7 @@ class TuneOptions:
     least_yaw_modulus: float = 0.45
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------

@@ -164,7 +164,7 @@ class VehicleLink(Protocol):
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the vehicle in messages."""
 
     def state(self) -> VehicleState:
         """Return the latest state; returns at once."""

@@ -176,7 +176,7 @@ class RunWatch:
         self._over_s = math.inf
 
     def __call__(self, now_s: float) -> bool:
-        """Tell what has changed; False ends the run."""
+        """Report changes; return False to end the run."""
         if now_s - self._told_s >= _TELL_EVERY_S:
             self._told_s = now_s
             self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
@@ -303,7 +303,7 @@ class SimRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated.
+        """Refuse requests that cannot be simulated.
 
         Raises
         ------
@@ -339,7 +339,7 @@ _MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
 
 
 def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:
-    """Run the loop, write log, figures and page, and tell the summary; returns 0.
+    """Run the loop, write log, figures and page, and print the summary; return 0.
 
     Raises
     ------

@@ -94,11 +94,11 @@ class LoopLog:
         return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
 
     def note_neutral(self, seen_s: float, now_s: float) -> None:
-        """Take in that thrust ended, at a time after the last valid posture."""
+        """Note that thrust ended, at a time after the last valid posture."""
         self._neutral_s = now_s - seen_s
 
     def note_sight(self, seen_s: float, now_s: float, thrusts: bool) -> None:
-        """Take in that a valid posture came, when one had come before, and the effort till now."""
+        """Note a valid posture, with the one before and the effort until now."""
         gap = now_s - seen_s
         if NEUTRAL_WITHIN_S < gap < math.inf:
             self.n_blind += 1
@@ -118,7 +118,7 @@ _UNITS = {
 
 
 def write_log(log: LoopLog, path: Path) -> None:
-    """Write the rows as CSV; units are in the names, cells of what is not known are empty.
+    """Write the rows as CSV; units are in the names, cells of unknown values are empty.
 
     Raises
     ------
@@ -265,7 +265,7 @@ class SafetyMeasures:
 
 
 def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> HoldMeasures:
-    """Return what a stretch came to; frames without a setpoint count against the last one."""
+    """Return the measures of a period; frames without a setpoint count against the last one."""
     here = _between(log, start_s, end_s)
     off = log.column("range")[here] - _filled(log.column("wanted_range"))[here]
     turned = log.column("yaw")[here] - _filled(log.column("wanted_yaw"))[here]
@@ -326,7 +326,7 @@ def step_measures(
 
 
 def safety_measures(log: LoopLog) -> SafetyMeasures:
-    """Return what a whole run came to."""
+    """Return the safety measures of a whole run."""
     return SafetyMeasures(
         least_clearance=float(log.column("clearance").min()),
         n_blind=log.n_blind,

@@ -52,11 +52,11 @@ class SimulatedLink:
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the vehicle in messages."""
         return f"simulated {self.vehicle.model.name}"
 
     def state(self) -> VehicleState:
-        """Return what the vehicle tells of itself, by the vehicle's clock."""
+        """Return the vehicle's reported state, by the vehicle's clock."""
         told = self.vehicle.telemetry()
         return VehicleState(
             heard_s=math.floor(told.time_s * _TELLS_HZ) / _TELLS_HZ,
@@ -99,7 +99,7 @@ class Eye(Protocol):
     """Interface of a sensor that measures the net's posture from a vehicle."""
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
-        """Return what the frame exposed now gives; None where there is no frame at all."""
+        """Return the result for the frame exposed now; None for a lost frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +118,7 @@ class Timing:
     delay: float = 0.06
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -155,7 +155,7 @@ class _Sight:
     seen_s: float = -math.inf
 
     def silence_s(self) -> float:
-        """Return when a silent stream is told next."""
+        """Return when a silent stream is reported next."""
         return max(self.heard_s + _SILENT_AFTER_S, self.told_s + _SILENT_EVERY_S)
 
     def bark_s(self, thrusts: bool) -> float:

@@ -63,7 +63,7 @@ class RandomDive:
         return HoldMission(self.setpoint)
 
     def run(self, seconds: float = SECONDS) -> LoopLog:
-        """Dive until the end, or until somebody must take over, and return the log."""
+        """Dive until the end, or until a human must take over, and return the log."""
         rng = np.random.default_rng([self.seed, 43])
         noise = PostureNoise(outliers=0.005)
         eye = SampledEye(self.case.net, rng, noise, self.blind, _WORKING_RANGE)
@@ -180,7 +180,7 @@ def _net(rng: np.random.Generator) -> NetWall:
 
 
 def _blind(rng: np.random.Generator) -> tuple[Blind, ...]:
-    """Draw stretches without sight of up to a second, a few seconds apart."""
+    """Draw periods without sight of up to a second, a few seconds apart."""
     stretches: list[Blind] = []
     start_s = _FIRST_LOSS_S + rng.exponential(3.0)
     while start_s < SECONDS - 2.0:

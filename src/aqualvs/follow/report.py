@@ -81,7 +81,7 @@ def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
 
 
 def _motion(log: LoopLog) -> "Figure":
-    """As figure 22: depth, range, heading and target yaw."""
+    """Draw figure 22: depth, range, heading and target yaw."""
     figure, axes = _panels(3, 6.4)
     time_s = log.column("time_s")
     depth, ranges, angles = axes
@@ -101,7 +101,7 @@ def _motion(log: LoopLog) -> "Figure":
 
 
 def _control(log: LoopLog) -> "Figure":
-    """As figure 23: setpoint, measurement and command of both controllers."""
+    """Draw figure 23: setpoint, measurement and command of both controllers."""
     figure, axes = _panels(4, 8.0)
     time_s = log.column("time_s")
     _loop(axes[0], log, "range", 1.0)
@@ -206,7 +206,7 @@ class RunFacts:
 
 
 def summary(log: LoopLog) -> list[tuple[str, str]]:
-    """Return what a run came to, as names and values."""
+    """Return the results of a run, as names and values."""
     rows = log.rows
     start_s = SETTLED_S if rows[-1].time_s > 2.0 * SETTLED_S else 0.5 * rows[-1].time_s
     hold, safety = hold_measures(log, start_s), safety_measures(log)

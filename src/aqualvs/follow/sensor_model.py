@@ -82,7 +82,7 @@ class RenderedEye:
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
-        """Return what the frame exposed now gives."""
+        """Return the result for the frame exposed now; None for a lost frame."""
         if self._planes is None or time_s < self._freeze_s:
             self._planes = self._rendered(world_from_dome, time_s)
         frame = Frame(self._n_frames, time_s, *self._planes)
@@ -188,7 +188,7 @@ class SampledEye:
         self._last: Posture | Refusal | None = None
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
-        """Return what the frame exposed now gives."""
+        """Return the result for the frame exposed now; None for a lost frame."""
         self._last = self._look(self._net.posture_at(world_from_dome, time_s), time_s)
         return self._last
 

@@ -171,7 +171,7 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
-    """Return what to say of gains: margins at both delays, as it is and at worst; steps."""
+    """Return the report on gains: margins at both delays, nominal and worst case; steps."""
     usual, most = options.delay, options.greatest_delay
     lines = [
         f"{model.name}: margins with the model as it is, and in the worst corner (mass "

@@ -70,7 +70,7 @@ class FollowLogOutput:
         self._thread.start()
 
     def send(self, sample: LiveSample) -> None:
-        """Take in the pilot's last step; returns at once."""
+        """Take the pilot's last step; return at once."""
         report = self._pilot.latest
         if report is None or report is self._told:
             return
@@ -78,13 +78,13 @@ class FollowLogOutput:
         self._waiting.put((report, sample.scan.time_s, sample.scan.posture))
 
     def health(self) -> PartHealth:
-        """Return whether it can be written."""
+        """Return whether the log can be written."""
         if self._trouble:
             return PartHealth(self.name, State.FAULT, self._trouble)
         return PartHealth(self.name, State.OK)
 
     def close(self) -> None:
-        """Write what is left and close the file; further calls do nothing."""
+        """Write the remaining rows and close the file; further calls do nothing."""
         if self._thread.is_alive():
             self._waiting.put(None)
             self._thread.join(2.0)
@@ -154,7 +154,7 @@ class FollowRequest:
 def follow_and_tell(
     request: FollowRequest, tell: Callable[[str], object], keys: TextIO | None = None
 ) -> int:
-    """Run until the source ends or somebody stops it; returns 0.
+    """Run until the source ends or the user stops it; return 0.
 
     It starts disengaged: a line on `keys` (the terminal) engages or disengages.
 
@@ -192,7 +192,7 @@ def _runner(
     holder: SetpointHolder,
     tell: Callable[[str], object],
 ) -> LiveRunner:
-    """Make the live loop; what was made before a part that fails is closed."""
+    """Make the live loop; if a part fails, the parts made before it are closed."""
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
         undo.callback(pilot.close)

@@ -64,7 +64,7 @@ class WaterFollower:
         return self._sigma
 
     def offer(self, frame: Frame) -> None:
-        """Have a frame looked at when it is due and nobody is looking."""
+        """Pass on a frame for reading the target, when one is due and the thread is idle."""
         if self._following.is_due(frame) and self._frames.empty():
             self._frames.put_nowait(frame)
 
@@ -257,7 +257,7 @@ class LiveRequest:
 
 
 def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
-    """Run until the source ends or somebody stops it, which is how live runs end; returns 0.
+    """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises
     ------
@@ -309,7 +309,7 @@ def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> l
 
 
 def recorder_options(scanner: ScannerOptions, *, video: bool) -> RecorderOptions:
-    """Return what recordings hold: with `video` the pictures, too."""
+    """Return the options of recordings; with `video`, pictures are included."""
     return RecorderOptions(pictures=PictureFormat.JPEG if video else None, scanner=scanner)
 
 

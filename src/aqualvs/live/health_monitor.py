@@ -62,7 +62,7 @@ class FrozenOptions:
     share: float = 0.65
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -209,7 +209,7 @@ class DriftWatch:
             self._thread.start()
 
     def offer(self, scan: Scan) -> None:
-        """Pass a scan on; one that finds the thread busy is not missed."""
+        """Pass a scan on; scans are skipped while the thread is busy."""
         if self._thread is not None and not self._scans.full():
             self._scans.put_nowait(scan)
 

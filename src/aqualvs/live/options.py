@@ -66,7 +66,7 @@ class VehicleSetup:
 
 
 def load_vehicle(path: Path) -> VehicleSetup:
-    """Return what a vehicle file says; its key file is looked for beside it.
+    """Return the contents of a vehicle file; its key file is looked for beside it.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def serve_page(
     recorder: RecorderSwitch | None,
     tell: Callable[[str], object],
 ) -> Output:
-    """Serve the page and tell its address.
+    """Serve the page and print its address.
 
     Parameters
     ----------

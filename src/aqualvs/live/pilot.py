@@ -55,7 +55,7 @@ class Watchdog:
         self._thread.start()
 
     def send(self, effort: Effort, known_s: float) -> Effort:
-        """Send an effort, or neutral in its place if it is too old already; return what was sent.
+        """Send an effort, or neutral if it is already too old; return the sent effort.
 
         Parameters
         ----------
@@ -155,14 +155,14 @@ class PilotReport:
 
     @property
     def colour(self) -> State:
-        """How it is, for the health list."""
+        """State for the health list."""
         if not self.engaged:
             return State.OFF
         return State.WARN if self.reason or self.state.doubt else State.OK
 
 
 def words_of(reason: Reason, state: VehicleState) -> str:
-    """Return why efforts do not pass, with what the vehicle says of it."""
+    """Return the reason why efforts do not pass, with the vehicle's report of it."""
     told = state.mode_name if reason in _TELL_MODE else ""
     if reason is Reason.CONFLICT and state.mode is not Mode.CONFLICT:
         told = state.rival
@@ -170,7 +170,7 @@ def words_of(reason: Reason, state: VehicleState) -> str:
 
 
 def _aim(guidance: Guidance) -> str:
-    """Return what a mission aims at."""
+    """Return the aim of a mission."""
     setpoint = guidance.setpoint
     if setpoint is None:
         return guidance.stage.value.replace("_", " ")
@@ -232,7 +232,7 @@ class Pilot:
         return self._latest
 
     def engage(self) -> None:
-        """Take over, as somebody wants it.
+        """Engage on request of the user.
 
         Raises
         ------
@@ -261,7 +261,7 @@ class Pilot:
         _log.info("pilot: disengaged")
 
     def send(self, sample: LiveSample) -> None:
-        """Take one step; never waits, and never raises for what control or vehicle do."""
+        """Take one step; never waits, and never raises faults of control or vehicle."""
         with self._stepping:
             now_s = time.monotonic()
             try:
@@ -283,7 +283,7 @@ class Pilot:
         self._tell(self._latest)
 
     def health(self) -> PartHealth:
-        """Return what the pilot does, or why it does not."""
+        """Return the pilot's action, or the reason for none."""
         trouble = self._fault or self._unsent
         if trouble:
             return PartHealth(self.name, State.FAULT, trouble, self._n_unsent)
@@ -302,7 +302,7 @@ class Pilot:
         self._vehicle.close()
 
     def _begin(self) -> tuple[Reason | None, VehicleState]:
-        """Let control begin; return why not, and what the vehicle told."""
+        """Start control; return the reason if it cannot start, and the vehicle's state."""
         try:
             state = self._vehicle.state()
             return self._steering.engage(time.monotonic(), state), state
@@ -333,7 +333,7 @@ class Pilot:
         return posture
 
     def _obey(self, decision: Decision) -> Effort:
-        """Send what was decided; return what went out."""
+        """Send the decided effort; return the sent one."""
         if decision.engaged:
             self._goodbyes = -1
             return self._send(decision.effort)
@@ -346,7 +346,7 @@ class Pilot:
         return NEUTRAL
 
     def _send(self, effort: Effort) -> Effort:
-        """Send an effort that rests on the last posture; return what went out."""
+        """Send an effort that rests on the last posture; return the sent one."""
         try:
             sent = self._watchdog.send(effort, self._seen_s)
         except (OSError, ValueError) as fault:
@@ -357,7 +357,7 @@ class Pilot:
         return sent
 
     def _give_up(self, fault: Exception) -> None:
-        """Stop after what control has raised, until somebody engages again."""
+        """Stop after an exception of control, until engaged again."""
         words = f"stopped by a fault: {fault}"
         if words != self._fault:
             _log.exception("pilot: %s", words)
@@ -381,7 +381,7 @@ class Pilot:
         return self._holder is not None and self._holder.setpoint is not None
 
     def _tell(self, report: PilotReport) -> None:
-        """Log what has changed."""
+        """Log changes."""
         told = (report.engaged, report.reason, report.state.doubt)
         if told == self._told:
             return

@@ -105,7 +105,7 @@ class OutputWorker:
         return self._output.name
 
     def offer(self, sample: LiveSample) -> None:
-        """Pass a sample on; returns at once."""
+        """Pass a sample on; return at once."""
         if self._thread is None:
             self._send(sample)
             return
@@ -117,7 +117,7 @@ class OutputWorker:
             self._changed.notify()
 
     def health(self) -> PartHealth:
-        """Return how the output is, with what could not be handed to it."""
+        """Return the state of the output, with the number of dropped samples."""
         try:
             found = self._output.health()
         except Exception as fault:
@@ -130,7 +130,7 @@ class OutputWorker:
         return replace(found, n_dropped=found.n_dropped + self._n_dropped)
 
     def close(self) -> None:
-        """Let what waits go out, for a few seconds at most, and close the output."""
+        """Send waiting samples, for a few seconds at most, and close the output."""
         if self._thread is not None:
             with self._changed:
                 self._closing = True
@@ -415,7 +415,7 @@ class LiveRunner:
         self._health, self._health_ns = Health(), 0
 
     def run(self, stop: Callable[[], bool]) -> AqualvsError | None:
-        """Run until the feed ends or `stop` returns True; returns what ended the feed, if a fault.
+        """Run until the feed ends or `stop` returns True; return the fault that ended the feed.
 
         Whatever fails meanwhile is logged and shown in the samples' health.
         """
@@ -436,7 +436,7 @@ class LiveRunner:
         return self._reader.fault
 
     def health(self) -> Health:
-        """Return how the run goes; figures are at most a tenth of a second old."""
+        """Return the health of the run; figures are at most a tenth of a second old."""
         now_ns = time.monotonic_ns()
         if now_ns - self._health_ns > 1e9 * _HEALTH_EVERY_S:
             self._health_ns = now_ns

@@ -107,7 +107,7 @@ def rig_yaml(rig: Rig) -> str:
 
 
 def rig_exact(rig: Rig) -> str:
-    """Return what a rig file rounds, as JSON, whose numbers lead back to the same bits."""
+    """Return the exact values of the numbers that a rig file rounds, as JSON."""
     pose, dome = rig.dome_from_cam, rig.dome
     found = {
         "rotation": pose.rotation.tolist(),
@@ -339,7 +339,7 @@ class Topic:
 
 
 def _definition(own: str, *parts: tuple[str, str]) -> str:
-    """Return a definition with those of its parts, as ROS 2's recordings have them."""
+    """Return a definition with those of its parts, in the form of ROS 2's recordings."""
     line = 80 * "=" + "\n"
     return "".join([own, *(f"{line}MSG: {name}\n{text}" for name, text in parts)])
 

@@ -103,7 +103,7 @@ class ChunkBuilder:
         self.n_bytes += len(parts[0]) + len(parts[1])
 
     def seal(self) -> Chunk:
-        """Return the chunk of what was gathered: at least one message."""
+        """Return the chunk of the gathered messages, at least one."""
         raw = b"".join(self._parts)
         packed = _codec().compress(raw, asbytes=True)
         times = [entries[end][0] for entries in self._entries.values() for end in (0, -1)]
@@ -209,11 +209,11 @@ class GrowingFile:
             self._list_pending()
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk."""
+        """Wait until all written data are on the disk."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Cut off what the file has too much, and close it; further calls do nothing.
+        """Cut off the unused end of the file and close it; further calls do nothing.
 
         It is closed and readable in any case.
         """
@@ -268,7 +268,7 @@ class GrowingFile:
         self._unlisted.append(index)
 
     def _list_pending(self) -> None:
-        """Add what the summary lacks."""
+        """Add missing records to the summary."""
         while self._unlisted:
             limit = self._size - FOOTER_BYTES
             self._tail = self._insert(self._tail, self._unlisted[0], limit)
@@ -294,13 +294,13 @@ class GrowingFile:
         self._summary_at, self._tail, self._size, self._settled = at, tail, size, False
 
     def _size_for(self, size: int, n_data: int) -> int:
-        """Return the size of a file that is longer by what data and summary will need."""
+        """Return a file size with room for more data and their summary."""
         summary_bytes = self._summary_bytes()
         data_bytes = max(_DATA_BYTES, _DATA_PER_SUMMARY * summary_bytes) + n_data
         return _up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
 
     def _settle(self) -> None:
-        """Put the summary near the end of the file and free what is before it."""
+        """Move the summary near the end of the file and free the space before it."""
         at = _down(self._size - FOOTER_BYTES - self._summary_room())
         limit = at - DATA_END_BYTES
         # Zeros, not a hole: adding to the summary then needs no new place on the disk.

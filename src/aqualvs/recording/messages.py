@@ -72,7 +72,7 @@ def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
 
 
 def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
-    """Return what was detected, bit for bit, or why nothing was measured."""
+    """Return the detected stripes, bit for bit, or the reason of a refusal."""
     scan, to = sample.scan, CdrWriter()
     refusal = scan.posture if not sample.returns and not scan.posture else None
     to.header(stamp_ns, FRAME_ID)
@@ -165,7 +165,7 @@ def rig_texts(rig: Rig, options: ScannerOptions) -> tuple[str, str, str]:
 
 
 def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
-    """Return what the run measures with, from `rig_texts`."""
+    """Return the message of rig and options, from `rig_texts`."""
     to = CdrWriter()
     to.header(stamp_ns, FRAME_ID)
     for words in texts:
@@ -350,7 +350,7 @@ class SampleEncoder:
         yield from self.rig_again(stamp_ns)
 
     def rig_again(self, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
-        """Yield the rig that was told last, to the same bit."""
+        """Yield the last recorded rig once more, bit for bit."""
         if self._rig_texts is not None:
             yield RIG, rig_message(self._rig_texts, stamp_ns)
 
@@ -407,6 +407,6 @@ class RecordClock:
 
 
 def _is_silence(sample: LiveSample) -> bool:
-    """Return whether a sample stands for no frame at all."""
+    """Return whether a sample reports a silent stream instead of a frame."""
     posture = sample.scan.posture
     return isinstance(posture, Refusal) and posture.reason is Reason.NO_FRAMES

@@ -106,7 +106,7 @@ class Recording:
             self._flush()
 
     def close(self) -> None:
-        """Write what is left and close the file; further calls do nothing."""
+        """Write the remaining messages and close the file; further calls do nothing."""
         if self._closed:
             return
         self._closed = True
@@ -227,7 +227,7 @@ class Recorder:
         return PartHealth(self.name, State.OK, detail)
 
     def close(self) -> None:
-        """Write what is left and close the file; further calls do nothing."""
+        """Write the remaining messages and close the file; further calls do nothing."""
         with self._changed:
             if not self._closing:
                 self._chunks.finish()
@@ -393,7 +393,7 @@ class RecorderSwitch:
             recorder.send(sample)
 
     def health(self) -> PartHealth:
-        """Return how the recording is; off says what the last one was."""
+        """Return the state of the recording; when off, that of the last one."""
         recorder = self._recorder
         if recorder is not None:
             return recorder.health()

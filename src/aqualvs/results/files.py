@@ -167,7 +167,7 @@ def read_json(path: Path) -> Any:
 
 
 def explain(path: Path, fault: OSError) -> str:
-    """Return what is wrong with `path` and what to do about it."""
+    """Return the fault of `path` and its remedy."""
     if fault.errno in _FULL:
         return (
             f"{path}: the disk is full ({fault.strerror}); what was written stays readable, "
@@ -231,7 +231,7 @@ class Claim(Closing):
                 _note(folder, {name: {_WRITER: writer, _MARK: None} for name in names})
 
     def close(self) -> None:
-        """Note what the files are now; call it when they are complete."""
+        """Note size and checksum of the files; call it when they are complete."""
         for folder, names in self._names.items():
             written = {
                 name: {_WRITER: self._writer, _MARK: _mark(folder / name)}
@@ -283,7 +283,7 @@ def _note(folder: Path, entries: Mapping[str, dict[str, Any] | None]) -> None:
 
 
 def _mark(path: Path) -> list[int] | None:
-    """Return size and checksum of a file's two ends; None for a folder or what cannot be read."""
+    """Return size and checksum of a file's two ends; None for a folder or an unreadable file."""
     try:
         if not path.is_file():
             return None

@@ -239,7 +239,7 @@ class RunOutputs:
         fault: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Complete the folder: `points.parquet` and `points.ply` stand for the journal."""
+        """Complete the folder: `points.parquet` and `points.ply` replace the journal."""
         if isinstance(fault, OutputError):
             self._leave_as_it_is(fault)
             return
@@ -257,7 +257,7 @@ class RunOutputs:
             raise refusal from full
 
     def _leave_as_it_is(self, fault: OutputError) -> None:
-        """Close what is open without writing more than a disk in need can take."""
+        """Close open files, writing no more than a full disk can take."""
         self._discard_export()
         self._points.abandon()
         self._posture.close()

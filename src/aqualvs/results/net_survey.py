@@ -100,7 +100,7 @@ class NetPass:
         self._n_frames = 0
 
     def add(self, scan: Scan) -> None:
-        """Take the next scan; what is not a net is passed over."""
+        """Take the next scan; scans of other targets than nets are ignored."""
         self._n_frames += 1
         posture = scan.posture
         if not isinstance(posture, Posture) or not _is_net(scan):
@@ -111,7 +111,7 @@ class NetPass:
         self._condition.add(scan)
 
     def write(self, folder: Path, video: Path | None = None) -> NetResult:
-        """Finish, write the files of `NET_FILES` and return what was found.
+        """Finish, write the files of `NET_FILES` and return the result.
 
         Parameters
         ----------
@@ -285,7 +285,7 @@ def _posture(row: dict[str, str]) -> Posture | Refusal:
 
 
 def _variances(row: dict[str, str], names: tuple[str, ...]) -> FloatArray:
-    """Return a covariance (3, 3) without what is between its numbers."""
+    """Return a covariance (3, 3) with zero correlations."""
     sigma = np.array([_number(row.get(name)) for name in names])
     sigma[1:] = np.deg2rad(sigma[1:])
     return np.diag(sigma**2)
@@ -329,7 +329,7 @@ class _Points:
 
 
 def _pieces(run_folder: Path) -> Iterator[tuple[int, Columns]]:
-    """Yield each frame's points, in pieces where the file's batches part them."""
+    """Yield each frame's points, in parts where the file's batches split them."""
     for columns in _batches(run_folder):
         frame = columns["frame"]
         edges = [0, *(np.flatnonzero(np.diff(frame)) + 1).tolist(), len(frame)]
@@ -383,7 +383,7 @@ def _plain(name: str, column: Any) -> NDArray[Any]:
 
 
 def _scan_points(parts: list[Columns]) -> ScanPoints:
-    """Join the pieces of one frame's points."""
+    """Join the parts of one frame's points."""
 
     def of(*names: str) -> FloatArray:
         columns = [np.concatenate([part[name] for part in parts] or [_NONE]) for name in names]

@@ -102,7 +102,7 @@ class PointsJournal:
         self._file.close()
 
     def _append(self) -> None:
-        """Hand over what Arrow has written as many small parts."""
+        """Append Arrow's many small writes as one piece."""
         self._file.append(self._waiting.getvalue())
         self._waiting.seek(0)
         self._waiting.truncate()
@@ -264,7 +264,7 @@ class PointsExport:
         return self._n_points
 
     def discard(self) -> None:
-        """Remove what has been written of files that will not be finished."""
+        """Remove the files that will not be finished."""
         with contextlib.suppress(OSError):
             self._open_files.close()
         for draft in self._drafts:

@@ -113,7 +113,7 @@ def read_run_yaml(folder: Path) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this package, of Python and of what computes the numbers."""
+    """Return the versions of this package, of Python and of the numerical packages."""
     found = {"aqualvs": __version__, "python": platform.python_version(), "system": sys.platform}
     return found | {name: _installed(name) for name in _LIBRARIES}
 
@@ -348,7 +348,7 @@ def check_fits(source: FrameSource, rig: Rig) -> None:
 
 
 def source_facts(source: FrameSource) -> dict[str, Any]:
-    """Return what identifies a source without reading all of it."""
+    """Return data that identify a source without reading all of it."""
     found: dict[str, Any] = {"name": source.name}
     path = Path(source.name)
     if path.exists():

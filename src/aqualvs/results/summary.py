@@ -54,7 +54,7 @@ class TruthComparison:
     yaw_deg: Deviation
 
     def lines(self) -> list[str]:
-        """Return the comparison in words."""
+        """Return the comparison as lines of text."""
         return [
             f"against the truth in {self.n_compared} frames "
             f"({self.n_missed} with truth but without posture):",
@@ -230,7 +230,7 @@ class Tally:
         return found
 
     def lines(self) -> list[str]:
-        """Return the summary in words."""
+        """Return the summary as lines of text."""
         if not self.n_frames:
             return ["no frame was measured"]
         share = 100 * self.n_valid / self.n_frames

@@ -160,7 +160,7 @@ def _bound_unpacking() -> None:
 
 
 def _bounded(unpacker: Callable[[], Any]) -> Callable[..., bytes]:
-    """Return what unpacks bytes that are whole and not too many."""
+    """Return a decompressor that limits the size of its output."""
 
     def unpack(packed: bytes, _size: int = 0) -> bytes:
         one = unpacker()
@@ -270,7 +270,7 @@ def _read(path: Path, stream: "_Bounded", topic: str | None) -> Iterator[tuple[A
 
 
 def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[tuple[Any, ...]]:
-    """Yield what the chunks of a topic hold, in the order of their times."""
+    """Yield the messages in the chunks of a topic, in the order of their times."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk, Message
 
@@ -288,7 +288,7 @@ def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[t
 
 
 def _by_order(stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield what a file without index holds, from its beginning on."""
+    """Yield the messages of a file without index, from its beginning on."""
     from mcap.records import Channel, Chunk, Message, Schema
     from mcap.stream_reader import StreamReader
 
@@ -329,7 +329,7 @@ def _summary(stream: "_Bounded") -> Any:
 
 
 def _mcap_faults() -> tuple[type[Exception], ...]:
-    """Return what a damaged file raises, here and in the package that reads it."""
+    """Return the exceptions that a damaged file causes, here and in the package that reads it."""
     from mcap.exceptions import McapError
     from pyarrow import ArrowException
 
@@ -367,7 +367,7 @@ def _opened_mcap(path: Path) -> Iterator[_Bounded]:
 
 
 def _reader(path: Path, schema: Any, encoding: str) -> _Reader:
-    """Return what reads the messages of a schema."""
+    """Return the function that decodes the messages of a schema."""
     if encoding == "protobuf":
         return image_of_protobuf(schema.name)
     if encoding == "json":

@@ -219,7 +219,7 @@ class Feed(Protocol):
 
     @property
     def name(self) -> str:
-        """How health and messages call it."""
+        """Name of the source in health reports and messages."""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until the source ends (a file) or `close` is called (a stream).
@@ -263,7 +263,7 @@ class FrameSource(Protocol):
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the source in messages."""
 
     @property
     def size_px(self) -> tuple[int, int]:

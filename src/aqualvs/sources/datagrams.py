@@ -124,7 +124,7 @@ class Datagrams:
             return None
 
     def forget(self) -> int:
-        """Drop what is waiting; returns how many datagrams that were."""
+        """Drop all waiting datagrams; return their number."""
         n = self._waiting.qsize()
         for _ in range(n):
             self.get(0.0)
@@ -155,7 +155,7 @@ class Datagrams:
 
 
 def why_not(address: UdpAddress, fault: OSError) -> str:
-    """Say in a few words why one cannot listen.
+    """Return in a few words why listening is impossible.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ _MAX_LAG_S = 2.0
 
 
 def kind_of(datagram: bytes) -> str | None:
-    """Return what a datagram holds, or None if that is none of the kinds known here.
+    """Return the kind of content of a datagram, or None if it is unknown.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ class Inbox:
         return peeked or self._datagrams.get(timeout)
 
     def is_late(self, datagram: Datagram) -> bool:
-        """Return whether decoding lags too far behind; what waits is then dropped.
+        """Return whether decoding lags too far behind; if so, drop the waiting datagrams.
 
         Parameters
         ----------

@@ -54,7 +54,7 @@ _CODECS = {
 
 
 def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
-    """Return what reads the packets of a stream; None for a codec without such units.
+    """Return the function that reads a stream's packets; None for a codec without such units.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def _frame_number_bits(unit: bytes) -> int | None:
 
 
 def _skip_chroma(bits: _Bits) -> bool:
-    """Pass the fields of the high profiles; False if scaling matrices follow."""
+    """Skip the fields of the high profiles; return False if scaling matrices follow."""
     if bits.golomb() == 3:
         bits.read(1)
     bits.golomb()
@@ -231,7 +231,7 @@ def _skip_chroma(bits: _Bits) -> bool:
 
 
 def _skip_order(bits: _Bits) -> bool:
-    """Pass the fields of the picture order; False for its type 1, which nobody sends."""
+    """Skip the fields of the picture order; return False for its rare type 1."""
     kind = bits.golomb()
     if kind == 0:
         bits.golomb()

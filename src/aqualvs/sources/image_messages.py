@@ -171,7 +171,7 @@ _DATA = {"foxglove.CompressedImage": 2, "foxglove.CompressedVideo": 3}
 
 
 def kind_of_schema(name: str) -> str | None:
-    """Return what kind of image a schema holds, or None.
+    """Return the kind of image of a schema, or None.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def image_of_json(content: bytes) -> ImageMessage:
 
 
 def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
-    """Return what reads a Foxglove message written as Protobuf.
+    """Return the function that decodes a Foxglove message written as Protobuf.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ _before: tuple[int, int] = (-1, 0)
 
 @contextlib.contextmanager
 def quiet_decoders() -> Iterator[None]:
-    """Lead nowhere what OpenCV and the libraries below it print to standard error.
+    """Discard output of OpenCV and the libraries below it on standard error.
 
     They know nothing of Python's streams, so the file of the process itself is replaced meanwhile,
     for all of its threads.
@@ -50,7 +50,7 @@ def quiet_decoders() -> Iterator[None]:
 
 
 def _lead_nowhere() -> int:
-    """Lead standard error nowhere; return a copy of what it was, -1 where it is closed."""
+    """Discard standard error; return a copy of its descriptor, -1 where it is closed."""
     try:
         kept = os.dup(2)
     except OSError:

@@ -223,7 +223,7 @@ class Reception:
             self._over = words
 
     def health(self) -> PartHealth:
-        """Return the state in words."""
+        """Return the state of the reception."""
         now = time.monotonic()
         with self._lock:
             self._forget(now)
@@ -385,7 +385,7 @@ class LiveFrames:
         self._n_held = 0
 
     def connect(self, codec: VideoCodecContext, tick: float, *, hears_losses: bool) -> None:
-        """Begin with a new decoder; what the old one held is lost.
+        """Begin with a new decoder; pictures in the old one are lost.
 
         Parameters
         ----------
@@ -402,7 +402,7 @@ class LiveFrames:
         self._clock.set_tick(tick)
 
     def restart(self) -> None:
-        """Go on with a sender that has begun anew, on the same decoder."""
+        """Continue with a sender that has started anew, on the same decoder."""
         self.lose()
         self._ledger.restart()
         self._lossy = False
@@ -461,7 +461,7 @@ class LiveFrames:
         return Frame(index, at, luma, chroma)
 
     def _number(self, picture: VideoFrame, at: float) -> int:
-        """Return the picture's number; after a loss the time tells how many are missing."""
+        """Return the picture's number; after a loss, the time gives the number of missing ones."""
         number = self._ledger.number(picture.pts)
         if self._first is None:
             self._first = number  # What came before was joined too late, not lost.

@@ -74,14 +74,14 @@ def header(profile: str, library: str) -> bytes:
 
 
 def schema(number: int, name: str, definition: str) -> bytes:
-    """Return what describes a kind of message, in ROS 2's language for messages."""
+    """Return the record of a message definition, in ROS 2's language for messages."""
     content = definition.encode("utf-8")
     head_part = struct.pack("<H", number) + text(name) + text("ros2msg")
     return record(Op.SCHEMA, head_part, struct.pack("<I", len(content)), content)
 
 
 def channel(number: int, schema_number: int, topic: str) -> bytes:
-    """Return what says that messages of a schema come on a topic, in ROS 2's encoding."""
+    """Return the record of a topic and the schema of its messages, in ROS 2's encoding."""
     numbers = struct.pack("<HH", number, schema_number)
     return record(Op.CHANNEL, numbers, text(topic), text("cdr"), struct.pack("<I", 0))
 
@@ -326,7 +326,7 @@ class McapFile:
 
 
 def _summary(file: BinaryIO, size: int) -> _Listing:
-    """Return what the summary tells; nothing where there is none that can be read to its end."""
+    """Return the contents of the summary; empty if it cannot be read to its end."""
     file.seek(max(0, size - FOOTER_BYTES))
     end = file.read(FOOTER_BYTES)
     if len(end) < FOOTER_BYTES or end[0] != Op.FOOTER:
@@ -347,7 +347,7 @@ def _summary(file: BinaryIO, size: int) -> _Listing:
 
 
 def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
-    """Return what is found from the beginning on, or before the first chunk."""
+    """Return the contents found from the beginning on, or before the first chunk."""
     found, at = _Listing(), len(MAGIC)
     while (first := _record_head(file, at)) is not None:
         kind, length = first
@@ -395,7 +395,7 @@ def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, .
 
 
 def _note(found: _Listing, kind: int, content: bytes) -> None:
-    """Take in a record.
+    """Add a record to the contents.
 
     Raises
     ------

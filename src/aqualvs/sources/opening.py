@@ -229,7 +229,7 @@ def is_bag(path: Path) -> bool:
 
 
 def _check_address(where: str) -> None:
-    """Refuse what no stream can have for an address, which FFmpeg would try again and again."""
+    """Refuse impossible addresses, which FFmpeg would try again and again."""
     shown = where if where.isprintable() else repr(where)
     remedy = "write SCHEME://HOST:PORT, such as rtsp://192.168.2.10:554/video or udp://:5600"
     try:

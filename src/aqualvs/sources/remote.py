@@ -92,7 +92,7 @@ class Connection:
 
 
 def _words(fault: Exception) -> str:
-    """Return what went wrong in a few words."""
+    """Return the fault in a few words."""
     if isinstance(fault, av.error.ExitError):
         return "no answer in time"
     if isinstance(fault, OSError | av.error.FFmpegError) and fault.strerror:
@@ -160,7 +160,7 @@ class RemoteFeed:
         return self._reception.health()
 
     def close(self) -> None:
-        """End the iteration; what FFmpeg still waits for ends by itself within seconds."""
+        """End the iteration; pending calls of FFmpeg end by themselves within seconds."""
         self._closed.set()
         self._reception.end("closed")
         if self._connection is not None:

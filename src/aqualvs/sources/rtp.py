@@ -287,7 +287,7 @@ class H264Depacketizer:
         return done
 
     def _note(self, ordered: Ordered) -> None:
-        """Keep in mind what is missing before a packet."""
+        """Remember that packets are missing before a packet."""
         if ordered.is_restart:
             self._is_restart = self._gap_before = True
             self._unwrap = Unwrapper(32)

@@ -206,7 +206,7 @@ class _Packets:
         return "" if self._cuts[:1] == [0] else "no key frame at the beginning"
 
     def spans(self, n_least: int) -> tuple[Span, ...]:
-        """Return the parts, each of which begins at a picture that needs none before it."""
+        """Return the spans, each of which begins at a picture that needs none before it."""
         starts = _far_enough(self._sound_cuts(), n_least)
         edges = [*starts, len(self._pts)]
         origin = min(self._pts)
@@ -266,7 +266,7 @@ def _far_enough(cuts: Sequence[int], n_least: int) -> list[int]:
 
 
 def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
-    """Return in words that the file may hold less than it says; empty if all is there."""
+    """Return a note if the file may hold less than its container states; empty if not."""
     if stream.time_base is None:
         return "no clock"
     if stream.frames:

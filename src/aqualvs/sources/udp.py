@@ -395,7 +395,7 @@ class UdpFeed:
         return found
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
-        """Yield frames of whatever kind comes, which may change."""
+        """Yield frames of any kind of content, which may change."""
         readers: dict[str, Callable[[Inbox], Iterator[Frame]]] = {
             RTP: RtpReader(self._frames, self._parameter_sets, self._payload_type).frames,
             TS: TransportReader(self._frames).frames,

@@ -174,7 +174,7 @@ class VideoSource(Closing):
         self._check_complete(n_delivered, last)
 
     def _pictures(self) -> Iterator[VideoFrame]:
-        """Decode what can be decoded, in order of presentation."""
+        """Decode all undamaged pictures, in order of presentation."""
         for packet in self._packets():
             self._ledger.expect(packet)
             if packet.is_corrupt and not self._damage_is_partial:

@@ -136,7 +136,7 @@ def read_binary(data: bytes, wanted: Iterable[str]) -> Records:
 def _scan(
     data: bytes, names: frozenset[str], places: dict[str, list[int]], formats: dict[str, Format]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Walk over the records, note where the wanted ones are and what they look like."""
+    """Walk over the records; note the places and formats of the wanted ones."""
     lengths: dict[int, int] = {_FMT: _FMT_LENGTH}
     lists: dict[int, list[int]] = {}
     skipped: list[tuple[int, int]] = []

@@ -88,7 +88,7 @@ def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
 
 
 def robust_sigma(values: FloatArray) -> float:
-    """Return the standard deviation that the median of the magnitudes stands for; 0 for none."""
+    """Return the standard deviation by the median of the magnitudes; 0 for none."""
     return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
 
 

@@ -232,7 +232,7 @@ _OTHERS = {
 
 
 def read_vehicle_log(path: str | Path) -> VehicleLog:
-    """Read a vehicle's log; the format is told from the content, not from the name.
+    """Read a vehicle's log; the content determines the format, not the name.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def read_vehicle_log(path: str | Path) -> VehicleLog:
 
 
 def _reader(head: bytes, path: Path) -> Callable[[Path], VehicleLog]:
-    """Return what reads such a file."""
+    """Return the function that reads a file with such content."""
     if looks_like_dataflash(head):
         return read_dataflash
     if looks_like_dataflash_text(head):

@@ -343,7 +343,7 @@ def _words(matches: list[Match], channels: tuple[Channel, ...], shared_s: float)
 
 
 def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
-    """Add what the clocks say."""
+    """Add a comparison with the offset by the clocks."""
     off = start.offset_s - found.offset_s
     doubt = math.hypot(found.sigma_s, start.sigma_s)
     verdict = "agree" if abs(off) <= _START_SIGMAS * doubt else "are not to be trusted"

@@ -260,7 +260,7 @@ class VehicleLog:
         )
 
     def at(self, time_s: ArrayLike) -> VehicleState:
-        """Return the vehicle's state at other times; nothing is told across gaps.
+        """Return the vehicle's state at other times; values in gaps are not valid.
 
         Parameters
         ----------

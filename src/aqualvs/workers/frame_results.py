@@ -254,7 +254,7 @@ class Meter:
         ]
 
     def lost(self, scan: Scan) -> Measured:
-        """Complete the scan that stands for a lost frame."""
+        """Complete the scan of a lost frame."""
         return Measured(scan, self._bare(scan), is_lost=True)
 
     def _bare(self, scan: Scan) -> Posture | Refusal | None:
@@ -276,7 +276,7 @@ class Meter:
 def measured_blocks(
     blocks: Iterator[list[tuple[list[Scan], Frame]]], meter: Meter
 ) -> Iterator[list[Measured]]:
-    """Yield what is found in frames, and what stands for lost ones, in the order of the dive.
+    """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
     Parameters
     ----------

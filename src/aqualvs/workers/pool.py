@@ -227,7 +227,7 @@ class Crew(Closing):
         self._n_processes = min(n_processes, len(work.parts))
 
     def blocks(self) -> Iterator[list[Measured]]:
-        """Yield what is found, in the order of the dive.
+        """Yield the results, in the order of the dive.
 
         It ends before its time where a part is not what it was taken for, or a process has died:
         `is_done` is False then, and the rest is to be measured by other means, from `next_frame`.

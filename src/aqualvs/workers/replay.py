@@ -106,7 +106,7 @@ class Replay(Closing):
         self._black: ImagePlane = np.zeros((height, width), np.uint8)
 
     def __iter__(self) -> Iterator[ReplayedFrame]:
-        """Yield what was recorded, frame by frame.
+        """Yield the recorded frames.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class Replay(Closing):
         return self.measured(frame)[1]
 
     def measured(self, frame: Frame) -> tuple[Rig, Scan, dict[SearchAxis, Returns]]:
-        """Return the scan of a frame of this source, and what it was made with and of."""
+        """Return the scan of a frame of this source, with its rig and stripes."""
         recorded = frame.recorded if isinstance(frame, ReplayedFrame) else None
         if recorded is None:
             raise ValueError("a replay measures its own frames only")

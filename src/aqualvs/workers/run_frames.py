@@ -56,7 +56,7 @@ def ready(frames: Iterator[Frame], source: FrameSource, window: FrameWindow) -> 
 def with_losses(
     frames: Iterator[Frame], first: int | None, n_water: float
 ) -> Iterator[tuple[list[Scan], Frame]]:
-    """Yield each frame with the scans that stand for the lost frames right before it.
+    """Yield each frame with the scans of the lost frames right before it.
 
     Frames are counted from `first` on; None takes none of them for lost.
     """
@@ -108,7 +108,7 @@ class RunMeasuring(Closing):
     def blocks(
         self, scanner: ScansFrames, *, one_by_one: bool
     ) -> Generator[list[Measured], None, None]:
-        """Yield what is found, in the order of the dive; to be closed before the source is.
+        """Yield the results, in the order of the dive; to be closed before the source is.
 
         Parameters
         ----------

@@ -71,7 +71,7 @@ class WaterFollowingScanner:
         self._last: IndexReading | None = None
 
     def process(self, frame: Frame) -> Scan:
-        """Measure a frame in the water as it is known now."""
+        """Measure a frame in the water as presently known."""
         if self.is_due(frame):
             self.look(frame)
         return self.scanner.process(frame)
@@ -82,7 +82,7 @@ class WaterFollowingScanner:
         return float("nan") if self._last is None else self._last.sigma
 
     def lines(self) -> list[str]:
-        """Return what the run's summary says of the water."""
+        """Return the lines of the run's summary about the water."""
         last = self._last
         if last is None:
             return [

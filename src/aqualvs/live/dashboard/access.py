@@ -117,7 +117,7 @@ class Controls:
         self.setpoint, self.recorder = setpoint, recorder
 
     def carry_out(self, command: Command) -> None:
-        """Do what a page with the right to command asks for.
+        """Carry out a command of a page that has the right to command.
 
         Raises
         ------
@@ -168,11 +168,11 @@ class Access:
             return False
 
     def may_command(self, token: str) -> bool:
-        """Return whether somebody with this token may command."""
+        """Return whether this token gives the right to command."""
         return secrets.compare_digest(token.encode(), self.token.encode())
 
     def may_watch(self, token: str) -> bool:
-        """Return whether somebody with this token may see the data."""
+        """Return whether this token gives the right to see the data."""
         return self.is_local or self.may_command(token)
 
     def is_own_page(self, origin: str | None, host: str) -> bool:
@@ -228,7 +228,7 @@ def make_access(host: str, token: str | None) -> Access:
 
 
 def token_fault(token: str | None) -> str:
-    """Return what is wrong with a token that a user chose; "" if nothing is."""
+    """Return the fault of a token that a user chose; "" if there is none."""
     if token is None or len(token) >= _LEAST_TOKEN:
         return ""
     return f"--token: {len(token)} characters; choose at least {_LEAST_TOKEN}, or leave it out"

@@ -73,7 +73,7 @@ class Dashboard:
         self._state_s = self._picture_s = 0.0
 
     def send(self, sample: LiveSample) -> None:
-        """Send a sample, and now and then its picture behind the number of its frame."""
+        """Send a sample, and at intervals its picture behind the number of its frame."""
         now_s = time.monotonic()
         if not self._server.hub.n_watchers or now_s - self._state_s < 0.5 * _STATE_EVERY_S:
             return
@@ -116,7 +116,7 @@ class SwitchButton:
         self._switch.stop()
 
     def facts(self) -> Mapping[str, Any]:
-        """Return whether a recording is on, and its file or what is wrong."""
+        """Return whether a recording is on, and its file or its fault."""
         path, health = self._switch.path, self._switch.health()
         words = health.detail if health.state is State.FAULT else path.name if path else ""
         return {"on": path is not None, "words": words}
@@ -131,7 +131,7 @@ def start_dashboard(
     recorder: RecorderSwitch | None,
     tell: Callable[[str], object],
 ) -> Dashboard:
-    """Serve the page and tell its address; without a recorder, its button refuses.
+    """Serve the page and print its address; without a recorder, its button refuses.
 
     Raises
     ------

@@ -78,7 +78,7 @@ def page_state(sample: LiveSample, setpoint: Setpoint | None, recording: Mapping
 
 
 def rig_state(rig: Rig, *, may_command: bool) -> str:
-    """Return the message that begins a connection: what does not change."""
+    """Return the first message of a connection: the data that do not change."""
     near, far = rig.working_range
     found = {
         "kind": "rig",
@@ -148,7 +148,7 @@ def _part(part: PartHealth) -> dict[str, Any]:
 
 
 def _without_nan(value: Any) -> Any:
-    """Return the same with null for what is no number: JSON has no other word for it."""
+    """Return the same with null in place of NaN, which JSON does not have."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -183,7 +183,7 @@ class Watcher:
     _news: asyncio.Event = field(default_factory=asyncio.Event)
 
     def put(self, state: str, picture: bytes | None) -> None:
-        """Leave the latest; what has not been sent is replaced."""
+        """Replace the waiting state and picture by the latest."""
         self._state = state
         self._picture = picture if picture is not None else self._picture
         self._news.set()
@@ -404,7 +404,7 @@ class DashboardServer:
         return "" if self.hub.join(watcher) else "too many pages are open"
 
     async def _attend(self, socket: WebSocket, watcher: Watcher, peer: str) -> None:
-        """Send what is new and listen, until the page goes."""
+        """Send news and receive messages until the page closes."""
         beside = [
             asyncio.create_task(_send_news(socket, watcher)),
             asyncio.create_task(_make_room(socket, watcher, peer)),
@@ -479,7 +479,7 @@ def _refusing_malformed(app: ASGIApp) -> ASGIApp:
 
 
 async def _blueos(_request: Request) -> Response:
-    """Tell BlueOS, which looks for it at every port, what is served here."""
+    """Answer BlueOS, which asks every port for the service behind it."""
     return JSONResponse(
         {
             "name": "aqualvs",

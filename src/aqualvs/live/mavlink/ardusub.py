@@ -76,7 +76,7 @@ class PilotSticks:
         self._sent: deque[tuple[int, Sticks]] = deque(maxlen=_KEPT)
 
     def note(self, sticks: Sticks) -> None:
-        """Remember what we sent ourselves, now."""
+        """Remember the sticks that we send now."""
         self._sent.append((time.monotonic_ns(), sticks))
 
     def moved(self) -> bool:
@@ -113,7 +113,7 @@ class PilotSticks:
         return not vertical_is_ours and self._beyond(told, _VERTICAL, [])
 
     def _beyond(self, told: Any, channel: str, ours: list[int]) -> bool:
-        """Return whether a channel lies outside of what our own sticks can have made of it."""
+        """Return whether a channel is outside of the range that our own sticks explain."""
         pulse_us = getattr(told, channel)
         if not _LEAST_US <= pulse_us <= _MOST_US:
             return False
@@ -398,7 +398,7 @@ class ArduSubLink:
         return sent
 
     def _shape(self, beat: Received) -> None:
-        """Take out of the sticks what the vehicle, as it tells, makes of them."""
+        """Compensate the vehicle's reported conversion of the sticks."""
         if not isinstance(self._commander, StickCommander):
             return
         known: dict[str, float] = {}
@@ -410,7 +410,7 @@ class ArduSubLink:
             self._commander.keeps_place = keeps_place
 
     def _advise(self, parameters: dict[str, float]) -> None:
-        """Log once what the vehicle's settings mean, as soon as they are known or silent."""
+        """Log advice on the vehicle's settings once, when they are known or stay unanswered."""
         if self._advised or self.options.command is not Command.STICKS:
             return
         if not (StationRange(parameters).known or self._watch.was_patient):
@@ -440,7 +440,7 @@ class ArduSubLink:
         return Mode.OURS, name
 
     def _is_ignored(self, parameters: dict[str, float]) -> bool:
-        """Return whether the vehicle has told that it takes sticks of others only."""
+        """Return whether the vehicle has reported that it takes only others' sticks."""
         obeyed = StationRange(parameters)
         by_sticks = self.options.command is Command.STICKS
         return by_sticks and obeyed.known and self.options.ground_station not in obeyed

@@ -51,14 +51,14 @@ class StickResponse:
         self._turns = _Pairs()
 
     def note(self, sticks: Sticks) -> None:
-        """Remember what we send now."""
+        """Remember the sticks that we send now."""
         now_s = time.monotonic()
         if self._stick is None or now_s - self._stick[0] > _LONGEST_STICK_S:
             self._began_s = now_s
         self._stick = now_s, sticks
 
     def doubt(self) -> str:
-        """Return why the vehicle seems not to obey, empty if it does or nothing is known."""
+        """Return why the vehicle seems not to obey; empty if it does or nothing is known."""
         now_s, stick = time.monotonic(), self._stick
         if stick is None or now_s - stick[0] > _LONGEST_STICK_S:
             for pairs in (*self._channels.values(), self._turns):
@@ -76,7 +76,7 @@ class StickResponse:
         return "RC_CHANNELS is not told: whether our sticks are obeyed is not seen"
 
     def _take(self, now_s: float, sticks: Sticks) -> None:
-        """Pair what has come since the last look with our stick."""
+        """Pair the messages since the last call with our stick."""
         told = self._new("RC_CHANNELS")
         if told is not None:
             for channel, axis in _AXES:
@@ -156,7 +156,7 @@ class Commander(Protocol):
     """Interface of a converter from efforts to messages."""
 
     def message(self, effort: Effort) -> Packable:
-        """Return what to send for an effort of finite parts."""
+        """Return the message for an effort of finite parts."""
 
 
 def is_finite(effort: Effort) -> bool:

@@ -77,7 +77,7 @@ class StationRange:
 
     @property
     def known(self) -> bool:
-        """Whether the vehicle has told."""
+        """Whether the vehicle has reported them."""
         return self._least is not None
 
     def __contains__(self, system: int) -> bool:
@@ -108,7 +108,7 @@ class ParameterWatch:
         self._next_s, self._n_asked = float("-inf"), 0
 
     def read(self) -> dict[str, float]:
-        """Return what is known, and ask for the rest when it is time."""
+        """Return the known parameters, and request the others when it is time."""
         known = self._link.parameters()
         missing = [name for name in self._names if name not in known]
         now_s = time.monotonic()
@@ -126,7 +126,7 @@ class ParameterWatch:
 
 
 def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
-    """Say whether the vehicle obeys sticks that are sent in a ground station's name."""
+    """Advise whether the vehicle obeys sticks that are sent in a ground station's name."""
     obeyed = StationRange(parameters)
     if not obeyed.known:
         return Advice(
@@ -148,7 +148,7 @@ def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
 
 
 def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
-    """Say what the pilot-input fail-safe does when efforts end."""
+    """Advise on the effect of the pilot-input fail-safe when efforts end."""
     action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
     found = []
     if action is None:
@@ -196,7 +196,7 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
 def advise_on_speed(
     parameters: Mapping[str, float], full_climb_rate: float = FULL_CLIMB_RATE
 ) -> list[Advice]:
-    """Say what a full vertical stick asks for, beside what gains take for granted.
+    """Advise on the climb rate of a full vertical stick, compared with the gains' assumption.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def advise_on_speed(
 def advise_on_distance(
     parameters: Mapping[str, float], working_range: tuple[float, float] | None = None
 ) -> list[Advice]:
-    """Say what the vehicle makes of `DISTANCE_SENSOR`.
+    """Advise on the vehicle's use of `DISTANCE_SENSOR`.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def _limits_advice(
 def _first(
     parameters: Mapping[str, float], names: tuple[tuple[str, float], ...]
 ) -> tuple[str, float] | None:
-    """Return the first name that was told, and its value in metres."""
+    """Return the first name with a reported value, and the value in metres."""
     told = [(name, unit * parameters[name]) for name, unit in names if name in parameters]
     return told[0] if told else None
 

@@ -240,12 +240,12 @@ class MavlinkLink:
 
     @property
     def conflict(self) -> str:
-        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        """Contradiction between heartbeats of the vehicle; empty if there is none."""
         return self._peers.conflict
 
     @property
     def rival(self) -> str:
-        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        """Other address that speaks as the vehicle; empty if there is none."""
         return self._peers.rival
 
     def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
@@ -290,7 +290,7 @@ class MavlinkLink:
             self.send(asked, to_vehicle=True)
 
     def parameters(self) -> dict[str, float]:
-        """Return the parameters that the autopilot has told, whoever asked for them."""
+        """Return the parameters that the autopilot has sent, whoever requested them."""
         with self._receiving:
             return dict(self._parameters)
 
@@ -443,7 +443,7 @@ class MavlinkLink:
         return parser
 
     def _read(self, port: Port) -> None:
-        """Take in what has come, but not so much that sending has to wait."""
+        """Read incoming data, but not for so long that sending has to wait."""
         for _ in range(_READ_AT_ONCE):
             data, peer = port.read()
             if not data:
@@ -456,7 +456,7 @@ class MavlinkLink:
                     self._keep(peer, message)
 
     def _keep(self, peer: Peer, message: Any) -> None:
-        """Keep a message as the latest of its kind and sender."""
+        """Store a message as the latest of its kind and sender."""
         kind, received_ns = message.get_type(), time.monotonic_ns()
         sender = (message.get_srcSystem(), message.get_srcComponent())
         with self._receiving:
@@ -478,7 +478,7 @@ def _check_id(name: str, value: int) -> None:
 
 
 def _dialect() -> Any:
-    """Import pymavlink's messages; version 2, whatever the environment says."""
+    """Import pymavlink's messages in version 2, regardless of the environment."""
     try:
         return importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
     except ImportError as fault:

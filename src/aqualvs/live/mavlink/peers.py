@@ -209,14 +209,14 @@ class PeerTable:
 
     @property
     def conflict(self) -> str:
-        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        """Contradiction between heartbeats of the vehicle; empty if there is none."""
         with self._lock:
             contest = self._contest
             return contest.words if time.monotonic() < contest.until_s else ""
 
     @property
     def rival(self) -> str:
-        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        """Other address that speaks as the vehicle; empty if there is none."""
         since_s = time.monotonic() - _SAYS_FOR_S
         with self._lock:
             rivals = self._contest.rivals
@@ -240,7 +240,7 @@ class PeerTable:
             self._senders.clear()
 
     def decode(self, peer: Peer, data: bytes, *, whole: bool) -> list[Any]:
-        """Return the messages that have come from an address; what is none is left out.
+        """Return the valid messages that have come from an address.
 
         Parameters
         ----------
@@ -319,7 +319,7 @@ class PeerTable:
         self._contest.words = f"heartbeats of sysid {self._system} {where} contradict each other"
 
     def _remember(self, peer: Peer, parser: Any) -> None:
-        """Keep the parser of an address, and send to it; strangers never displace anybody."""
+        """Store the parser of an address, and send to it; strangers never replace known senders."""
         now_s = time.monotonic()
         sender = self._senders.get(peer)
         if sender is not None:

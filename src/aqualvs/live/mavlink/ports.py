@@ -180,19 +180,19 @@ _NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
 
 
 class Port(Protocol):
-    """An open way to a peer. Whatever shows that it is broken is raised as OSError."""
+    """Open connection to a peer; its faults are raised as OSError."""
 
     @property
     def many(self) -> bool:
-        """Whether anybody may send to it, and addresses keep senders apart."""
+        """Whether there may be several senders, kept apart by their addresses."""
 
     @property
     def whole(self) -> bool:
-        """Whether what is read is a datagram."""
+        """Whether each read returns a datagram."""
 
     @property
     def refused_s(self) -> float | None:
-        """When the peer's computer said that nobody listens (`time.monotonic`), if ever."""
+        """Time of the peer's refusal because its port is closed (`time.monotonic`), if any."""
 
     @property
     def unsent(self) -> bool:
@@ -200,28 +200,28 @@ class Port(Protocol):
 
     @property
     def lag_s(self) -> float:
-        """How long the driver is going to send what it holds already."""
+        """Time that the driver needs to send its buffered data."""
 
     def fileno(self) -> int:
         """Return the number to wait on."""
 
     def read(self) -> tuple[bytes, Peer]:
-        """Return what has come, empty if nothing, and from where."""
+        """Return the received data, possibly empty, and their sender."""
 
     def write(self, frames: bytes, peer: Peer, /) -> bool:
-        """Send all of it, or nothing if there is no room; return whether it went.
+        """Send all of it, or nothing if there is no room; return whether it was sent.
 
         Where there is only one peer, its address is left empty.
         """
 
     def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
-        """Send to everybody: to those heard, where the port has no address of its own."""
+        """Send to all known peers, where the port has no address of its own."""
 
     def flush(self) -> None:
-        """Send what waits, as far as there is room."""
+        """Send waiting data, as far as there is room."""
 
     def close(self) -> None:
-        """Free the port at once; what waits is lost."""
+        """Free the port at once; waiting data are lost."""
 
 
 def open_port(address: Address) -> Port:
@@ -424,11 +424,11 @@ class StreamPort:
 
     @property
     def lag_s(self) -> float:
-        """How long the driver is going to send what it holds already."""
+        """Time that the driver needs to send its buffered data."""
         return 0.0
 
     def read(self) -> tuple[bytes, Peer]:
-        """Return what has come, empty if nothing, and from where: from the only peer."""
+        """Return the received data, possibly empty, and their sender, the only peer."""
         try:
             data = self._take()
         except BlockingIOError:
@@ -438,11 +438,11 @@ class StreamPort:
         return data, ()
 
     def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
-        """Send to everybody: to the only peer."""
+        """Send to the only peer."""
         return self.write(frames, ())
 
     def write(self, frames: bytes, _peer: Peer, /) -> bool:
-        """Send all of it, or nothing if there is no room; return whether it went."""
+        """Send all of it, or nothing if there is no room; return whether it was sent."""
         self.flush()
         if self._rest:
             return False
@@ -451,7 +451,7 @@ class StreamPort:
         return True
 
     def flush(self) -> None:
-        """Send what waits, as far as there is room."""
+        """Send waiting data, as far as there is room."""
         if not self._rest:
             self._moved_s = time.monotonic()
             return
@@ -488,7 +488,7 @@ class _TcpPort(StreamPort):
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Free the port at once; what waits is lost."""
+        """Free the port at once; waiting data are lost."""
         self._socket.close()
 
     def _take(self) -> bytes:
@@ -550,7 +550,7 @@ class SerialPort(StreamPort):
 
     @property
     def lag_s(self) -> float:
-        """How long the driver is going to send what it holds already."""
+        """Time that the driver needs to send its buffered data."""
         answer = fcntl.ioctl(self._number, termios.TIOCOUTQ, b"\0\0\0\0")
         return float(struct.unpack("i", answer)[0]) / self._bytes_per_s
 
@@ -559,7 +559,7 @@ class SerialPort(StreamPort):
         return self._number
 
     def close(self) -> None:
-        """Free the port at once; what waits is lost."""
+        """Free the port at once; waiting data are lost."""
         if self._number < 0:
             return
         number, self._number = self._number, -1
@@ -579,7 +579,7 @@ class SerialPort(StreamPort):
 
 
 def _make_raw(number: int, speed: int) -> None:
-    """Pass bytes through as they are."""
+    """Set the terminal to pass bytes through unchanged."""
     state = termios.tcgetattr(number)
     state[0] = termios.IGNBRK
     state[1] = 0

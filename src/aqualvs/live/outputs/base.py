@@ -26,7 +26,7 @@ class Output(Protocol):
 
     @property
     def name(self) -> str:
-        """How health and messages call it."""
+        """Name of the output in health reports and messages."""
 
     @property
     def inline(self) -> bool:

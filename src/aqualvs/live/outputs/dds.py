@@ -64,7 +64,7 @@ _HASHES = {
 
 
 def type_hash(topic: Topic) -> bytes:
-    """Return the user data by which ROS 2 since Iron tells the version of a topic's type.
+    """Return the user data that identify the version of a topic's type since ROS 2 Iron.
 
     Subscribers match without it, but warn (ROS REP-2016).
     """
@@ -165,7 +165,7 @@ class _Link:
     writers: dict[Topic, Any]
 
     def wanted(self) -> frozenset[Topic]:
-        """Return the topics that somebody listens to."""
+        """Return the topics that have subscribers."""
         return frozenset(
             topic
             for topic, writer in self.writers.items()
@@ -216,7 +216,7 @@ class DdsOutput:
         self._health = PartHealth(self.name, State.WARN, "not connected yet")
 
     def send(self, sample: LiveSample) -> None:
-        """Publish what a sample has to say, on the topics that somebody listens to.
+        """Publish a sample on the topics that have subscribers.
 
         A network that is not there is looked for again after half a second, then less and less
         often, up to every eight seconds.
@@ -305,7 +305,7 @@ def domain_of_this_machine(environment: Mapping[str, str] = os.environ) -> int:
 
 
 def stays_on_this_machine(environment: Mapping[str, str] = os.environ) -> bool:
-    """Return whether ROS 2 is told not to use the network, and Cyclone DDS nothing else."""
+    """Return whether ROS 2 is configured for this machine only, and Cyclone DDS not at all."""
     local = (
         environment.get("ROS_LOCALHOST_ONLY", "") == "1"
         or environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"

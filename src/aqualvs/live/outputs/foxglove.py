@@ -328,7 +328,7 @@ class FoxgloveOutput:
             self._server.stop()
 
     def _log_seldom(self, sample: LiveSample, at_ns: int) -> None:
-        """Send what changes seldom, also for those who have just come."""
+        """Send data that rarely change, also to new viewers."""
         rig, health, options = sample.rig, sample.health, self._scanner
         if self._transforms.has_sinks():
             self._transforms.log(transforms(rig, at_ns), log_time=at_ns)
@@ -342,7 +342,7 @@ class FoxgloveOutput:
     def _log(
         self, topic: Topic, at_ns: int, content: Callable[[], bytes], due: "_Rate | None" = None
     ) -> None:
-        """Send a message if somebody watches its topic and it is due."""
+        """Send a message if its topic has viewers and it is due."""
         channel = self._channels[topic]
         if channel.has_sinks() and (due is None or due.at(at_ns)):
             channel.log(content(), log_time=at_ns)
@@ -363,7 +363,7 @@ class _Viewers:
             return len(self._watched)
 
     def take_news(self) -> bool:
-        """Return whether somebody has asked for a topic since the last call."""
+        """Return whether a viewer has subscribed to a topic since the last call."""
         with self._lock:
             news, self._news = self._news, False
             return news
@@ -391,7 +391,7 @@ class _Rate:
         self._from_ns = 0
 
     def at(self, stamp_ns: int) -> bool:
-        """Return whether it is time, and begin to wait anew if so."""
+        """Return whether the message is due; if so, start the next period."""
         if self._every_ns is None or stamp_ns < self._from_ns:
             return False
         self._from_ns = stamp_ns + self._every_ns

@@ -71,7 +71,7 @@ class MavlinkOutput:
         self._was_filtered = False
 
     def send(self, sample: LiveSample) -> None:
-        """Send one sample; never waits, and what cannot be sent is dropped."""
+        """Send one sample without waiting; drop messages that cannot be sent."""
         time_boot_ms = boot_ms(sample.instants.arrived_ns)
         _fill_distance(self._distance, time_boot_ms, sample)
         numbers = _numbers(sample.scan.posture, sample.scan.n_water)

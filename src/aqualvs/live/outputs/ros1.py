@@ -82,12 +82,12 @@ class Ros1Node:
 
     @property
     def tcpros(self) -> list[Any]:
-        """How subscribers connect, in the protocol's words."""
+        """Address for subscribers, in the protocol's form."""
         return ["TCPROS", self._host, self.links.port]
 
     @property
     def trouble(self) -> str:
-        """Why nobody can find the node, in a few words; empty where roscore knows it."""
+        """Reason why roscore does not know the node; empty if it does."""
         return self._ended or self._trouble
 
     def leave(self, reason: str) -> None:
@@ -335,7 +335,7 @@ class Ros1Output:
 
     @property
     def uri(self) -> str:
-        """Where ROS calls the node."""
+        """Address of the node for calls by ROS."""
         return self._node.uri
 
     def send(self, sample: LiveSample) -> None:

@@ -369,7 +369,7 @@ class Ros1Links:
         self._selector.register(connection, selectors.EVENT_READ, link)
 
     def _hear(self, link: _Link) -> None:
-        """Take what a subscriber says; after the handshake that is nothing but its farewell."""
+        """Read from a subscriber; after the handshake only the end of the connection comes."""
         if link not in self._links:
             return
         try:

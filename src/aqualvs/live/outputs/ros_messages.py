@@ -428,7 +428,7 @@ class MessageMaker:
     def messages(
         self, sample: LiveSample, wanted: Collection[Topic]
     ) -> Iterator[tuple[Topic, Message]]:
-        """Yield what there is to say about a sample, on the topics that somebody listens to.
+        """Yield the messages of a sample, on the topics that have subscribers.
 
         Without a posture there is no pose, and the range is not a number.
         """
@@ -518,7 +518,7 @@ def _pose_message(
 
 
 def _no_range(sample: LiveSample) -> float:
-    """Return what REP-117 says where there is no range.
+    """Return the value of REP-117 for a missing range.
 
     Minus infinity for a target that is too near, infinity for one that is too far, else not a
     number: a picture without stripes is no promise that the way is free.
