@@ -158,7 +158,7 @@ class RunMcap(Closing):
             scan=scan,
             returns=returns,
             frame=None,
-            # As if the dive had begun with the run.
+            # Times as if the dive had started with the run.
             utc_ns=self._began_ns + at_ns,
             instants=Instants(at_ns, at_ns, at_ns),
             filtered=None,

@@ -204,7 +204,7 @@ class NetPilot:
         if guidance.setpoint is None or guidance.stage.halts:
             return None
         if motion is None:
-            # A frame or two without a posture: the gate limits for how long this goes on.
+            # A frame or two without a posture: the gate limits the duration.
             return self._asked
         return self.controller.update(
             time_s,
@@ -227,7 +227,7 @@ class NetPilot:
             self.controller.applied(effort)
 
 
-# Frames that the network held up may be so late; older ones are of another stream.
+# Frames delayed by the network may be this late; older ones belong to another stream.
 _LATE_S = 0.5
 _IDLE = Guidance(setpoint=None, stage=Stage.IDLE)
 

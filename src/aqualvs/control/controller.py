@@ -208,7 +208,7 @@ class Pid:
         return allowed
 
     def _near_last(self, wanted: float, step: float) -> float:
-        # A first update has no step; it may move as far as in a short one.
+        # The first update has no time step; its output may change as much as in a short one.
         most = self.options.output_rate * (step or _FIRST_STEP_S)
         return min(max(wanted, self._output - most), self._output + most)
 
@@ -301,7 +301,7 @@ class Ramp:
             return
         left = goal - self.value
         most = self._most * dt
-        # The speed from which one more step, and then braking, ends on the goal.
+        # Speed at which one more step and then braking end on the goal.
         brake = math.sqrt(0.25 * most * most + 2.0 * self._most * abs(left)) - 0.5 * most
         wanted = math.copysign(min(self._speed, max(brake, 0.0), abs(left) / dt), left)
         before = self.rate
@@ -341,9 +341,9 @@ class QuietZone:
         return asked if self._side else 0.0
 
 
-# Beyond this yaw forward hardly changes the range, in radians.
+# Beyond this yaw, in radians, forward motion hardly changes the range.
 _GREATEST_YAW = math.radians(60.0)
-# Time constant in seconds with which a small integral fades while thrust changes its side.
+# Time constant in seconds of a small integral's decay while thrust changes its sign.
 _FORGETS_S = 1.0
 
 
@@ -397,7 +397,7 @@ class RangeYawController:
         self._slope = _Slope(gains.rate_time)
         band = thrust, near.crossing_impulse, near.crossing_share
         self._pairs = (DeadBandCrossing(*band), DeadBandCrossing(*band))
-        # A force whose impulse in that time does not cross the dead band is none.
+        # A force whose impulse in that time does not cross the dead band counts as zero.
         self._least = near.crossing_impulse * thrust.forward / mass / _FORGETS_S
         self._quiet = QuietZone(turn.quiet_rate)
         self.reset()
@@ -521,7 +521,7 @@ class RangeYawController:
     def _turning(self, time_s: float, yaw: float, yaw_rate: float | None) -> float:
         """Return the turning rate asked for, clockwise."""
         ramp = self._yaw_ramp
-        # The derivative acts on the measurement; what the ramp itself asks for is given back.
+        # The derivative acts on the measurement; the ramp's own rate is added back.
         forward = ramp.rate + self.gains.yaw.derivative * ramp.seen_rate
         return -self._turn.update(time_s, ramp.seen, yaw, yaw_rate, forward)
 
@@ -535,7 +535,7 @@ class RangeYawController:
         side = sway * c if vehicle.can_sway else 0.0
         aside = (side + vehicle.dome_forward * turn) * s
         mending = self._mending(range)
-        # Speeds and accelerations as seen along the forward axis.
+        # Speeds and accelerations along the forward axis.
         ahead = (mending - ramp.rate - aside) / c
         asked, found = (mending - ramp.seen_rate) / c, -rate / c
         turns = self._turns(step)

@@ -112,7 +112,7 @@ class Coverage:
         Defaults if left out.
     """
 
-    # Steps that are longer are gaps, in seconds.
+    # Longer steps are gaps, in seconds.
     LONGEST_STEP_S = 1.0
 
     def __init__(self, options: CoverageOptions | None = None) -> None:

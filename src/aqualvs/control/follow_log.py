@@ -61,7 +61,7 @@ class FollowLog:
         self._path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Without a buffer a row outlives the process.
+            # Unbuffered, so that rows survive the death of the process.
             self._file = path.open("wb", buffering=0)
         except OSError as fault:
             raise self._trouble(fault) from None

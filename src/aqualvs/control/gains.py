@@ -114,7 +114,7 @@ class ThrustMap:
 
     def _past_dead_band(self, size: float) -> float:
         bent = 1.0 - self.linear
-        # The root of bent x² + linear x = size in the form that holds for bent = 0.
+        # Root of bent x² + linear x = size, in the form that is valid for bent = 0.
         x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
         return self.dead_band + (1.0 - self.dead_band) * x
 
@@ -164,7 +164,7 @@ class DeadBandCrossing:
             if abs(owed) <= self._impulse and abs(share) < self._great:
                 self._owed = owed
                 return self._edge()
-            # What has waited is late: the loop asks for it anew where it is still needed.
+            # Delayed thrust is dropped: the loop requests it again if it is still needed.
             self._side, self._stood_s, owed = -self._side, 0.0, share * step
         self._owed = 0.0
         given = owed / step if step > 0.0 else share
@@ -406,11 +406,11 @@ def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
     )
 
 
-# Drag damps as the speed's gain does, but what is known of it may be twice the truth. The limit is
-# for that too: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever more.
+# Drag damps like the speed's gain, but its assumed value may be twice the truth. The limit allows
+# for that, and for pitch: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever more.
 _DAMPING_SHARE, _GREATEST_SCHEDULE = 0.8, 2.2
-# Drag makes the loop stiff in position; the integral has to keep up with that, or it takes 10 s to
-# find the force of a strong current.
+# Drag makes the loop stiff in position; without a greater gain, the integral takes 10 s to find the
+# force of a strong current.
 _INTEGRAL_SHARE, _GREATEST_INTEGRAL = 1.2, 6.0
 
 

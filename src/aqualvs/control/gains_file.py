@@ -414,5 +414,5 @@ def _drag_part(drag: Drag) -> DragPart:
 
 
 def _degrees(angle: float) -> float:
-    # More digits than anybody sets, fewer than rounding leaves.
+    # More digits than users set, fewer than rounding errors leave.
     return float(f"{math.degrees(angle):.10g}")

@@ -371,9 +371,9 @@ def paced(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Gu
     return Guidance(setpoint=setpoint, sway=sway, stage=Stage.FOLLOWING)
 
 
-# Descent asked for by a depth's error, in m/s per m, and how near a depth must be come to.
+# Speed of descent by a depth's error, in m/s per m, and the tolerance of a depth.
 _DESCENT_GAIN, _DEPTH_REACHED = 0.8, 0.07
-# Seconds that a depth must be kept before the next leg, so that a wave does not count.
+# Seconds that a depth must be kept before the next leg, longer than a wave.
 _DEPTH_STEADY_S = 1.0
 
 

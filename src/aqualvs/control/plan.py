@@ -26,9 +26,9 @@ from aqualvs.errors import OptionError
 VERSION = 1
 """Version of the format that is read."""
 _KEY = "aqualvs_plan"
-# A setpoint so near to the least range leaves no room to swing, in metres.
+# Least distance of a setpoint from the least range, in metres: room to swing.
 _ROOM = 0.1
-# Depths of a survey, at most; more are a slip of the pen.
+# Greatest number of depths of a survey; more are a typing error.
 _MOST_DEPTHS = 1000
 
 Two = Annotated[list[Number], Field(min_length=2, max_length=2)]
@@ -228,7 +228,7 @@ def _depths(part: SurveyPart) -> tuple[float, ...]:
         raise OptionError(f"survey.step_m {part.step_m:g} makes {n} legs; choose a greater one")
     step = math.copysign(part.step_m, last - first)
     depths = [first + i * step for i in range(n)]
-    # The last depth counts even where the step does not meet it.
+    # The last depth is included even if the step does not meet it.
     if abs(depths[-1] - last) > 1e-6:
         depths.append(last)
     return tuple(depths)

@@ -184,7 +184,7 @@ class SafetyGate:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
         refused = self._vehicle_refuses(now_s, state)
         if refused is None and state.rival:
-            # Which of them is the vehicle nobody knows; one who comes later is the other.
+            # At the start it is unknown which of them is the vehicle; later, the newcomer is not.
             refused = Reason.CONFLICT
         self.latched = Reason.NOT_ENGAGED if refused else None
         return refused
@@ -229,12 +229,12 @@ class SafetyGate:
             return NEUTRAL, refused or Reason.NO_POSTURE
         near = min(posture.range, posture.nearest)
         closing = self._closing_speed(now_s - posture_age_s, near, range_rate)
-        # What came closer goes on coming closer while nobody sees it.
+        # A target that approached is assumed to approach further while it is not seen.
         return self._guarded(effort, near - max(closing, 0.0) * posture_age_s, closing)
 
     def _clock_refuses(self, now_s: float) -> Reason | None:
         backwards = not now_s >= self._last_s
-        # Counts from the new time on: a clock that was set back must not stop us for good.
+        # Continue from the new time: a clock that was set back must not stop the gate for good.
         self._last_s = now_s if math.isfinite(now_s) else -math.inf
         if backwards or not math.isfinite(now_s):
             self._seen.clear()
@@ -252,7 +252,7 @@ class SafetyGate:
         return self.latched or doubt
 
     def _vehicle_refuses(self, now_s: float, state: VehicleState) -> Reason | None:
-        # A heartbeat from the future is of another clock, and tells nothing.
+        # A heartbeat from the future is by another clock, and useless.
         if not -self.limits.heartbeat_age <= now_s - state.heard_s <= self.limits.heartbeat_age:
             return Reason.NO_HEARTBEAT
         if not state.armed:
@@ -302,11 +302,11 @@ class SafetyGate:
         return _clipped(effort), None
 
 
-# The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat is
-# firm before.
+# The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat
+# reaches its full effort before that.
 _FIRM_WITHIN_M = 0.05
 _FIRM_ABOVE = 2.0 / 3.0
-# Postures that far apart tell the closing speed to some cm/s in spite of their noise.
+# Postures this far apart give the closing speed to some cm/s in spite of their noise.
 _SPEED_WINDOW_S = 0.4
 _LEAST_WINDOW_S = 0.15
 
@@ -334,23 +334,23 @@ def _clipped(effort: Effort) -> Effort:
     )
 
 
-# Second differences of three quantities from so many postures in a row tell their noise.
+# Number of consecutive postures whose second differences, of three quantities, measure the noise.
 _N_NOISE, _N_USUAL = 8, 50
 _ORDER = 6.0
-# Postures of less noise come from a simulation without any: metres and radians.
+# Postures with less noise come from a simulation without noise: metres and radians.
 _LEAST_RANGE, _LEAST_ANGLE = 2e-5, math.radians(0.005)
-# The force that holds the vehicle in its place is the mean over so many seconds of thrust; known
-# after so many. Before, a current that the controller has yet to find takes as much.
+# The force that holds the vehicle in place is the mean thrust over so many seconds; known after so
+# many. Before that, a current that the controller has yet to find takes as much.
 _BALANCE_S, _BALANCED_S = 4.0, 10.0
 _SLOPE_S = 0.3
-# Means over parts of the window do not differ by more where a posture stands still: as share of the
-# range, in radians; and how many parts there are.
+# Greatest difference between means over parts of the window where a posture stands still, as share
+# of the range and in radians; and the number of parts.
 _STILL_RANGE, _STILL_YAW, _N_MEANS = 0.006, math.radians(0.6), 6
-# Efforts towards the target must have lasted so long, in seconds.
+# Least duration of efforts towards the target, in seconds.
 _PUSHED_S = 0.5
-# The range must lie so far beyond the one asked for, in metres.
+# Least distance of the range beyond its setpoint, in metres.
 _OFF = 0.05
-# Between two reports of a heading; more is a compass that was set anew.
+# Greatest change between two reports of a heading; a greater one is a reset compass.
 _GREATEST_TURN = math.radians(20.0)
 
 
@@ -404,7 +404,7 @@ class _Moment(NamedTuple):
     time_s: float
     range: float
     yaw: float
-    # Closing speed and way that the efforts beyond the balance have given since the start.
+    # Closing speed and way due to the efforts beyond the balance, since the start.
     speed: float
     way: float
     # Heading without jumps.
@@ -497,7 +497,7 @@ class AnswerWatch:
             self._moments.clear()
             self._told = math.nan
             step = 0.0
-        # Thrust to the side is for the drag of a way along the target, and promises nothing.
+        # Sideways thrust balances the drag of a way along the target; it predicts no approach.
         forward, _ = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
         push = forward * math.cos(yaw) / self._vehicle.mass
         if push <= 0.0:
@@ -525,7 +525,7 @@ class AnswerWatch:
         promised = last.way - begin.way + (before - begin.speed) * span
         turned = abs(last.heading - begin.heading)
         pushed = last.time_s - self._backed_s > _PUSHED_S and self._thrust_s > _BALANCED_S
-        # Near its setpoint the vehicle leans on the water as that changes.
+        # Near its setpoint the vehicle's thrust balances the changing current.
         pushed = pushed and last.range - self._wanted > _OFF
         promises = promised > self.limits.promised and pushed
         if not promises and turned < self.limits.turned:

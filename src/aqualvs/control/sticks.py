@@ -219,7 +219,7 @@ def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
             reverse=parameters.get(f"RC{n}_REVERSED", 0.0) == 1.0,
         )
         if name == "throttle":
-            # A range: its middle is that of its limits, and its trim means nothing.
+            # A range channel: its middle is that of its limits, and its trim is not used.
             channel = replace(channel, trim=0.5 * (channel.least + channel.most))
         found[name] = channel if channel.is_sound else default
     shaping = StickShaping(
@@ -228,7 +228,7 @@ def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
         throttle_dead_zone=_within(parameters.get("THR_DZ"), 0.0, 400.0, own.throttle_dead_zone),
         **found,
     )
-    # Trims beyond what sticks reach cannot be made up for.
+    # Trims beyond the reach of the sticks cannot be compensated.
     return shaping if shaping.turning_share > 0.0 and shaping.climbing_share > 0.0 else own
 
 

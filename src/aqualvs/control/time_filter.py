@@ -9,7 +9,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Refusal
 
-# A micrometre and a microradian: keeps a measurement that claims to be exact invertible.
+# A micrometre and a microradian: keeps the covariance of an exact measurement invertible.
 _LEAST_VARIANCE = 1e-12 * np.eye(3)
 
 

@@ -148,7 +148,7 @@ def tidy(value: float) -> float:
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
-# From a slow drift to what thrusters no longer follow, in rad/s.
+# Frequencies from a slow drift to the limit of the thrusters, in rad/s.
 _OMEGA = np.geomspace(1e-2, 1e2, 1600)
 _PADE = 4
 
@@ -219,7 +219,7 @@ def margins(loop: Loop) -> Margins:
     """Return the margins of a loop."""
     along = loop.at(_OMEGA)
     size = np.abs(along)
-    # Phase beyond -180 degrees, 0 to 2 pi: what is left where the gain is 1.
+    # Phase above -180 degrees, 0 to 2 pi: the margin where the gain is 1.
     left = np.mod(np.angle(along) + math.pi, 2.0 * math.pi)
     ones = np.flatnonzero((size[:-1] > 1.0) != (size[1:] > 1.0))
     return Margins(
@@ -252,24 +252,24 @@ def _pade(delay: float) -> FloatArray:
         math.factorial(2 * n - k) / (math.factorial(k) * math.factorial(n - k)) * delay**k
         for k in range(n, -1, -1)
     ]
-    # A vanishing delay leaves zeros in front, which are no powers of s.
+    # A vanishing delay leaves leading zeros, which are no powers of s.
     return np.trim_zeros(np.array(terms) / terms[-1], "f")
 
 
 _POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.3, 0.25, 0.15
 _SWELL = 1.2
-# Metres: the closing speed that lacks, summed over time, before thrust changes its side. With 15 mm
-# a BlueROV2 Heavy in calm water does so more than 20 times a minute, with 21 mm the step of a
-# BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of their thrust
-# times seconds: with 0.022 the step of a VideoRay-like vehicle does.
+# Integral of the missing closing speed before thrust changes its sign, in metres. With 15 mm, the
+# thrust of a BlueROV2 Heavy in calm water changes its sign more than 20 times a minute; with 21 mm,
+# the step of a BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of
+# their thrust times seconds: with 0.022 the step of a VideoRay-like vehicle takes twice the time.
 _CROSSING, _GREATEST_CROSSING = 0.018, 0.0175
-# In the thrusters' dead band the autopilot follows a turning rate so many times later.
+# Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
 _SLUGGISH = 4.0
-# Where the bisection of a gain begins and ends, in 1/s.
+# Limits of the bisection of a gain, in 1/s.
 _LEAST, _GREATEST = 0.05, 20.0
-# Delays and frames in seconds, and m/s: beyond them nothing is steered.
+# Greatest delays and frame intervals in seconds, and greatest current in m/s.
 _MOST_S, _MOST_CURRENT = 60.0, 10.0
-# Packaged gains have 0.40 to 0.55, half as much again 0.28 to 0.37, twice as much 0.13 to 0.19.
+# Packaged gains have 0.40 to 0.55; 1.5 times these gains 0.28 to 0.37, twice these 0.13 to 0.19.
 _LEAST_USABLE_MODULUS = 0.25
 
 
@@ -477,7 +477,7 @@ def _range_loop(
     pushes = np.polymul([speed, integral], swell)
     pushes = np.polyadd(pushes, speed * np.polymul([1.0, 0.0], swings))
     above = np.polymul(pushes, [1.0, gains.position])
-    # Drag is put in beforehand at the speed asked for, which follows the position.
+    # Drag is fed forward at the requested speed, which follows the position.
     ahead = known * gains.position
     above = np.polyadd(above, ahead * np.polymul([1.0, 0.0], swell)) / mass
     below = np.polymul(np.polymul([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)

@@ -42,9 +42,9 @@ from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import Health, PartHealth, State
 from aqualvs.terminal import StopSignals
 
-# So far behind the clock, a run does not try to catch up.
+# Lag behind the clock beyond which a run does not catch up.
 _LATE_S = 0.2
-# Frames that the share of valid ones counts.
+# Number of frames over which the share of valid ones is taken.
 _N_SHARE = 50
 
 
@@ -141,9 +141,9 @@ class LoopPage:
 
 
 _TELL_EVERY_S = 10.0
-# A plan that is over goes on to hold: long enough to see that it does.
+# A plan that is over continues to hold: time to show that it does.
 _HOLDS_ON_S = 5.0
-# A report needs some rows.
+# Least length of a run: a report needs some rows.
 _LEAST_S = 1.0
 
 
@@ -334,7 +334,7 @@ class SimRequest:
 
 
 _FOLLOW_LEAST_S, _LEAST_RADIUS = 1.0, 2.0
-# A day; the slowest and fastest that cameras are.
+# A day; frame rates of the slowest and the fastest cameras.
 _MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
 
 

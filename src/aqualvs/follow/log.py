@@ -160,7 +160,7 @@ SETTLED_SHARE = 0.1
 """A step has settled once the range stays within this share of it."""
 LOST_AFTER_S = 2.5
 """Without sight for longer, in seconds, somebody has to take over."""
-# Swings that are that much greater at the end of a run than in its middle are growing, in metres.
+# Greater increase of the swings from the middle to the end of a run counts as growth, in metres.
 _GROWS, _GROWS_BY = 2.0, 0.05
 
 

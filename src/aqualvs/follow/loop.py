@@ -24,7 +24,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 
-# A vehicle tells its attitude ten times a second.
+# A vehicle reports its attitude ten times a second.
 _TELLS_HZ = 10.0
 
 
@@ -88,7 +88,8 @@ class SimulatedLink:
         self._closed = True
 
 
-# The live run tells a silent stream after so long, and then so often; the watchdog looks so often.
+# Time after which the live run reports a silent stream, the period of further reports, and that of
+# the watchdog's checks.
 _SILENT_AFTER_S, _SILENT_EVERY_S, _DOG_LOOKS_S = 0.20, 0.10, 0.02
 
 
@@ -146,12 +147,12 @@ class _Sight:
 
     patience_s: float
     coming: deque[_Arrival] = field(default_factory=deque)
-    # When a frame came last, and when a silent stream was told last.
+    # Times of the last frame and of the last report of a silent stream.
     heard_s: float = 0.0
     told_s: float = -math.inf
     # Exposure of that frame.
     exposed_s: float = 0.0
-    # When a valid posture came last.
+    # Time of the last valid posture.
     seen_s: float = -math.inf
 
     def silence_s(self) -> float:

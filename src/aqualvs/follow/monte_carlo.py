@@ -27,10 +27,10 @@ from aqualvs.simulation.vehicle.models import VehicleModel
 
 SECONDS = 40.0
 """Length of a random dive."""
-# Sight is not lost before the loop has begun.
+# Sight is not lost before the loop has started.
 _FIRST_LOSS_S, _GREATEST_LOSS_S = 6.0, 1.0
 _GIVEN_UP_S = LOST_AFTER_S + 0.5
-# What a careful pilot holds: so many metres, and so many more for each m/s of current.
+# Range that a careful pilot holds: in metres, and in metres more for each m/s of current.
 _ROOM, _ROOM_BY_SPEED = 0.5, 0.6
 _WORKING_RANGE = bluerov2_rig().working_range
 

@@ -38,7 +38,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 8.0,
     "legend.frameon": False,
 }
-# An axis shows at least so much, so that noise does not fill it: metres, degrees.
+# Least span of an axis, so that noise does not fill it: metres, degrees.
 _LEAST_DEPTH, _LEAST_RANGE, _LEAST_ANGLE = 0.2, 0.1, 6.0
 
 

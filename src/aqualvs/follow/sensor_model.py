@@ -24,7 +24,7 @@ from aqualvs.simulation.net_motion import NetPosture, NetWall
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene
 
-# More than are under way from the exposure to the pilot.
+# More pictures than are in transit from the exposure to the pilot.
 _N_KEPT = 8
 
 
@@ -102,7 +102,7 @@ class RenderedEye:
         return planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
 
 
-# What a posture of the example rig rests on, about.
+# Approximate number of inliers of a posture by the example rig.
 _N_POINTS = 400
 _GREATEST_ANGLE = math.radians(60.0)
 
@@ -193,7 +193,7 @@ class SampledEye:
         return self._last
 
     def _look(self, truth: NetPosture, time_s: float) -> Posture | Refusal | None:
-        # Drawn in any case: the noise of a frame does not depend on what happened before.
+        # Always drawn: the noise of a frame does not depend on earlier frames.
         draws = self._rng.normal(size=3)
         wild = self._rng.uniform() < self._noise.outliers
         blind = next((one for one in self._blind if one.start_s <= time_s < one.end_s), None)

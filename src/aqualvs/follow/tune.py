@@ -22,7 +22,7 @@ from aqualvs.simulation.vehicle.models import VEHICLES, VehicleModel
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle, level_pose
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
 
-# The wall stands across north, so far from the origin; the vehicle is so deep, in metres.
+# Distance of the wall north of the origin, and depth of the vehicle, in metres.
 _WALL, _DEPTH = 5.0, 5.0
 _REST_S, _AFTER_S = 6.0, 12.0
 _BAND = 0.05

@@ -198,7 +198,7 @@ def _runner(
         undo.callback(pilot.close)
         feed = request.feed.opened(request.source, realtime=True)
         undo.callback(feed.close)
-        # The pilot first: what others do must not hold an effort up.
+        # The pilot first: other outputs must not delay an effort.
         outputs: list[Output] = [pilot, MavlinkOutput(link)]
         outputs.append(FollowLogOutput(request.out / FOLLOW_CSV, pilot))
         undo.callback(outputs[-1].close)

@@ -160,7 +160,7 @@ def status_line(sample: LiveSample) -> str:
     return f"{told}  | {health.rate_hz:.0f} Hz{delay}{dropped}"
 
 
-# Threads wait for the interpreter at most so long; Python's own 5 ms would show in the delays.
+# Longest wait of a thread for the interpreter; Python's default of 5 ms would show in the delays.
 SWITCH_S = 0.0005
 
 

@@ -25,15 +25,15 @@ from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import ImagePlane, Scan
 from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 
-# Means over cells of so many pixels a side; every fourth row of cells is looked at.
+# Side of a cell in pixels; every fourth row of cells is compared.
 _CELL, _EVERY = 8, 4
 _ONES = np.ones(_CELL, np.float32)
-# Stripes of lasers fill a hundredth of a picture and more.
+# Laser stripes fill at least a hundredth of a picture.
 _QUANTILE = 0.99
-# Changes of a live picture that are kept, and how many are needed to know what is usual.
+# Number of stored changes of a live picture, and the least number for their quantile.
 _N_KEPT, _N_KNOWN = 250, 25
 _USUAL = 0.05
-# A stream that has been away for so long begins anew, in seconds.
+# A stream that returns after this time counts as a new one, in seconds.
 _GAP_S = 2.0
 
 
@@ -160,7 +160,7 @@ class FrozenPicture:
         elif math.isnan(self._moved_s):
             self._moved_s = time_s
         elif time_s - self._moved_s > self.options.span_s:
-            # A key frame changes a still once: it is in the comparison for one span.
+            # A key frame changes a still once, so it affects the comparison for one span.
             self._since_s = self._moved_s = math.nan
 
 
@@ -238,7 +238,7 @@ def _agreement_of(rig: Rig) -> LaserAgreement | None:
     try:
         return LaserAgreement(rig)
     except RigError:
-        # What the rig says of its own uncertainty does not parse; measuring does not need it.
+        # The rig's uncertainty cannot be parsed; measuring does not need it.
         return None
 
 
@@ -256,7 +256,7 @@ STAGES = ("wait", "measure", "send", "total")
 """From the decoded frame to the moment the measuring thread takes it; the measurement; the sending
 to outputs that never wait; all of it."""
 
-# A laser that shows nothing on the target for so long, while others do, is off or covered.
+# A laser without points on the target for this time, while others have some, is off or covered.
 _DARK_S = 2.0
 
 

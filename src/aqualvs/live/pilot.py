@@ -45,7 +45,7 @@ class Watchdog:
 
     def __init__(self, vehicle: VehicleLink, patience_s: float) -> None:
         self._vehicle, self._patience_s = vehicle, patience_s
-        # Only ever held for a call that returns at once, so that nothing can keep neutral back.
+        # Held only for calls that return at once, so that nothing can delay neutral.
         self._sending = threading.Lock()
         self._known_s = float("-inf")
         self._thrusting = threading.Event()
@@ -72,7 +72,7 @@ class Watchdog:
             if time.monotonic() - known_s > self._patience_s:
                 effort = NEUTRAL
             self._known_s = known_s
-            # Before it is sent: one that went out in spite of an error is stopped all the same.
+            # Before sending: an effort that was sent despite an error is stopped all the same.
             if effort == NEUTRAL:
                 self._thrusting.clear()
             else:
@@ -179,7 +179,7 @@ def _aim(guidance: Guidance) -> str:
     return f"{guidance.stage.value.replace('_', ' ')}: {aim}{sway}"
 
 
-# Datagrams may be lost. A pilot who holds his sticks is not to be disturbed: one will do.
+# Several, as datagrams may be lost; only one while the pilot moves his sticks, not to disturb him.
 _GOODBYES, _GOODBYES_TO_STICKS = 3, 1
 
 

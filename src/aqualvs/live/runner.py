@@ -71,7 +71,7 @@ def wall_frame(rig: Rig) -> Frame:
     return Frame(0, 0.0, luma, (u, np.full_like(u, 110)))
 
 
-# Samples that a recorder may be behind, which keep their pictures: 300 MB at 1920x1080.
+# Samples that may wait for a recorder, with their pictures: 300 MB at 1920x1080.
 _QUEUE = 100
 _PATIENCE_S = 5.0
 _log = logging.getLogger(__name__)
@@ -238,7 +238,7 @@ class Mailbox:
 
 # A feed promises to end within a second of being closed.
 _READER_PATIENCE_S = 3.0
-# After a fault that nobody foresaw the feed is begun again.
+# After an unexpected exception the feed is restarted.
 _AGAIN_S = 1.0
 
 
@@ -298,7 +298,7 @@ class FrameReader:
                     self.fault = fault
                     return None
                 except Exception as fault:
-                    # The thread must not die without a word: the pilot would see an old picture.
+                    # The thread must not die silently: the pilot would see an old picture.
                     _log.exception("%s: reading failed; trying again", self._feed.name)
                     self._trouble = f"{type(fault).__name__}: {fault}"
                     self._closing.wait(_AGAIN_S)
@@ -315,7 +315,7 @@ class FrameReader:
             self._mailbox.put(frame)
 
 
-# How often a silent stream is told to the outputs, and a request to stop is looked for.
+# Period of samples that report a silent stream, and of checks for a request to stop.
 _SILENT_EVERY_S, _LOOK_EVERY_S, _HEALTH_EVERY_S = 0.1, 0.05, 0.1
 
 
@@ -404,7 +404,7 @@ class LiveRunner:
         self._mailbox = Mailbox(keep_every=self._options.keep_every)
         self._reader = FrameReader(feed, self._mailbox)
         self._monitor = HealthMonitor(supply.scanner.rig)
-        # Those that never wait come first: waking a thread takes longer than a datagram.
+        # Outputs that never wait come first: waking a thread takes longer than a datagram.
         ordered = sorted(outputs, key=lambda output: not output.inline)
         self._workers = [OutputWorker(output) for output in ordered]
         frozen = self._options.frozen

@@ -35,7 +35,7 @@ from aqualvs.scanning.target import TargetKind
 from aqualvs.sources.base import bgr_of
 from aqualvs.yamlfile import parse_yaml, rig_text
 
-# Noise leaves little to a search for what repeats: runs alone are smaller, and no slower.
+# In noise a search for repetitions finds little: run-length coding is smaller and no slower.
 _PNG = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
@@ -174,7 +174,7 @@ def options_from_text(text: str) -> ScannerOptions:
     found = json.loads(text)
     detector = dict(found["detector"])
     kind = {"ridge": StripeOptions, "threshold": ThresholdOptions}[detector.pop("kind")]
-    # Recordings of 0.1.0 name the gate on colour that likelihoods have replaced.
+    # Recordings of 0.1.0 contain the option of a colour gate, since replaced by likelihoods.
     detector.pop("min_green_fall", None)
     mesh = found["mesh_filter"]
     return ScannerOptions(

@@ -130,10 +130,10 @@ def _codec() -> Any:
 
 
 PAGE = 4096
-# Room for chunks, and for their index records, that the file gets at least when it is made longer.
+# Least room for chunks, and for their index records, added when the file is made longer.
 _DATA_BYTES = 8 << 20
 _INDEX_BYTES = 1 << 16
-# For what rounding to pages takes.
+# Margin for rounding to pages.
 _SPARE_BYTES = 3 * PAGE
 # Copying the summary costs at most this share of what is written.
 _DATA_PER_SUMMARY = 8
@@ -204,7 +204,7 @@ class GrowingFile:
         self._make_room(len(chunk.content), len(index))
         self._frontier = self._insert(self._frontier, chunk.content, self._limit)
         self._note(chunk, index)
-        # The chunk is in the file; what cannot be listed now is listed by the next call.
+        # The chunk is in the file; the next call lists records that cannot be listed now.
         with contextlib.suppress(OSError):
             self._list_pending()
 
@@ -343,7 +343,7 @@ class GrowingFile:
         self._file.seek(at)
         rest = memoryview(content)
         while len(rest):
-            # A disk that fills up takes a part; the next try makes it say why.
+            # A disk that fills up takes a part; the next attempt raises the reason.
             rest = rest[self._file.write(rest) :]
 
 
@@ -366,7 +366,7 @@ def _publish(draft: Path, path: Path) -> None:
     except FileExistsError:
         raise
     except OSError:
-        # A file system without hard links, as memory cards have.
+        # A file system without hard links, as on memory cards.
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
         os.rename(draft, path)

@@ -109,7 +109,7 @@ def stripes_of(
         axis = SearchAxis(of.text())
         line = of.array("u4").astype(np.int64)
         position, height, width, likelihood = (of.array("f8") for _ in range(4))
-        # Recordings of 0.1.0 hold levels here, of returns that had passed a gate; NaN if grey.
+        # Recordings of 0.1.0 hold levels here, of peaks that passed a colour gate; NaN if grey.
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
         returns[axis] = Returns(line, position, height, width, likelihood)
     return index, time_s, n_water, returns, Refusal(Reason(reason), detail) if reason else None
@@ -261,8 +261,8 @@ def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
 
 
 _HEALTH_EVERY_NS = 1_000_000_000
-# The rig is told again after a second, then at intervals that double up to a minute, and at the
-# end: a part that is damaged, the first one too, takes no rig with it.
+# The rig is recorded again after a second, then at intervals that double up to a minute, and at the
+# end: so no damage, not even of the first part, loses the rig.
 _RIG_AGAIN_NS, _RIG_EVERY_NS = 1_000_000_000, 60_000_000_000
 
 

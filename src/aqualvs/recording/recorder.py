@@ -139,7 +139,7 @@ def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = No
     )
     return GrowingFile(
         path,
-        # The profile tells rosbag2 and its kin that the messages are ROS 2's.
+        # The profile identifies the messages as those of ROS 2, for rosbag2 and similar tools.
         front=mcap_file.MAGIC + mcap_file.header("ros2", f"aqualvs {__version__}") + repeated,
         repeated=repeated,
         n_schemas=len(TOPICS),
@@ -149,7 +149,7 @@ def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = No
 
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-# How often a disk that refused is tried again, and a chunk without company is looked at.
+# Period of retries on a full disk, and of checks for a chunk that is due.
 _RETRY_S, _LOOK_S = 2.0, 0.25
 _PATIENCE_S = 4.0
 

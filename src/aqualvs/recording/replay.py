@@ -84,7 +84,7 @@ class DiveRecording:
         self.rig: Rig | None = None
         self.options: ScannerOptions | None = None
         self._no_rig = "its rig is in none of its undamaged parts; add --rig"
-        # Told every minute, the rig outlives the part that held it first.
+        # The rig is recorded every minute, so it survives the loss of the first part.
         stored = next(self._file.messages([RIG.name]), None)
         if stored is not None:
             self._read_rig(stored.data)

@@ -26,7 +26,7 @@ from aqualvs.yamlfile import read_text
 
 try:
     import fcntl
-except ImportError:  # Windows locks open files by itself.
+except ImportError:  # Windows locks open files anyway.
     fcntl = None  # type: ignore[assignment]
 
 
@@ -58,7 +58,7 @@ class AppendFile:
         rest = memoryview(piece)
         try:
             while len(rest):
-                # A disk that fills up takes a part; the next try makes it say why.
+                # A disk that fills up takes a part; the next attempt raises the reason.
                 rest = rest[self._file.write(rest) :]
         except OSError:
             self._take_back()
@@ -181,7 +181,7 @@ RECORD = ".aqualvs.json"
 """File in which a folder notes who wrote its files."""
 
 _WRITER, _MARK = "writer", "mark"
-# A video has gigabytes: its beginning and end, with the size, tell it from another.
+# A video has gigabytes: its beginning and end, with the size, identify it.
 _ENDS = 1 << 16
 
 
@@ -239,7 +239,7 @@ class Claim(Closing):
                 else None
                 for name in names
             }
-            # The files are more worth than the note; without it they stay noted as begun.
+            # The files matter more than the note; without it they stay noted as incomplete.
             with contextlib.suppress(OSError):
                 _note(folder, written)
 

@@ -205,7 +205,7 @@ class RunOutputs:
         self.tally = Tally()
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
-            # First of all: of two runs that begin at the same moment, one gets no further.
+            # First, so that only one of two runs that begin at the same moment continues.
             self._points = stack.enter_context(_new_journal(folder))
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
@@ -224,7 +224,7 @@ class RunOutputs:
             try:
                 self._export.add(batch)
             except OSError:
-                # The journal has it all: the next attempt, at the end, tells what is wrong.
+                # The journal is complete: the next attempt, at the end, reports the fault.
                 self._discard_export()
         for scan in scans:
             self.tally.add(scan)

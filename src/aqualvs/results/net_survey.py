@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from aqualvs.nets.tables import NetWall
 
 
-# The posture is that of a net if so much of what it rests on is net.
+# Least share of net among the inliers for the posture to be that of a net.
 _NET_SHARE = 0.5
 
 

@@ -180,14 +180,14 @@ DRAFT = ".part"
 
 _ROWS_PER_GROUP = 1 << 17
 _N_LASERS = 128
-# Only names are worth a dictionary: to look for repetition in numbers takes longer than to write
-# them. What repeats is short once compressed, and of measured numbers the bytes that resemble each
-# other, signs and exponents, are put side by side: the file is a sixth smaller so, and the fast
-# compression makes it hardly larger than the thorough one.
+# Dictionary encoding for names only: to look for repetitions in numbers takes longer than to write
+# them, and compression shortens them anyway. For measured numbers, BYTE_STREAM_SPLIT puts similar
+# bytes (signs, exponents) side by side: the file is a sixth smaller, and the fast compression level
+# makes it hardly larger than the thorough one.
 _NAMES = ("label",)
-# What ascends over the dive, so that a reader of a stretch of it can pass over groups of rows; of
-# all else each group holds everything, and to look for its least and greatest takes a third of the
-# time of writing.
+# Statistics for ascending columns only, so that readers of a part of the dive can skip row groups.
+# In the other columns each group spans the whole range, and to find minimum and maximum takes a
+# third of the time of writing.
 _ASCENDING = ("frame", "time_s")
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -237,7 +237,7 @@ class PointsExport:
                     write_statistics=[name for name in _ASCENDING if name in schema.names],
                 )
             )
-            # It ends before the files are closed that it writes to.
+            # The thread ends before its files are closed.
             self._thread = stack.enter_context(ThreadPoolExecutor(1))
             self._open_files = stack.pop_all()
 

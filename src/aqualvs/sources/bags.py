@@ -29,7 +29,7 @@ from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, decompressed
 from aqualvs.sources.message_source import MAX_BYTES, Logged, MessageSource, Topic, choose_topic
 from aqualvs.special_files import refuse_special
 
-# Room that is left on the disk where bags are unpacked that are packed as whole files.
+# Disk space to keep free where bags compressed as whole files are unpacked.
 _FREE_BYTES = 1 << 30
 _REMEDY = "check it with ros2 bag info or rosbag reindex"
 
@@ -92,7 +92,7 @@ def _messages(path: Path, topic: str) -> Iterator[Logged]:
         try:
             for connection, log_ns, content in reader.messages(connections=wanted):
                 yield log_ns, _image(reader, content, connection.msgtype)
-        # The package lets through whatever damage leads to, from AssertionError to ZstdError.
+        # Damaged files raise anything in the package, from AssertionError to ZstdError.
         except Exception as fault:
             raise SourceError(f"{path}: the bag breaks off ({_words(fault)})") from fault
 
@@ -310,7 +310,7 @@ def _records_of(chunk: Any) -> list[Any]:
     """Return the records in a chunk; the package would take any amount of memory for them."""
     from mcap.stream_reader import breakup_chunk
 
-    # Of the smallest messages, records take ten times the room that their bytes take.
+    # Records of the smallest messages take ten times the memory of their bytes.
     if max(chunk.uncompressed_size, len(chunk.data)) > MAX_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)

@@ -127,7 +127,7 @@ def bgr_of(frame: Frame) -> ImagePlane:
     height, width = frame.luma.shape
     rows, columns = frame.chroma[0].shape
     i420 = np.empty((3 * rows, 2 * columns), np.uint8)
-    # An odd height or width leaves a row or column of the even picture to be cut off again.
+    # With an odd height or width, the even picture has a row or column too many.
     i420[: 2 * rows] = 0
     i420[:height, :width] = frame.luma
     i420[2 * rows :] = np.stack(frame.chroma).reshape(rows, 2 * columns)

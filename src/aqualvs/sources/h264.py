@@ -43,7 +43,7 @@ class _Codec:
     refresh: frozenset[int]
     slices: range
     parameter_sets: frozenset[int]
-    # Where the size of a unit's length stands in the extradata of a file (ISO/IEC 14496-15).
+    # Position of the size of a unit's length in the extradata of a file (ISO/IEC 14496-15).
     length_at: int
 
 
@@ -175,7 +175,7 @@ class FrameNumbers:
         last, self._last = self._last, (number, bool(unit[0] & 0x60))
         if last is None or is_idr:
             return False
-        if number == last[0]:  # After a picture nobody refers to, or the other field of one.
+        if number == last[0]:  # After a picture that is no reference, or the other field of one.
             return False
         return not last[1] or number != (last[0] + 1) % (1 << self._bits)
 

@@ -464,7 +464,7 @@ class LiveFrames:
         """Return the picture's number; after a loss, the time gives the number of missing ones."""
         number = self._ledger.number(picture.pts)
         if self._first is None:
-            self._first = number  # What came before was joined too late, not lost.
+            self._first = number  # Earlier ones are not lost: reception began later.
         index = number - self._first
         if self._last_index < 0:
             return index

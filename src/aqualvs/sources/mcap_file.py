@@ -272,7 +272,7 @@ class McapFile:
                 front = _front(file, size, only_channels=False)
         self._topics = _merged_topics(front, summary)
         self._counts = summary.counts if sound else None
-        # What was read to its end needs no summary, which may itself be damaged.
+        # A file that was read to its end needs no summary, which may itself be damaged.
         listed = summary.chunks if sound else front.chunks
         if not (sound or front.whole):
             listed = front.chunks | summary.chunks
@@ -363,7 +363,7 @@ def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
             break
         at += HEAD_BYTES + length
         if at > size:
-            # The record that seems to reach beyond the end is damaged, a chunk cut off.
+            # A record that seems to reach beyond the end is damaged; a chunk is cut off.
             break
     return found
 

@@ -136,7 +136,7 @@ class MessageSource(Closing):
                 if len(times) == 10:
                     break
         except SourceError:
-            # What comes before the damage counts; it is told when it is reached again.
+            # Messages before the damage count; the damage is reported when it is reached again.
             if size is None:
                 raise
         if size is None:

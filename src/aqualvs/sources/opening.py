@@ -241,7 +241,7 @@ def _check_address(where: str) -> None:
         raise SourceError(f"{shown}: no address (a space or control character in it); {remedy}")
     if not host and port is None:
         raise SourceError(f"{shown}: neither host nor port; {remedy}")
-    # Who listens at UDP port 0 gets a free one; nobody can be reached there.
+    # Listening at UDP port 0 takes a free port; sending to port 0 is impossible.
     if port == 0 and parts.scheme.lower() not in ("udp", "rtp"):
         raise SourceError(f"{shown}: port 0 cannot be reached; {remedy}")
 

@@ -69,7 +69,7 @@ class Connection:
             with self._opener() as container:
                 self._read(container)
         except Exception as fault:
-            # Whatever it is: the reader must be told, for nobody waits for this thread.
+            # Any exception: the reader must be notified, because nothing joins this thread.
             self.fault = fault
             self.reason = _words(fault)
         self._packets.put(None)

@@ -137,7 +137,7 @@ class RtpOrder:
         if packet.sender != self._sender or abs(step) > _MAX_STEP:
             return self._consider(packet, arrival)
         if step < 0:
-            # Comes twice, or too late; after a silence, a sender that began anew close by.
+            # A duplicate, or too late; after a silence, a restarted sender with a close number.
             silent = arrival - self._heard >= _RESTART_SILENCE_S
             return self._consider(packet, arrival) if silent else []
         self._heard = arrival
@@ -336,7 +336,7 @@ class H264Depacketizer:
     def _take_fragment(self, payload: bytes) -> None:
         indicator, header = payload[0], payload[1]
         if bool(header & 0x80) == bool(self._fragments):
-            self._spoil()  # Begins within another, or goes on with none.
+            self._spoil()  # Starts within another unit, or continues none.
         if header & 0x80:
             self._fragments = [bytes([indicator & 0xE0 | header & 31])]
         self._fragments.append(payload[2:])

@@ -29,10 +29,10 @@ from aqualvs.sources.base import planes_of
 from aqualvs.sources.h264 import UnitReader, unit_reader
 from aqualvs.sources.images import ImageSource, images_in
 
-# Codecs that predict no picture from another.
+# Codecs without prediction between pictures.
 _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
-# The container's promise is kept where the last picture comes no earlier than this before its end;
-# the serial reader is more patient.
+# Tolerance in the time of the last picture before the end that the container states; the serial
+# reader allows more.
 _EARLY_FRAMES, _EARLY_SHARE = 2.0, 0.01
 _PATIENCE_S = 10.0
 
@@ -251,7 +251,7 @@ class _Packets:
         if self._units is None:
             return packet.is_keyframe
         found = self._units(memoryview(packet))
-        # Parameter sets in the file's midst count from there on; a part must bring its own.
+        # Parameter sets within the file apply from there on; a span must contain its own.
         self._sets_in_band = self._sets_in_band or found.has_parameter_sets
         return found.is_refresh and (found.has_all_parameter_sets or not self._sets_in_band)
 
@@ -352,7 +352,7 @@ class VideoParts(Closing):
 
     def _stream(self, span: Span) -> VideoStream:
         if not span.first:
-            # Some containers cannot be wound back.
+            # Some containers cannot seek to the start.
             self.close()
         if self._container is None:
             self._container = av.open(str(self._path), timeout=_PATIENCE_S)

@@ -226,7 +226,7 @@ class TransportReader:
             for picture in stream.push(content or b""):
                 if codec != stream.codec:
                     codec = stream.codec or ""
-                    # A loss of 16 packets, or as many times that, shows in no counter.
+                    # A loss of 16 packets, or a multiple of that, shows in no counter.
                     self._frames.connect(decoder_of(codec), 1 / TICKS_HZ, hears_losses=False)
                 yield from decoded(self._frames, picture)
 

@@ -143,8 +143,8 @@ class VideoSource(Closing):
         self.name = str(where)
         self._container = _open(self.name)
         self._stream = self._video_stream()
-        # Threads that share a picture leave patched ones unmarked; threads with a picture each do
-        # not wait for each other's patches, so that what follows would be left to chance.
+        # Slice threads leave patched pictures unmarked; frame threads do not wait for each other's
+        # patches, so that the following pictures would depend on timing.
         self._stream.codec_context.thread_count = 1
         self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
         rate = self._stream.average_rate or self._stream.guessed_rate

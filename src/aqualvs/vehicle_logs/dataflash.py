@@ -145,7 +145,7 @@ def _scan(
         kind = data[at + 2]
         length = lengths.get(kind, 0) if data[at] == 0xA3 and data[at + 1] == 0x95 else 0
         if not length:
-            # A record that lost bytes swallows the next ones, so the search begins within it.
+            # A record that lost bytes overlaps the next ones, so the search begins within it.
             found = _next_record(data, last + 1 if n_records else 0, lengths)
             begin = at if found is None or found >= at else last
             swallower = lists.get(data[last + 2]) if begin == last < at else None

@@ -179,7 +179,7 @@ def _scan(
     while at + _SHORTEST <= size:
         end = _record_end(data, at)
         if end is None:
-            # A record that lost bytes swallows the next ones, so the search begins within it.
+            # A record that lost bytes overlaps the next ones, so the search begins within it.
             found = _next_record(data, last + 1 if n_frames else 0)
             begin = at if found is None or found >= at else last
             skipped.append((begin, (size if found is None else found) - begin))
@@ -237,7 +237,7 @@ def _decode(
     frame = at + _STAMP
     length = octets[frame + 1].astype(np.int64)
     size = message.dtype.itemsize
-    # MAVLink 2 cuts zeros off the end; they read as zeros again.
+    # MAVLink 2 truncates trailing zeros; they are restored as zeros.
     column = np.arange(size)
     inside = column < length[:, None]
     places = np.where(inside, frame[:, None] + header + column, 0)

@@ -102,7 +102,7 @@ def _slopes(values: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray
     window = np.exp(-0.5 * (lag / SMOOTHING_S) ** 2)
     centred = np.where(valid, values - values[valid].mean(), 0.0) if valid.any() else values
     count = valid.astype(float)
-    # Reversed kernels, since convolution turns them round.
+    # Reversed kernels, because convolution reverses them.
     s0, s2 = _convolve(count, window), _convolve(count, window * lag**2)
     s1, sx = _convolve(count, -window * lag), _convolve(centred, window)
     stx = _convolve(centred, -window * lag)
@@ -125,7 +125,7 @@ def _smooth(values: FloatArray, valid: BoolArray) -> FloatArray:
 
 
 def _convolve(values: FloatArray, window: FloatArray) -> FloatArray:
-    # A second to import, which only this needs.
+    # Imported here: it takes a second, and only this function needs it.
     from scipy.signal import oaconvolve
 
     whole: FloatArray = oaconvolve(values, window, mode="full")
@@ -228,7 +228,7 @@ def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
     n = np.maximum(count, 1.0)
     mean_a, mean_b = pairs(fa, fmb) / n, pairs(fma, fb) / n
     var_a, var_b = pairs(fa2, fmb) / n - mean_a**2, pairs(fma, fb2) / n - mean_b**2
-    # Relative to the whole, so that rounding of the transform cannot pass for motion.
+    # Relative to the sum, so that rounding errors of the transform do not count as motion.
     moving = (var_a > 1e-6 * np.mean(a**2)) & (var_b > 1e-6 * np.mean(b**2)) & (count > 0)
     spread = np.sqrt(np.where(moving, var_a * var_b, 1.0))
     rho = np.where(moving, (pairs(fa, fb) / n - mean_a * mean_b) / spread, 0.0)

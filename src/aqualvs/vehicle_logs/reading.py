@@ -34,9 +34,9 @@ _COLUMNS = TIME_COLUMNS + VALUE_COLUMNS
 _STEMS = {name.rsplit("_", 1)[0]: name for name in VALUE_COLUMNS} | {"yaw": "heading_deg"}
 _UNITS = frozenset({"", "m", "cm", "mm", "ft", "deg", "rad", "degrees", "radians", "cdeg"})
 _LARGEST = {"depth_m": 12000.0, "heading_deg": 720.0, "roll_deg": 360.0, "pitch_deg": 180.0}
-# Waves and the sensor's zero put a vehicle this far above the surface, no further.
+# Greatest height above the surface, from waves and the sensor's zero.
 _ABOVE_SURFACE_M = -2.0
-# A computer whose clock the network sets is right to well below this.
+# Clocks set by the network are more accurate than this.
 _UTC_SIGMA_S = 2.0
 
 
@@ -60,7 +60,7 @@ def read_csv_log(path: Path) -> VehicleLog:
     names, ignored = _columns([cell.strip() for cell in rows[0][1]], path)
     notes = (f"columns not used: {', '.join(ignored)}",) if ignored else ()
     if len(rows) > 2 and len(rows[-1][1]) < len(names):
-        # A recording that was interrupted ends within a line.
+        # An interrupted recording ends within a line.
         notes = (*notes, f"line {rows[-1][0]}, the last, is cut short and left out")
         del rows[-1]
     table, start_utc_s = _table(names, rows[1:], path)

@@ -225,7 +225,7 @@ def _peaks(scores: Scores, allowed: BoolArray) -> list[float]:
     """Return the offsets of the best peaks, the highest first."""
     height = np.where(allowed, scores.score, 0.0)
     # Padded, since a peak may be the first or the last.
-    # A second to import, which only this needs.
+    # Imported here: it takes a second, and only this function needs it.
     from scipy.signal import find_peaks
 
     tops, _ = find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))

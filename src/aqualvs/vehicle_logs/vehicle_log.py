@@ -296,7 +296,7 @@ def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray
     return signal.at(times)
 
 
-# Straight up or down no bearing is left to tell.
+# A vertical normal has no bearing.
 _LEAST_HORIZONTAL = 0.05
 
 

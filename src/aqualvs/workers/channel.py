@@ -38,7 +38,7 @@ _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fiel
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
 _ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
-# A line of the cache: no two columns share one.
+# Size of a cache line: no two columns share one.
 _ALIGNED = 64
 
 
@@ -218,7 +218,7 @@ class Sender:
             self._pipe.send((packed(message, own), own, n_bytes))
             return
         while self._n_free == 0:
-            # Only who has none is given a part: this can but be `_TAKEN`.
+            # A part is given only to a process without one, so this is always `_TAKEN`.
             self._pipe.recv()
             self._n_free += 1
         parcel = packed(message, self._memory.slots[self._next])

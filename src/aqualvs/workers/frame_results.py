@@ -27,7 +27,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of, reste
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.triangulate import Triangulator
 
-# Neighbouring points say the same; a few hundred are plenty for a comparison.
+# Neighbouring points are redundant; a few hundred are enough for a comparison.
 _EVERY = 4
 _MIN_POINTS = 6
 
@@ -176,7 +176,7 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
                 if given_up.is_set():
                     return
             put(_End())
-        except BaseException as fault:  # raised again where it is noticed
+        except BaseException as fault:  # raised again by the consumer
             put(_End(fault))
 
     thread = threading.Thread(target=fetch, name="frames", daemon=True)
@@ -264,7 +264,7 @@ class Meter:
         scanner = self._scanner
         if not isinstance(scanner, Scanner):
             return [scanner.process(frame) for frame in frames]
-        # Step by step for all of them: code that has just run is still in the caches, where
+        # Step by step for all frames: code that has just run is still in the caches, from which
         # decoding and the other step would displace it.
         returns = [scanner.detect(frame) for frame in frames]
         return [
@@ -292,7 +292,7 @@ def measured_blocks(
     for block in blocks:
         (before, _), *others = block
         if before:
-            # Before anything is recorded of the block's own frames.
+            # Before any result of the block's own frames is recorded.
             yield [meter.lost(scan) for scan in before]
         first, *more = meter.measure([frame for _, frame in block])
         found = [first]

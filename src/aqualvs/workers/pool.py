@@ -92,7 +92,7 @@ def serve(
     """
     for other in others:
         other.close()
-    # A terminal sends Ctrl-C to all processes; the one that has begun this one decides.
+    # A terminal sends Ctrl-C to all processes; the parent process decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
@@ -105,7 +105,7 @@ def serve(
                 for message in _messages(part, _frames(work, part, video), meter):
                     sender.send(message)
     except (EOFError, ConnectionError):
-        # The other end has gone; whatever is buffered for it goes too.
+        # The other end is closed; buffered data are discarded.
         os._exit(1)
 
 
@@ -113,7 +113,7 @@ def _messages(part: Part, frames: Iterator[Frame], meter: Meter) -> Iterator[Mes
     wanted = itertools.islice(
         frames,
         part.first - part.span.first,
-        # To its very end, where the reader compares the span with what was promised.
+        # To its end, where the reader compares the span with its description.
         None if part.stop == part.span.stop else part.stop - part.span.first,
     )
     try:
@@ -175,7 +175,7 @@ def _spans(source: FrameSource) -> tuple[Span, ...]:
         try:
             return video_spans(path, _PART_FRAMES).spans
         except (av.error.FFmpegError, OSError):
-            # The serial reader says what is wrong with it.
+            # The serial reader reports the fault.
             return ()
     return ()
 
@@ -288,7 +288,7 @@ class Crew(Closing):
         how, memory = context(), SharedMemory.new()
         mine, theirs = how.Pipe()
         is_copy = how.get_start_method() == "fork"
-        # A copy has these too; they count as closed when no process has them any more.
+        # Copies of this process inherit these; a pipe is closed when no process has it open.
         mines = [*(hand.pipe for hand in self._hands), mine] if is_copy else []
         process = how.Process(target=serve, args=(self._work, theirs, memory, mines), daemon=True)
         with interrupts_blocked() if is_copy else deaf_to_interrupts():

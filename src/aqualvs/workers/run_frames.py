@@ -62,7 +62,7 @@ def with_losses(
     """
     last_index, last_time_s = 0, 0.0
     for frame in frames:
-        # Between two frames that came, the clock is taken to run evenly.
+        # Times of lost frames are interpolated linearly.
         step = (frame.time_s - last_time_s) / max(1, frame.index - last_index)
         lost = range(frame.index if first is None else first, frame.index)
         yield [_lost(i, last_time_s + (i - last_index) * step, n_water) for i in lost], frame
@@ -127,10 +127,10 @@ class RunMeasuring(Closing):
             yield from self._shared
             if self._crew.is_done:
                 return
-            # The whole video tells what becomes of damage; what came before it stands.
+            # The effect of damage depends on the whole video; earlier results stay valid.
             self._window = replace(self._window, first=self._crew.next_frame)
             self._frames = window_of(self._source, self._window)
-        # A recording tells of lost frames itself; what it lacks was skipped on purpose.
+        # A recording contains its lost frames; frames that it lacks were skipped on purpose.
         first = None if isinstance(self._source, Replay) else self._window.first
         pairs = with_losses(self._frames, first, self._rig.n_water)
         ahead = _is_at_hand(self._source) and not one_by_one

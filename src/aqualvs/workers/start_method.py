@@ -76,7 +76,7 @@ def deaf_to_interrupts() -> Iterator[None]:
         return
     from multiprocessing import resource_tracker
 
-    # Begun later, it would have the thread that begins it hear again.
+    # Started later, it would unblock the signal in the starting thread.
     resource_tracker.ensure_running()
     with interrupts_blocked():
         yield

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 # Reading the target's markers takes longer than measuring a frame; the index hardly changes.
 _FIRST_FRAMES, _EVERY_S = 5, 0.4
-# A change of the index that matters less than this to the range (0.003 %) is not worth new plans.
+# Smaller changes of the index change the range by less than 0.003 % and need no new scanner.
 _WORTH = 2e-4
 _LEAST_SIGMA_TO_FOLLOW = 4e-3
-# How well users can measure where the plate is; its index is followed, not its place.
+# Accuracy of a user's measurement of the plate's place; only the index is tracked.
 _PLACE_MM, _TURN_DEG = 0.2, 0.1
 
 

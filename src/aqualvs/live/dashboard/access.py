@@ -210,7 +210,7 @@ def _is_host(text: str) -> bool:
     if found is None or int(found[1] or 0) > _MAX_PORT:
         return False
     try:
-        # The brackets of what is no IPv6 address raise here.
+        # Brackets without an IPv6 address raise here.
         return urlsplit(f"//{text}").hostname is not None
     except ValueError:
         return False
@@ -327,7 +327,7 @@ class TokenGate:
         if right:
             self._next()
         else:
-            # The next turn waits even if this caller is cancelled: hanging up saves no time.
+            # The next turn waits even if this caller is cancelled: disconnecting saves no time.
             asyncio.get_running_loop().call_later(self.WRONG_S, self._next)
             await asyncio.sleep(self.WRONG_S)
         return right

@@ -50,7 +50,7 @@ def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
     return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# More than a pilot sees; the rest of the machine's time belongs to the measurement.
+# More than a pilot perceives; the remaining time of the machine is for the measurement.
 _STATE_EVERY_S, _PICTURE_EVERY_S = 0.04, 0.08
 
 

@@ -158,7 +158,7 @@ def _without_nan(value: Any) -> Any:
     return value
 
 
-# Pictures on their way to a page that has not yet shown them: one being drawn, one being sent.
+# Pictures sent to a page and not yet shown: one being drawn, one in transit.
 _ON_THE_WAY = 2
 
 
@@ -213,7 +213,7 @@ class Hub:
     MAX_WATCHERS = 8
 
     def __init__(self) -> None:
-        # In the order in which they came.
+        # In the order of their arrival.
         self._watchers: dict[Watcher, None] = {}
 
     @property
@@ -260,9 +260,9 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
 }
-# A page that has connected greets within the first of these times.
+# The first is the time limit for the greeting of a connected page.
 _HELLO_S, _START_S, _STOP_S = 5.0, 10.0, 3.0
-# How often it is checked that whoever waits for the check of a token is still there.
+# Period of checks that a client whose token waits to be checked is still connected.
 _ALIVE_S = 0.5
 _REFUSED = 1008
 _log = logging.getLogger(__name__)
@@ -363,7 +363,7 @@ class DashboardServer:
             if watcher is not None:
                 await self._attend(socket, watcher, peer)
         except (WebSocketDisconnect, RuntimeError, OSError):
-            # The page has gone; that is its right.
+            # The page has closed, which is normal.
             return
 
     async def _welcome(self, socket: WebSocket, peer: str) -> Watcher | None:

@@ -84,7 +84,7 @@ class PilotSticks:
         return self._joystick_moved() or self._channels_moved()
 
     def _joystick_moved(self) -> bool:
-        # One who holds his sticks still must not hide another who moves his.
+        # A sender whose sticks are centred must not hide another whose sticks move.
         return any(self._moves(found) for found in self._link.every("MANUAL_CONTROL"))
 
     def _moves(self, found: Received) -> bool:
@@ -108,7 +108,7 @@ class PilotSticks:
             return True
         if self._beyond(told, _YAW, [s.r for s in ours]):
             return True
-        # JS_THR_GAIN scales the vertical by up to 4: where we use that axis, it tells nothing.
+        # JS_THR_GAIN scales the vertical by up to 4: while we use that axis, it shows nothing.
         vertical_is_ours = any(s.z != MIDDLE for s in ours)
         return not vertical_is_ours and self._beyond(told, _VERTICAL, [])
 
@@ -156,7 +156,7 @@ class DepthChoice:
 
     def read(self) -> float | None:
         """Return the depth in metres, positive down; None if none is known."""
-        # Only its span counts: what the pressure was at the surface, nobody says.
+        # Only its span counts: the pressure at the surface is unknown.
         self._value(*_PRESSURE)
         found = {kind: self._value(kind, field, scale) for kind, field, scale in _CANDIDATES}
         for kind, depth in found.items():
@@ -191,10 +191,10 @@ _ARMED = 128
 _FRESH_S = 1.0
 # Two and a half of ArduSub's heartbeats.
 _BEATS_WITHIN_S = 2.5
-# Sticks that were in use so lately may still be in force when the link is closed.
+# Sticks used within this time may still be in force when the link is closed.
 _LATELY_S = 3.0
 _GOODBYES, _GOODBYE_EVERY_S = 3, 0.02
-# Depth hold alone: elsewhere the vehicle would sink or rise under a neutral stick, or goes its way.
+# Depth hold only: in other modes the vehicle sinks or rises at neutral sticks, or steers itself.
 _KEEPS_DEPTH: Final = {
     Command.STICKS: ("ALT_HOLD", "POSHOLD", "SURFTRAK"),
     Command.GUIDED: ("GUIDED",),

@@ -16,18 +16,18 @@ from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping
 from aqualvs.control.vehicle import Effort
 from aqualvs.live.mavlink.link import MavlinkLink
 
-# Sticks and answers are looked at for so long, and are so many at least: six messages of three
+# Length of the window of sticks and responses, and their least number: six messages of three
 # channels, or as many of the attitude.
 _WINDOW_S, _LEAST_PAIRS = 6.0, 18
-# Of the squares of all sticks together: six at a tenth say enough of channels.
+# Least sum of the squares of all sticks: six at a tenth are enough for channels.
 _LEAST_SQUARES = 6 * 0.1**2
 # The least pilot gain is 0.1, 40 us for a full stick; half of the messages may hold the pilot's
-# own sticks, so that a quarter of that is an answer still.
+# own sticks, so that a quarter of that still counts as a response.
 _LEAST_SLOPE_US = 10.0
-# Sticks to and fro may be faster than channels are told; the channels then move all the same.
+# Sticks may alternate faster than channels are reported; the channels then move all the same.
 _STILL_US = 3.0
-# Below that a stick may lie within the dead zone of the channel. A vehicle that turns by less for
-# a full stick does not turn by it.
+# Smaller sticks may lie within the dead zone of the channel. A vehicle that turns by less for a
+# full stick does not respond to it.
 _TURNING_STICK, _LEAST_TURN = 0.5, math.radians(2.0)
 _LONGEST_STICK_S = 0.3
 _CENTRE_US, _LEAST_US, _MOST_US = 1500, 800, 2200
@@ -81,7 +81,7 @@ class StickResponse:
         if told is not None:
             for channel, axis in _AXES:
                 share, pulse_us = getattr(sticks, axis) / FULL, getattr(told, channel)
-                # 0 and 65535 stand for a channel that nobody moves.
+                # 0 and 65535 mean an unused channel.
                 off_us = pulse_us - _CENTRE_US if _LEAST_US < pulse_us < _MOST_US else 0
                 self._channels[channel].add(now_s, share, float(off_us))
         told = self._new("ATTITUDE")

@@ -28,9 +28,9 @@ FULL_CLIMB_RATE = 0.5
 
 _DISABLED, _DISARM = 0, 2
 _MAVLINK_RANGEFINDER, _FORWARD = 10, 0
-# A last effort that stands longer than this goes far.
+# A last effort that stays in force longer than this moves the vehicle far.
 _LONGEST_TIMEOUT_S = 1.0
-# The rate of descent closes its loop by the depth: half as fast or twice as fast still works.
+# The rate of descent is controlled by the depth: half or twice the rate still works.
 _CLIMB_RATE_RATIO = 2.0
 _ASK_EVERY_S, _ASK_SELDOM_S, _ROUNDS = 1.0, 30.0, 5
 

@@ -30,16 +30,16 @@ SILENT_AFTER_S = MOVES_AFTER_S
 
 _LOOK_EVERY_S = 0.1
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
-# A connection that lasts so long was a good one: the next attempt follows quickly again.
+# After a connection that lasted this long, the next attempt follows quickly again.
 _LASTING_S = 2.0
 # A peer that was heard and falls silent may have moved to another address.
 _REOPEN_AFTER_S = 10.0
 _REFUSED_FOR_S = 3.0
-# Of each kind of message the latest of so many senders is kept, besides the vehicle's.
+# Number of senders, besides the vehicle, whose latest message of each kind is kept.
 _MAX_SENDERS = 64
-# Datagrams taken in before the next look at what is to be sent.
+# Datagrams received before sending is checked again.
 _READ_AT_ONCE = 64
-# What a serial driver already holds delays a message by so much at most; beyond, it is dropped.
+# Greatest delay of a message by data in the serial driver's buffer; beyond it, it is dropped.
 _PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
 _ARDUPILOT, _NO_AUTOPILOT = 3, 8
 _AUTOPILOT_COMPONENT = 1
@@ -158,7 +158,7 @@ class MavlinkLink:
             self.dialect.MAV_STATE_ACTIVE,
             3,
         )
-        # Guards the port and the packer, and is only held for calls that never wait.
+        # Guards the port and the packer; held only for calls that never wait.
         self._sending = threading.Lock()
         self._port: Port | None = None
         self._broken: OSError | None = None
@@ -276,7 +276,7 @@ class MavlinkLink:
             again_s = min(time.monotonic() + _ASK_AGAIN_S, end_s)
             while time.monotonic() < again_s and not all(map(self._parameters.__contains__, asked)):
                 time.sleep(_ANSWER_POLL_S)
-            # Those that stay silent go to the end, so that the others are asked for.
+            # Unanswered parameters go to the end, so that the others are requested.
             rotated = [*missing[_ASKED_AT_ONCE:], *asked]
             missing = [name for name in rotated if name not in self._parameters]
         known = self.parameters()

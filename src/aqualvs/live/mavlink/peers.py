@@ -79,7 +79,7 @@ class Signer:
         for state in (self._outgoing, self._incoming):
             state.secret_key, state.timestamp = key, _now()
         self._outgoing.sign_outgoing = True
-        # Given, and never true, so that pymavlink counts what it refuses.
+        # A callback that always returns False, so that pymavlink counts refused messages.
         self._incoming.allow_unsigned_callback = lambda *_: False
 
     @property
@@ -124,10 +124,10 @@ Peer: TypeAlias = tuple[object, ...]
 MOVES_AFTER_S = 5.0
 """A system id that was silent for so long may be heard from another address."""
 
-# Those that are sent to: heard within so many seconds, the vehicle and so many others at most.
+# Messages are sent to the vehicle and at most so many others, heard within so many seconds.
 _HEARD_S, _MAX_OTHERS = 10.0, 8
-# Two and a half heartbeats, and what a busy machine adds: what somebody said of the vehicle's mode
-# counts for so long.
+# Lifetime of a statement about the vehicle's mode: two and a half heartbeats, and the delay of a
+# busy machine.
 _SAYS_FOR_S = 3.0
 _MAX_CLAIMS = 32
 _NO_AUTOPILOT = 8
@@ -303,7 +303,7 @@ class PeerTable:
             before = contest.now.get(claim.component)
             contest.now[claim.component] = claim
             if before is not None and before != claim:
-                # What comes back so soon was never given up: two speak from one address.
+                # A mode that returns so soon was not left: two systems speak from one address.
                 if now_s - contest.given_up_s.pop(claim, float("-inf")) < _SAYS_FOR_S:
                     self._contradicted(now_s, f"from {_shown(peer)}")
                 _put(contest.given_up_s, before, now_s)
@@ -336,7 +336,7 @@ class PeerTable:
 
 def _reset(parser: Any) -> None:
     """Let a parser begin a new message."""
-    # It works the length of a message out anew as soon as three bytes are there.
+    # The parser computes the length of a message again as soon as it has three bytes.
     parser.buf, parser.buf_index = bytearray(), 0
 
 

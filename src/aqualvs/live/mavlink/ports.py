@@ -173,7 +173,7 @@ def _serial_address(text: str, url: str) -> SerialAddress:
 _DATAGRAM = 65_535
 _CHUNK = 4096
 _CONNECT_S = 1.0
-# A stream that takes nothing for so long leads nowhere.
+# A stream that accepts no data for this time is broken.
 _STALLED_S = 5.0
 _SEND_BUFFER = 16_384
 _NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
@@ -265,7 +265,7 @@ def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tup
     """Return a socket that never waits, and the address as the system writes it."""
     flags = socket.AI_PASSIVE if passive else 0
     found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=flags)
-    # Autopilots and their routers listen to IPv4, also where the name has both.
+    # Autopilots and their routers listen on IPv4, also where the name has both kinds of address.
     family, kind, protocol, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     made = socket.socket(family, kind, protocol)
     made.setblocking(False)
@@ -331,7 +331,7 @@ class _UdpSender(_UdpPort):
         made, where = _open_udp(address, passive=False)
         super().__init__(made)
         try:
-            # Connected, so that the system tells when nobody listens, and lets nobody else in.
+            # Connected, so that the system reports a closed port and filters other senders.
             made.connect(where)
         except OSError:
             made.close()
@@ -480,7 +480,7 @@ class _TcpPort(StreamPort):
         self._socket = socket.create_connection((address.host, address.port), _CONNECT_S)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # What waits longer than this holds is too old to be sent.
+        # Data beyond this buffer would be too old when sent.
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
 
     def fileno(self) -> int:
@@ -564,7 +564,7 @@ class SerialPort(StreamPort):
             return
         number, self._number = self._number, -1
         try:
-            # Without this, closing waits until the driver has sent what it holds.
+            # Without this, closing waits until the driver has sent its buffer.
             termios.tcflush(number, termios.TCOFLUSH)
         except termios.error:
             pass
@@ -586,6 +586,6 @@ def _make_raw(number: int, speed: int) -> None:
     state[2] = termios.CS8 | termios.CREAD | termios.CLOCAL
     state[3] = 0
     state[4] = state[5] = speed
-    # With a minimum of 1 an idle port says "not now"; an empty read then means that it has gone.
+    # With a minimum of 1 an idle port raises "not now"; an empty read then means that it is gone.
     state[6][termios.VMIN], state[6][termios.VTIME] = 1, 0
     termios.tcsetattr(number, termios.TCSANOW, state)

@@ -32,7 +32,7 @@ _POSE, _POSE_COV = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovarian
 _FIELD = "sensor_msgs/msg/PointField"
 _STATUS, _PAIR = "diagnostic_msgs/msg/DiagnosticStatus", "diagnostic_msgs/msg/KeyValue"
 
-# In an order in which every type comes after those that it is made of.
+# Ordered so that every type comes after its parts.
 _DEFINITIONS = {
     _TIME: "int32 sec, uint32 nanosec",
     _HEADER: f"{_TIME} stamp, string frame_id",
@@ -137,7 +137,7 @@ def _serialize_cloud(
 
 
 _DEPTH = 5
-# A reader that cannot keep up holds a reliable writer for no longer.
+# Longest time that a slow reader blocks a reliable writer.
 _MAX_BLOCKING_NS = 50_000_000
 _MAX_DOMAIN = 232
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
@@ -149,7 +149,7 @@ _LOCALHOST = (
     "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
     '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
 )
-# By default every topic waits for a second, when it is closed, for subscribers that died.
+# By default every topic waits a second for dead subscribers when it is closed.
 _SHORT_FAREWELL = (
     "<CycloneDDS><Domain><Internal><WriterLingerDuration>100 ms</WriterLingerDuration>"
     "</Internal></Domain></CycloneDDS>"
@@ -361,6 +361,6 @@ def _quality(topic: Topic, options: RosOptions, types: Ros2Types) -> Any:
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
     ]
     if types.range_has_variance:
-        # Releases before Iron know no hashes, and have another Range.
+        # Releases before Iron have no type hashes, and another Range.
         policies.append(Policy.Userdata(type_hash(topic)))
     return Qos(*policies)

@@ -48,7 +48,7 @@ VEHICLE = "vehicle"
 
 _VEHICLE_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _LIFETIME_S = 0.5
-# Sides of the square that stands for the target, as a share of its range.
+# Side of the square that represents the target, as a share of its range.
 _SIDE_SHARE = 1.0
 _GREEN, _BLUE = (0.1, 1.0, 0.3, 1.0), (0.2, 0.6, 1.0, 0.25)
 _LINE_PX = 2.0

@@ -10,7 +10,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import ScanPoints
 from aqualvs.sources.base import PartHealth
 
-# The scanner believes a range that is beyond the working range by one part in a hundred.
+# The scanner accepts ranges up to one percent beyond the working range.
 _RANGE_TOLERANCE = 0.01
 _MAX_CM = 65_535
 _UNKNOWN_VARIANCE = 255
@@ -80,7 +80,7 @@ class MavlinkOutput:
         if self._was_filtered:
             filtered = _filtered_numbers(sample.filtered)
             messages = messages + _fill(self._filtered_values, time_boot_ms, filtered)
-        # The autopilot's distance goes first, and even where a slow line has no room for the rest.
+        # The autopilot's distance goes first, even if a slow line has no room for the rest.
         sent = self.link.send(self._distance, urgent=True)
         sent &= self.link.send(*messages)
         self._n_dropped += not sent

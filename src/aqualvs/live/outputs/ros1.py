@@ -31,7 +31,7 @@ _ASK_EVERY_S = 2.0
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
 _MASTER_S = 2.0
 _PATIENCE_S = 3.0
-# No packet is ever sent there; the system is only asked which way it would go.
+# No packet is ever sent there; the system is only asked for the route.
 _FAR_AWAY = "198.51.100.1"
 _TROUBLE = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError)
 _log = logging.getLogger(__name__)

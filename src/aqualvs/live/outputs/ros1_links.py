@@ -324,7 +324,7 @@ class Ros1Links:
         self._thread.join(_PATIENCE_S)
 
     def _rouse(self) -> None:
-        # Where the pipe is full the thread is going to wake anyway.
+        # If the pipe is full, the thread will wake anyway.
         with contextlib.suppress(OSError):
             self._wake.send(b"!")
 
@@ -393,7 +393,7 @@ class Ros1Links:
         except _RefusedError as refusal:
             _log.warning("subscriber at %s refused: %s", link.peer, refusal)
             link.waiting.append(_tcpros_header({"error": str(refusal)}))
-            # A few octets always fit; what the peer makes of them is its own affair.
+            # A few octets always fit; the peer may ignore them.
             self._serve(link)
             self._part(link)
             return

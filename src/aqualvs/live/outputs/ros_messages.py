@@ -466,7 +466,7 @@ class MessageMaker:
         near, far = rig.working_range
         value = posture.range if posture else _no_range(sample)
         if posture:
-            # What the scanner believes just outside must not be thrown away by the receiver.
+            # Ranges that the scanner accepts just outside must not be discarded by the receiver.
             near, far = min(near, value), max(far, value)
         return RangeMessage(
             stamp_ns=sample.utc_ns,

@@ -292,7 +292,7 @@ class _Receiver:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        # Connected, so that the system tells when nobody listens.
+        # Connected, so that the system reports a closed port.
         self._socket.connect(where)
         return True
 
