@@ -41,7 +41,7 @@ def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
     Raises
     ------
     RigError
-        If what the rig says about its uncertainty cannot be understood.
+        If the rig's uncertainty cannot be parsed.
     """
     if len(rig.lasers) < 2:
         return None
@@ -63,11 +63,11 @@ class RunResult:
         Name of the signal that stopped it, or empty.
     tally : Tally
     dome_lines : list of str
-        What the dome model is worth, in words.
+        Effect of the dome model, as lines of text.
     water_lines : list of str
-        What was found of the water's index, in words; empty where it was given.
+        Result for the water's index, as lines of text; empty where it was given.
     net_lines : list of str
-        The state of the net, in words; empty where nobody asked.
+        State of the net, as lines of text; empty if not requested.
     elapsed_s : float
         From the first frame to the complete folder, without the report.
     report : Path or None
@@ -213,7 +213,7 @@ def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None
     Raises
     ------
     AqualvsError
-        If the target that tells the water's index cannot be used.
+        If the target for the water's index cannot be used.
     """
     if request.index_target is None:
         return None
@@ -236,7 +236,7 @@ def agreement_for(request: RunRequest, rig: Rig) -> LaserAgreement | None:
     Raises
     ------
     RigError
-        If what the rig says about its uncertainty cannot be understood.
+        If the rig's uncertainty cannot be parsed.
     """
     if request.no_dome:
         return None

@@ -129,7 +129,7 @@ class NetPilot:
         filtered : Motion or None
             From the time filter, as of this frame, where there is one.
         state : VehicleState
-            What the vehicle tells.
+            As the vehicle reports it.
         """
         if self._other_stream(time_s):
             _, reason = self.gate.check(now_s, math.inf, None, state, NEUTRAL)

@@ -316,7 +316,7 @@ class Ramp:
 class QuietZone:
     """Suppression of small turning rates, so that the vehicle's own heading hold can act.
 
-    From rest a rate must exceed `quiet`; one that has begun ends when it changes its sign.
+    From rest a rate must exceed `quiet`; a turn ends when the rate changes its sign.
 
     Parameters
     ----------
@@ -574,7 +574,7 @@ class RangeYawController:
     def _against_drag(self, ahead: float) -> tuple[float, tuple[float, float]]:
         """Return the acceleration that keeps a speed, in addition to the integral.
 
-        The integral keeps the vehicle in its place: it tells how fast the water passes there. With
+        The integral keeps the vehicle in its place, so it gives the speed of the water there. With
         it come the factors on the gains in that water: drag damps the vehicle as the speed's gain
         does, and lets gain and integral be greater.
         """

@@ -39,8 +39,8 @@ FOLLOW_COLUMNS = (
     "heading_deg",
     "bearing_deg",
 )
-"""`posture` is "valid" or why there is none; errors are measured less wanted. What is not known is
-empty."""
+"""`posture` is "valid" or the reason of a refusal; errors are measured less wanted. Unknown values
+are empty."""
 
 
 class FollowLog:
@@ -49,7 +49,7 @@ class FollowLog:
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
 
     Raises
     ------

@@ -174,8 +174,8 @@ class DeadBandCrossing:
         return self._side * self._thrust.dead_band
 
 
-# Noise of postures owes less than that share of the impulse; and so long thrust must stand on one
-# side, in seconds, before it is more than a correction of the last one.
+# Noise of postures owes less than this share of the impulse; and thrust must stay on one side for
+# this time, in seconds, before it is more than a correction of the last one.
 _WAITING_SHARE, _STANDS_S = 1.0 / 3.0, 2.0
 
 
@@ -332,7 +332,7 @@ class YawGains:
     lag : float
         As of the range.
     quiet_rate : float
-        Turning rate below which none is begun, in rad/s.
+        Turning rate below which no turn begins, in rad/s.
     """
 
     proportional: float

@@ -77,7 +77,7 @@ class Mission(Protocol):
         now_s : float
             Monotonic, in seconds. Only steps forward of up to a second count as time spent.
         posture : Posture or None
-            The present one; None where there is none. While nobody steers there are no updates.
+            The present one; None where there is none. While disengaged there are no updates.
         state : VehicleState
             Depth and heading are used where they are known.
         """
@@ -95,7 +95,7 @@ class LossOptions:
     after : float
         Seconds without a posture after which the mission waits.
     steady : float
-        Seconds of postures in a row before it goes on.
+        Seconds of consecutive postures before it continues.
     give_up : float
         Seconds of waiting after which it ends.
     """
@@ -174,7 +174,7 @@ class HoldMission:
     Parameters
     ----------
     setpoint : Setpoint or None
-        Kept in `setpoint`, which may be set anew at any time.
+        Kept in `setpoint`, which may be changed at any time.
     duration : float, optional
         Seconds with the target after which it is `Stage.OVER`; endless if left out.
     loss : LossOptions, optional

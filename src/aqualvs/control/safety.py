@@ -121,8 +121,8 @@ class SafetyLimits:
         allowed shrinks with the way that is left.
     retreat_effort : float
         With which it backs away from too close; more where the controller asks for more. Must
-        exceed the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: whoever
-        still comes closer is pushed by the water.
+        exceed the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: a
+        vehicle that still comes closer is pushed by the water.
     brake_effort : float
         With which it brakes what closes in by two thirds or more faster than allowed; likewise.
         Below it is less in proportion: braking is not to throw the vehicle out of sight.
@@ -215,7 +215,7 @@ class SafetyGate:
         posture : Posture or None
             The last valid one; None if there never was any.
         state : VehicleState
-            What the vehicle tells.
+            As the vehicle reports it.
         effort : Effort
             What controllers ask for.
         range_rate : float, optional
@@ -361,13 +361,14 @@ class AnswerLimits:
     Attributes
     ----------
     repeats_s : float
-        So long the same posture to the last bit, while an effort is in force, is a frozen picture.
+        Time after which a posture that is the same to the bit, while an effort is in force, counts
+        as a frozen picture.
     quiet : float
         Noise of the postures, as share of the usual standard deviation, below which the picture is
         frozen. Twelve and more differences are looked at: sound noise is so small by chance once in
         10^10 frames.
     window_s : float
-        Efforts and motion are compared over so many seconds.
+        Efforts and motion are compared over this time, in seconds.
     promised : float
         Way towards the target by the efforts, in metres, that a posture which stands still must
         answer to. Standing still is 0.6 % of the range and 0.6 degrees: waters that take so much
@@ -416,7 +417,7 @@ class AnswerWatch:
 
     `Reason.FROZEN` while postures repeat to the bit, or their noise has all but vanished: a picture
     that stands still. `Reason.NO_ANSWER` where the efforts must have brought the vehicle nearer, or
-    the autopilot tells that it has turned, and the posture shows nothing of it: a picture that
+    the autopilot reports that it has turned, and the posture shows nothing of it: a picture that
     stands still in spite of its noise, a vehicle that is caught, sticks that turn the other way.
 
     Parameters
@@ -467,7 +468,7 @@ class AnswerWatch:
         posture : Posture
             Of a frame that has not been seen before.
         state : VehicleState
-            What the vehicle tells.
+            As the vehicle reports it.
         """
         if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
             return None

@@ -40,7 +40,7 @@ class Sticks:
     x, y, r : int
         Forward, right, clockwise, -1000 to 1000.
     z : int
-        Up, 0 to 1000; 500 is neutral, whatever the MAVLink specification says.
+        Up, 0 to 1000; 500 is neutral, contrary to the MAVLink specification.
     """
 
     x: int = 0

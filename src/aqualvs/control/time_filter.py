@@ -59,7 +59,7 @@ class PostureFilterOptions:
     ----------
     range_acceleration : float
         Random acceleration towards and from the target, in m/s², that acts for about a second: the
-        speed a second ahead is uncertain by so many m/s.
+        speed a second ahead is uncertain by the same number in m/s.
     pitch_acceleration, yaw_acceleration : float
         The same for the angles, in rad/s².
     initial_speed, initial_turn_rate : float
@@ -67,7 +67,7 @@ class PostureFilterOptions:
     gate_probability : float
         Share of sound measurements that pass the gate.
     n_rejected : int
-        Rejected measurements in a row that agree with each other, after which the filter believes
+        Rejected measurements in a row that agree with each other, after which the filter accepts
         them: the target itself is elsewhere.
     max_coast : float
         Seconds without an accepted measurement after which there is no filtered posture.

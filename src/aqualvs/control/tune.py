@@ -127,7 +127,7 @@ class Turning:
     rate_loop: float
 
     def lag(self, slower: float = 1.0) -> float:
-        """Return the whole, with a rate loop that is so many times slower."""
+        """Return the total lag, with a rate loop that is slower by a factor."""
         return self.shaping + self.thrusters + slower * self.rate_loop
 
 
@@ -284,7 +284,7 @@ class TuneOptions:
     greatest_delay : float
         What it may become; performance may suffer there, stability must not.
     frame : float
-        Seconds between frames; half of it counts as delay, for efforts are held so long.
+        Seconds between frames; half of it counts as delay: efforts are held until the next frame.
     mass_factor, drag_factor : float
         By which mass and drag may be off, either way.
     current : float

@@ -141,9 +141,9 @@ class VehicleState:
     heading, roll, pitch : float or None
         Radians; heading clockwise from north.
     doubt : str
-        Why it seems not to do what it is told; empty if it does, or nothing is known.
+        Why it seems not to obey; empty if it does, or nothing is known.
     rival : str
-        Who else speaks as the vehicle, and agrees with it; empty if nobody does.
+        Other sender that speaks as the vehicle, and agrees with it; empty if there is none.
     """
 
     heard_s: float = float("-inf")

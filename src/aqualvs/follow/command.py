@@ -159,7 +159,7 @@ class RunWatch:
         Takes one line.
     stop : StopSignals
     slow : bool
-        Whether a second takes seconds, so that the way is told.
+        Whether a simulated second takes seconds, so that progress is printed.
     """
 
     def __init__(

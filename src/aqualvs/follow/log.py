@@ -12,7 +12,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.results.files import writing
 
 NEUTRAL_WITHIN_S = 0.2
-"""Without a valid posture for so long there must be no thrust."""
+"""Without a valid posture for this time there must be no thrust."""
 
 
 class LoopRow(NamedTuple):
@@ -36,7 +36,7 @@ class LoopRow(NamedTuple):
     forward, right, down, turn : float
         The last effort sent.
     depth, heading : float
-        As the vehicle tells.
+        As the vehicle reports them.
     engaged : bool
     stage, reason, refusal : str
         Of the mission; why the effort was changed; why there is no posture.
@@ -78,10 +78,10 @@ class LoopLog:
     ----------
     rows : list of LoopRow
     blind_thrust_s : list of float
-        For each stretch of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
+        For each period of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
         reached: time from the last valid posture to neutral.
     n_blind : int
-        Such stretches, with or without thrust.
+        Such periods, with or without thrust.
     """
 
     rows: list[LoopRow] = field(default_factory=list)
@@ -159,7 +159,7 @@ def _cell(value: object, factor: float, digits: int) -> str:
 SETTLED_SHARE = 0.1
 """A step has settled once the range stays within this share of it."""
 LOST_AFTER_S = 2.5
-"""Without sight for longer, in seconds, somebody has to take over."""
+"""Without sight for longer, in seconds, a human has to take over."""
 # Greater increase of the swings from the middle to the end of a run counts as growth, in metres.
 _GROWS, _GROWS_BY = 2.0, 0.05
 
@@ -223,7 +223,7 @@ class EffortMeasures:
 
 
 JUMP = 0.25
-"""Of an effort: about what crossing a dead band takes."""
+"""Least jump of an effort that counts: about the width of a dead band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,7 +235,7 @@ class SafetyMeasures:
     least_clearance : float
         In metres; negative is contact.
     n_blind : int
-        Stretches of more than 0.2 s without a valid posture.
+        Periods of more than 0.2 s without a valid posture.
     neutral_late : float
         Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
     stable : bool

@@ -47,7 +47,7 @@ class RandomDive:
     sway : float
         In m/s; 0 is a dive that holds.
     blind : tuple of Blind
-        Stretches without sight.
+        Periods without sight.
     """
 
     seed: int
@@ -87,7 +87,7 @@ class Spread:
     Attributes
     ----------
     mass : float
-        Greatest deviation from what the controller believes, as a share.
+        Greatest deviation from the controller's value, as a share.
     drag : float
         Greatest factor either way.
     current : float

@@ -122,7 +122,7 @@ class Loss(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Blind:
-    """A stretch without a valid posture.
+    """Period without a valid posture.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class SampledEye:
     noise : PostureNoise, optional
         Defaults if left out.
     blind : sequence of Blind
-        Stretches without sight.
+        Periods without sight.
     working_range : (float, float)
         Outside of it nothing is measured, in metres.
     """

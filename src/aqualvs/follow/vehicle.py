@@ -48,7 +48,7 @@ class FollowLogOutput:
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
     pilot : Pilot
 
     Raises

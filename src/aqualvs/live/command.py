@@ -88,7 +88,7 @@ _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
 
 
 class Console:
-    """An output for whoever started the run.
+    """Output to the terminal of the user who started the run.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ class LiveRequest:
     water : Water
     scanner : ScannerOptions
     index_target : Path or None
-        Markers on the vehicle that tell the water's index.
+        Markers on the vehicle that show the water's index.
     """
 
     source: str

@@ -47,8 +47,8 @@ class FrozenOptions:
         Pictures so far apart, in seconds, are compared: long enough for cameras that repeat each
         picture two or four times, as they do in dim light.
     greatest : float
-        A greater change is never that of a frozen picture, in grey levels. What an encoder goes on
-        to improve in a still is less after 0.4 s.
+        A greater change is never that of a frozen picture, in grey levels. An encoder's
+        improvements of a still are less after 0.4 s.
     least : float
         A smaller change is always that of a frozen picture, in grey levels.
     share : float
@@ -79,9 +79,9 @@ class FrozenPicture:
     """Detector of frozen pictures: compares each with one a quarter of a second older.
 
     The statistic is the 99 % quantile, over cells of 8 x 8 pixels in a quarter of the rows, of how
-    much a cell's mean luma has changed. Means tell motion, and noise of the sensor, from what an
-    encoder does to a still: it adds detail to the cells and leaves their means. A stripe that moves
-    by a thirtieth of a pixel changes its cells by half a grey level.
+    much a cell's mean luma has changed. Means separate motion, and noise of the sensor, from the
+    encoder's changes of a still: it adds detail to the cells and leaves their means. A stripe that
+    moves by a thirtieth of a pixel changes its cells by half a grey level.
 
     Parameters
     ----------
@@ -250,11 +250,11 @@ def _off(agreement: LaserAgreement) -> dict[int, str]:
 
 
 WINDOW_S = 5.0
-"""Rates and delays are those of so many last seconds."""
+"""Time over which rates and delays are taken, in seconds."""
 
 STAGES = ("wait", "measure", "send", "total")
-"""From the decoded frame to the moment the measuring thread takes it; the measurement; the sending
-to outputs that never wait; all of it."""
+"""Delay from the decoded frame until the measuring thread takes it; of the measurement; of sending
+to outputs that never wait; and of all of it."""
 
 # A laser without points on the target for this time, while others have some, is off or covered.
 _DARK_S = 2.0

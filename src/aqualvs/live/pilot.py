@@ -35,7 +35,7 @@ class Watchdog:
     ----------
     vehicle : VehicleLink
     patience_s : float
-        So long an effort may stand.
+        Time that an effort may stay in force.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Watchdog:
         ----------
         effort : Effort
         known_s : float
-            When what it rests on was known, by `time.monotonic`.
+            Time at which its posture was known, by `time.monotonic`.
 
         Raises
         ------
@@ -136,7 +136,7 @@ class PilotReport:
     guidance : Guidance
         What the mission wants.
     state : VehicleState
-        What the vehicle told.
+        As the vehicle reported it.
     """
 
     at_ns: int
@@ -323,7 +323,7 @@ class Pilot:
         )
 
     def _present(self, sample: LiveSample, now_s: float) -> Posture | Refusal:
-        """Return the posture, unless measuring took so long that it is one no more."""
+        """Return the posture, unless measuring took so long that it is outdated."""
         posture, arrived_s = sample.scan.posture, 1e-9 * sample.instants.arrived_ns
         if not posture:
             return posture

@@ -193,7 +193,7 @@ class Mailbox:
     Attributes
     ----------
     n_dropped : int
-        Frames that were replaced by a newer one before anybody took them.
+        Frames that were replaced by a newer one before they were taken.
     """
 
     def __init__(self, *, keep_every: bool = False) -> None:
@@ -363,9 +363,9 @@ class LiveOptions:
     Attributes
     ----------
     stale_after_s : float
-        A stream that is silent for so long has no posture any more.
+        A stream that is silent for this time has no posture any more.
     keep_every : bool
-        Measure every frame, whatever delay that adds: for files.
+        Measure every frame regardless of the delay: for files.
     frozen : FrozenOptions or None
         When a picture counts as frozen, and has no posture; None where none does.
     """

@@ -175,7 +175,7 @@ class Recorder:
     Raises
     ------
     OutputError
-        If the file exists or cannot be begun. Later faults are told by `health`: what does not fit
+        If the file exists or cannot be begun. `health` reports later faults: what does not fit
         on the disk waits, as far as memory is granted, and is tried again.
     """
 

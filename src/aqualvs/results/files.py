@@ -39,7 +39,7 @@ class AppendFile:
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
     exclusive : bool
         Whether to raise `FileExistsError` where there is a file.
 
@@ -178,7 +178,7 @@ def explain(path: Path, fault: OSError) -> str:
 
 
 RECORD = ".aqualvs.json"
-"""File in which a folder notes who wrote its files."""
+"""File of a folder that records which command wrote its files."""
 
 _WRITER, _MARK = "writer", "mark"
 # A video has gigabytes: its beginning and end, with the size, identify it.

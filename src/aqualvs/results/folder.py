@@ -59,9 +59,8 @@ POSTURE_COLUMNS = (
     "sigma_yaw_total_deg",
 )
 """Curvatures, horizontal and vertical, are empty unless the target is a curved net. `sigma_range_m`
-and its like are what the frame's noise makes, `sigma_..._rig_...` what the uncertainty of the rig
-does, which is common to all frames, and `sigma_..._total_...` the root of the sum of the squares of
-both."""
+and its like are due to the frame's noise, `sigma_..._rig_...` to the uncertainty of the rig, which
+is common to all frames; `sigma_..._total_...` is the root of the sum of the squares of both."""
 _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 
 
@@ -71,7 +70,7 @@ class PostureCsv(Closing):
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
 
     Raises
     ------
@@ -164,7 +163,7 @@ RUN_FILES = (
     REPORT_HTML,
     *NET_FILES,
 )
-"""What belongs to a run; nothing else in its folder is ever removed or replaced."""
+"""Files of a run; nothing else in its folder is ever removed or replaced."""
 
 _KILLED = "the run ended before it could close its files; the folder was completed afterwards"
 
@@ -374,7 +373,7 @@ def _new_journal(folder: Path) -> PointsJournal:
     Raises
     ------
     OutputError
-        If another run has begun one since `prepare_folder`.
+        If another run has started one since `prepare_folder`.
     """
     try:
         with locked_folder(folder):

@@ -40,8 +40,9 @@ POINTS_SCHEMA = pa.schema(
 )
 """Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`.
 
-`label` says what a point lies on (`Label`), `used` whether it entered the posture; `intensity` is
-the stripe's height above its background in grey levels, `width_px` its full width at half of that.
+`label` is the kind of surface of a point (`Label`), `used` whether it entered the posture;
+`intensity` is the stripe's height above its background in grey levels, `width_px` its full width at
+half of that.
 """
 
 _LABEL_NAMES = pa.array(LABELS, pa.string())
@@ -53,7 +54,7 @@ class PointsJournal:
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
     exclusive : bool
         As for `AppendFile`.
 
@@ -176,7 +177,7 @@ def check_idle(path: Path) -> None:
 
 
 DRAFT = ".part"
-"""What is added to the names of files that are not finished."""
+"""Suffix of the names of unfinished files."""
 
 _ROWS_PER_GROUP = 1 << 17
 _N_LASERS = 128

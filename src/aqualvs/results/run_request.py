@@ -226,7 +226,7 @@ class RunRequest:
         Frame rate of image folders.
     scanner : ScannerOptions
     chosen : frozenset of str or None
-        Fields of `scanner` that count for a recording, whose own options stand for the others.
+        Fields of `scanner` that count for a recording, whose own options apply otherwise.
         None: all of them.
     mcap : bool
         Whether to write `dive.mcap`.
@@ -235,7 +235,7 @@ class RunRequest:
     truth : Path or None
         Truth to compare with.
     index_target : Path or None
-        Markers on the vehicle that tell the water's index, followed frame by frame.
+        Markers on the vehicle that show the water's index, tracked frame by frame.
     net : NetRequest or None
         What to find out about the net on the way, if anything.
     target : str

@@ -196,7 +196,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
 
     Decoders read a few dozen bytes beyond a packet's end and count on zeros there
     (AV_INPUT_BUFFER_PADDING_SIZE of FFmpeg). Memory that FFmpeg allocates has them; Python's bytes
-    end where they end, so that a sound picture may be taken for damaged.
+    end where they end, so that an intact picture may count as damaged.
 
     Parameters
     ----------

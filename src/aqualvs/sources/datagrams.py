@@ -21,13 +21,13 @@ from aqualvs.sources.rtp import parse_rtp
 from aqualvs.sources.transport_stream import PACKET_BYTES, SYNC
 
 _BUFFER_BYTES = 4 << 20
-"""Asked of the system, which may give less: a key frame comes in one burst."""
+"""Size of the receive buffer; the system may grant less. A key frame comes in one burst."""
 
 _LOOK_S = 0.2
-"""The receiver looks so often whether it shall end."""
+"""Period in which the receiver checks whether to end."""
 
 _MAX_WAITING = 20_000
-"""Datagrams kept for a reader that does not come; later ones are lost, and counted as such."""
+"""Datagrams kept for a late reader; further ones are lost, and counted as such."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,18 +200,18 @@ def _join(made: socket.socket, group: str, *, is_v6: bool) -> None:
 
 
 RTP, TS, BARE = "RTP H.264", "MPEG-TS", "bare H.264"
-"""Kinds of content, in the words of health."""
+"""Kinds of content, as health reports name them."""
 
 _TS_IN_RTP = 33
 
 WAIT_S = 0.2
-"""A wait for datagrams is no longer, so that an end is noticed."""
+"""Longest wait for datagrams, so that an end is noticed."""
 
 MAX_FOREIGN = 5
-"""So many datagrams in a row of another kind: the sender sends something else now."""
+"""Datagrams in a row of another kind, after which the sender has changed its content."""
 
 _MAX_LAG_S = 2.0
-"""What waits longer for decoding is dropped: this machine does not keep up."""
+"""Datagrams that wait longer for decoding are dropped: this machine does not keep up."""
 
 
 def kind_of(datagram: bytes) -> str | None:

@@ -31,7 +31,7 @@ class Units:
 
 
 UnitReader: TypeAlias = Callable[[memoryview], Units]
-"""Tells what a packet holds."""
+"""Reader of the units of a packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
     codec : str
         As FFmpeg names it.
     extradata : bytes
-        Of the stream; tells whether units begin with their length or with a start code.
+        Of the stream; states whether units begin with their length or with a start code.
     """
     found = _CODECS.get(codec)
     if found is None:
@@ -106,7 +106,7 @@ START_CODE = b"\x00\x00\x00\x01"
 
 _START = re.compile(b"\x00\x00\x01")
 _HEAD = 64
-"""Bytes of a unit that hold all that is read here; a long scaling list is left unread."""
+"""Bytes of a unit that hold all fields read here; a long scaling list is left unread."""
 
 _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 
@@ -129,7 +129,7 @@ def nal_units(data: bytes) -> list[bytes]:
 class FrameNumbers:
     """Detector of missing reference pictures by their frame numbers (7.4.3, `frame_num`).
 
-    Needed where the transport does not tell of losses. A decoder copies the missing picture from
+    Needed where the transport does not report losses. A decoder copies the missing picture from
     another one and says nothing.
     """
 
@@ -152,7 +152,7 @@ class FrameNumbers:
         Returns
         -------
         gap : bool
-            False also where that cannot be told: before a parameter set, in streams that leave
+            False also where that is unknown: before a parameter set, in streams that leave
             numbers out on purpose.
         """
         for unit in nal_units(data):

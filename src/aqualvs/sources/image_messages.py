@@ -37,7 +37,7 @@ _TO_BGR = {
 """Channels and OpenCV's conversion; OpenCV names Bayer patterns by their second row."""
 
 _PACKED_422 = {"yuv422_yuy2": 0, "yuyv": 0, "yuv422": 1, "uyvy": 1}
-"""Where luma begins among the bytes of two pixels; ROS's `yuv422` is UYVY."""
+"""Position of luma among the bytes of two pixels; ROS's `yuv422` is UYVY."""
 
 ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
 
@@ -49,7 +49,7 @@ class ImageMessage:
     Attributes
     ----------
     stamp_ns : int
-        Time of the picture, nanoseconds; 0 if the message tells none.
+        Time of the picture, nanoseconds; 0 if the message has none.
     encoding : str
         Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
     data : bytes

@@ -25,7 +25,7 @@ from aqualvs.sources.h264 import FrameNumbers
 from aqualvs.sources.video import Ledger
 
 _DISAGREE_S = 5.0
-"""Stream and arrival differ by less while the sender's clock runs on: buffers hold no more."""
+"""Greatest difference of stream and arrival times for one sender: buffers hold no more."""
 
 
 class Unwrapper:
@@ -64,7 +64,7 @@ class Unwrapper:
 class StreamClock:
     """Time since the first picture, which never falls, also over a sender that starts anew.
 
-    A sender that starts anew counts from any number. Where its time disagrees with the time of
+    A sender that restarts counts from any number. Where its time disagrees with the time of
     arrival by more than 5 s, or falls, the stream goes on as long after the last picture as the
     new one arrived after it.
 
@@ -125,7 +125,7 @@ class StreamClock:
 
 
 _WINDOW_S = 5.0
-"""Rates and losses are told for so long."""
+"""Rates and losses are reported for this time."""
 
 _SILENT_S = 0.5
 """Longer silence is a fault."""

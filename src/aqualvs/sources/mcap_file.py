@@ -19,7 +19,7 @@ from aqualvs.errors import SourceError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9
-"""Of every record: its kind and the length of what follows."""
+"""Head of every record: its kind and the length of its content."""
 
 
 class Op(IntEnum):
@@ -50,7 +50,7 @@ def head(kind: Op, length: int) -> bytes:
 
 
 def padding_head(span: int) -> bytes:
-    """Return the first bytes of a record of no meaning that spans so many bytes, its head included.
+    """Return the head of a padding record that spans this many bytes, its head included.
 
     Raises
     ------
@@ -185,7 +185,7 @@ DATA_END_BYTES = len(data_end())
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 MAX_RECORD_BYTES = 1 << 29
-"""Size of a record, also when decompressed; more is damage, or meant to fill the memory."""
+"""Greatest size of a record, also when decompressed; more is damage or an attack."""
 # The records of a summary are far smaller than chunks.
 _MAX_SUMMARY_BYTES = 1 << 24
 _KNOWN = frozenset(Op)
@@ -236,9 +236,9 @@ class _Listing:
 class McapFile:
     """An MCAP file whose chunks can be read one after the other.
 
-    What the summary at the end tells is checked against the chunks themselves. Where they differ,
+    The summary at the end is checked against the chunks themselves. Where they differ,
     or the end is missing, as after a loss of power or with a bit that flipped on the disk, the file
-    is read from its beginning as far as it goes, and what the summary tells beyond that is added:
+    is read from its beginning as far as it goes, and further contents of the summary are added:
     damage in one place loses the chunk that it is in.
 
     Parameters
@@ -383,7 +383,7 @@ def _is_sound(file: BinaryIO, summary: _Listing) -> bool:
 def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, ...]]:
     """Return the topics of every channel by both ends; one end that contradicts itself is left out.
 
-    Where the ends give a channel two names both count: damage makes a name that nobody asks for.
+    Where the ends give a channel two names both count: a damaged name matches no request.
     """
     found: dict[int, tuple[str, ...]] = {}
     for one in (front, summary):

@@ -29,7 +29,7 @@ class Topic:
     ----------
     name : str
     n_messages : int or None
-        None where the recording does not tell.
+        None where the recording does not state it.
     """
 
     name: str
@@ -88,7 +88,7 @@ class MessageSource(Closing):
 
     Notes
     -----
-    Times are those of the pictures where the messages tell them, else those of the log. Pictures of
+    Times are those of the pictures where the messages have them, else those of the log. Pictures of
     a video that are predicted from a lost one are not delivered (see `LiveDecoder`).
     """
 

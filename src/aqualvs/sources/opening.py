@@ -93,7 +93,7 @@ STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "rtsps", "srt", "tcp",
 """Addresses of streams; everything else is a path."""
 
 BLUEROV_PORT = 5600
-"""Where BlueOS and ArduSub send the main camera, and QGroundControl listens."""
+"""Port to which BlueOS and ArduSub send the main camera, and where QGroundControl listens."""
 
 
 def open_source(

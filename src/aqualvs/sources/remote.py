@@ -25,14 +25,14 @@ VideoPacket: TypeAlias = "Packet[VideoStream]"
 Opener: TypeAlias = Callable[[], InputContainer]
 
 _MAX_WAITING = 250
-"""Packets kept for a decoder that does not come; then the connection is given up."""
+"""Packets kept for a late decoder; beyond it the connection is given up."""
 
 
 class Connection:
     """Connection opened in the background, and the packets of its first video.
 
-    FFmpeg waits without end where a network is silent, and can't be woken. So nobody waits for
-    this thread: it ends by itself when FFmpeg's time runs out, and closes what it opened.
+    FFmpeg waits without end where a network is silent, and can't be woken. So the thread is not
+    joined: it ends by itself when FFmpeg's time runs out, and closes what it opened.
 
     Parameters
     ----------
@@ -106,11 +106,11 @@ _OPEN_S, _SILENT_S = 5.0, 2.0
 """Time to connect and find the first key frame; silence after which a connection is dead."""
 
 _RETRY_S = (0.1, 0.2, 0.5)
-"""Pauses before new tries, the last for ever: the vehicle may come back at any time."""
+"""Pauses before retries, the last one repeated: the vehicle may return at any time."""
 
 _PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
-"""The rate need not be known; the first pictures shall not wait until it is measured. FFmpeg's
-`nobuffer` is not set: it drops what was read meanwhile, often the only key frame for seconds."""
+"""The rate is not probed, so that the first pictures need not wait for it. FFmpeg's
+`nobuffer` is not set: it drops packets read meanwhile, often the only key frame for seconds."""
 
 
 class RemoteFeed:

@@ -10,10 +10,10 @@ from aqualvs.sources.h264 import DELIMITER, SEI, SPS, START_CODE
 from aqualvs.sources.live_frames import Unwrapper
 
 _MAX_STEP = 3000
-"""Packets that may be missing in a row; a greater step is a sender that begins anew."""
+"""Packets that may be missing in a row; a greater step is a restarted sender."""
 
 _RESTART_SILENCE_S = 0.1
-"""So long must the sender in use be silent before another takes its place."""
+"""Time for which the sender in use must be silent before another takes its place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Ordered(NamedTuple):
     after_loss : bool
         Packets right before it are missing.
     is_restart : bool
-        The first of another sender, or of one that has begun anew.
+        The first of another sender, or of a restarted one.
     """
 
     packet: RtpPacket
@@ -104,7 +104,7 @@ class RtpOrder:
     Notes
     -----
     A stray packet, of another sender or with a damaged number, is ignored. Two in a row that fit
-    each other are a sender that begins anew; if it has another identity, the old one must be
+    each other are a restarted sender; if it has another identity, the old one must be
     silent, so that of two senders to one port the first is kept.
     """
 
@@ -211,7 +211,7 @@ TICKS_HZ = 90_000
 _STAP_A, _FU_A = 24, 28
 _SINGLE = range(1, 24)
 _UNUSED = frozenset({0, 2, 3, 4, 30, 31})
-"""Types that no H.264 encoder sends, but H.265 in RTP shows all the time."""
+"""Types that no H.264 encoder sends, but that H.265 in RTP often contains."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ class AccessUnit:
     after_loss : bool
         Packets before it, or of it, are lost.
     is_restart : bool
-        The first of a sender that begins anew.
+        The first of a restarted sender.
     """
 
     ticks: int

@@ -321,7 +321,7 @@ class VideoParts(Closing):
         Raises
         ------
         UnlikeSurveyError
-            If any picture is damaged or missing: only the whole video tells what becomes of those
+            If any picture is damaged or missing: the whole video decides what becomes of those
             that follow.
         """
         index, latest = span.first, span.origin_pts - 1

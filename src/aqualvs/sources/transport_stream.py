@@ -10,10 +10,10 @@ _CODECS = {0x01: "mpeg1video", 0x02: "mpeg2video", 0x10: "mpeg4", 0x1B: "h264", 
 """FFmpeg's names by stream type (table 2-34)."""
 
 _RESTART_TICKS = 10 * TICKS_HZ
-"""A step in time beyond this is a sender that begins anew."""
+"""A step in time beyond this is a restarted sender."""
 
 _MAX_BYTES = 16 << 20
-"""No picture is larger; what is has lost its end."""
+"""No picture is larger; larger data have lost their end."""
 
 
 class TransportStream:

@@ -317,7 +317,7 @@ def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
 
 
 _RETRY_S = 0.5
-"""Between two tries to listen."""
+"""Pause between two attempts to listen."""
 
 
 class UdpFeed:
@@ -329,7 +329,7 @@ class UdpFeed:
         How health and messages call it.
     address : UdpAddress
     parameter_sets : bytes
-        SPS and PPS as a byte stream, where an SDP file tells them; else they come in the stream.
+        SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
     payload_type : int or None
         Of RTP; None takes every dynamic one (96 to 127).
 

@@ -102,15 +102,15 @@ class Ledger:
 
 
 _STALL_S = 10.0
-"""A stream that sends nothing for so long has ended."""
+"""A stream that sends nothing for this time has ended."""
 
 _HIDDEN_PACKETS = frozenset({"vp8"})
 """Codecs whose packets need not show a picture, so that packets cannot be counted as frames."""
 
 _LOSSY_CONTAINERS = frozenset({"mpegts", "rtsp"})
 """Containers in which a packet marked as damaged still holds most of its picture, which helps to
-predict the next ones. Elsewhere it is the torn end of a file; its error would take the sound
-pictures with it that the decoder still holds."""
+predict the next ones. Elsewhere it is the torn end of a file; its error would discard the intact
+pictures that the decoder still holds."""
 
 
 class VideoSource(Closing):

@@ -15,17 +15,17 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal
 
 STEP_S = 0.05
-"""Of the grid; what is faster than the smoothing below is noise, so finer would tell nothing."""
+"""Step of the grid. Motion faster than the smoothing below is noise: a finer step adds nothing."""
 SMOOTHING_S = 0.4
 """Standard deviation of the window over which a rate is taken. Posture's noise of 0.4 degrees at
 25 Hz leaves a rate of 0.1 degrees a second; a vehicle's own motion is slower than this window."""
 _TREND_S = 5.0
-"""What changes more slowly is left out: the net's own bearing along a cage, drift of a compass."""
+"""Slower changes are left out: the net's own bearing along a cage, drift of a compass."""
 _LEAST_COVER = 0.5
 """Share of the window that must hold values."""
 _CLIP_SIGMAS = 4.0
 _CLIP_RATE = math.radians(5.0)
-"""Rates beyond both are cut down to the larger one, lest one false reading decides."""
+"""Rates beyond both are clipped to the larger one, so that no single false reading decides."""
 _HAMPEL_SAMPLES = 11
 _HAMPEL_SIGMAS = 5.0
 _HAMPEL_ANGLE = math.radians(2.0)
@@ -42,7 +42,7 @@ class Rates:
     rate : array, shape (n,)
         Radians a second, extreme ones cut down; 0 where not valid.
     valid : bool array, shape (n,)
-        Where there are values enough to tell.
+        Where there are enough values.
     """
 
     start_s: float

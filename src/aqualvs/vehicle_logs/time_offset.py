@@ -34,12 +34,12 @@ from aqualvs.vehicle_logs.vehicle_log import Signal, VehicleLog
 _LEAST_OVERLAP_S = 30.0
 _LONGEST_S = 24 * 3600.0
 _LOBE_S = 1.0
-"""Within this of the best offset, another is no rival but the same peak."""
+"""Offsets within this of the best one belong to the same peak and are no rivals."""
 _N_RIVALS = 30
 _BLOCK_S = 3.0
-"""Longer than a motion lasts, so that blocks are independent witnesses."""
+"""Longer than a motion lasts, so that blocks are independent."""
 _LEAST_MARGIN = 2.5
-"""By how many standard deviations the best offset must explain the blocks better than any other."""
+"""Least number of standard deviations by which the best offset must exceed all others."""
 _START_SIGMAS = 4.0
 _ITERATIONS = 8
 _HUBER = 1.5

@@ -56,7 +56,7 @@ def choose_depth(
     candidates : sequence of Candidate
         The best first.
     pressure_depth : Signal or None
-        Depth that the outer pressure alone tells, up to a constant. An estimate that stands still
+        Depth by the outer pressure alone, up to a constant. An estimate that stands still
         while the pressure changes is the estimate of a filter without origin, not a depth.
     """
     dived = 0.0 if pressure_depth is None else _span(pressure_depth)
@@ -82,10 +82,10 @@ def _span(depth: Signal) -> float:
 _BOOT = "time_boot_ms"
 _REBOOT_S = 2.0
 _BLOCK_S = 30.0
-"""A tether delays some message by next to nothing in so long a time."""
+"""In this time, a tether delays at least one message by almost nothing."""
 _CLOCK_STEP_S = 1.0
 _UTC_SIGMA_S = 2.0
-"""A computer whose clock the network sets is right to well below this."""
+"""Clocks set by the network are more accurate than this."""
 _FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
 
 
@@ -96,7 +96,7 @@ class TelemetryClock:
     Attributes
     ----------
     at : array, shape (n,)
-        Places in the file of the messages that the clock rests on.
+        Places in the file of the messages that define the clock.
     log_s : array, shape (n,)
         Their log time.
     boot_at : array, shape (k,)

@@ -126,7 +126,7 @@ def _places(n_points: int) -> list[tuple[int, int]]:
 _N_SLOTS = 3
 _SLOT_BYTES = 4 << 20
 _TAKEN = -1
-"""Said instead of a part's number: what was in a slot has been taken out of it."""
+"""Sent instead of a part's number: the data of a slot have been read."""
 
 
 class SharedMemory:
@@ -146,7 +146,7 @@ class SharedMemory:
     Raises
     ------
     OSError
-        If the memory is not to be had.
+        If the memory is not available.
     """
 
     def __init__(self, file: int) -> None:

@@ -213,11 +213,11 @@ class Measured:
     ----------
     scan : Scan
     bare : Posture, Refusal or None
-        What ignoring the dome would make of it; None for a rig without a dome.
+        Result when the dome is ignored; None for a rig without a dome.
     frame : Frame or None
         None for a frame that was lost, or that another process has measured.
     is_lost : bool
-        Whether the scan stands for a frame that could not be decoded.
+        Whether the scan is that of a frame that could not be decoded.
     """
 
     scan: Scan
@@ -281,13 +281,13 @@ def measured_blocks(
     Parameters
     ----------
     blocks : iterator of list
-        Of frames with the scans that stand for the lost ones right before, see `with_losses`.
+        Of frames with the scans of the lost ones right before, see `with_losses`.
     meter : Meter
 
     Yields
     ------
     found : list of Measured
-        Of one block; what stands for lost frames before it comes by itself.
+        Of one block; scans of lost frames before it come by themselves.
     """
     for block in blocks:
         (before, _), *others = block

@@ -132,10 +132,10 @@ def _frames(work: CrewWork, part: Part, video: VideoParts) -> Iterator[Frame]:
 
 
 _LEAST_FRAMES = 100
-"""Fewer are measured before more processes are ready."""
+"""Least number of frames to share: fewer are measured before more processes are ready."""
 
 _PART_FRAMES = 32
-"""A part has at least so many, since the first frames of each cost more."""
+"""Least number of frames in a part, because the first frames of each cost more."""
 
 
 def crew_work(
@@ -185,7 +185,7 @@ def _earlier(stop: int, wanted: int | None) -> int:
 
 
 _MOST_WAITING = 100
-"""Blocks for each process that wait for those of parts before; then only these are taken in."""
+"""Blocks for each process that may wait for earlier parts; beyond it, only those are read."""
 
 _PATIENCE_S = 2.0
 
@@ -229,7 +229,7 @@ class Crew(Closing):
     def blocks(self) -> Iterator[list[Measured]]:
         """Yield the results, in the order of the dive.
 
-        It ends before its time where a part is not what it was taken for, or a process has died:
+        It ends early where a part differs from its description, or a process has died:
         `is_done` is False then, and the rest is to be measured by other means, from `next_frame`.
         """
         try:

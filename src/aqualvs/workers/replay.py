@@ -50,7 +50,7 @@ class ReplayRequest:
     no_dome : bool
     scanner : ScannerOptions
     chosen : set of str or None
-        Fields of `scanner` that count; the recording's own stand for the others. None: all.
+        Fields of `scanner` that count; otherwise the recording's own apply. None: all.
     index_target : Path or None
     pictures : bool
         Whether pictures are wanted even if stripes are not looked for again.

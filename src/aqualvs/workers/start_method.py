@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 FOR_BATCHES = ("distributed.nanny", "aqualvs.batch.scheduler")
-"""What the processes of a batch import first."""
+"""Modules that the processes of a batch import first."""
 
 
 def prepare(modules: tuple[str, ...]) -> None:

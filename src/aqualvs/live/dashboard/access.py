@@ -144,7 +144,7 @@ _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """The rules: this machine may watch, whoever has the token may watch and command.
+    """Access rules: this machine may watch; with the token, any client may watch and command.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     Parameters
     ----------
     hosts, origins : sequence of str
-        All values of these headers; a program may send none, nobody may send two.
+        All values of these headers; a program may send none, and no client two.
     """
     if len(hosts) > 1 or len(origins) > 1:
         return False

@@ -49,7 +49,7 @@ from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink,
 from aqualvs.vehicle_logs.tlog import SUB_MODES
 
 FRESH_S = 1.0
-"""An older message says nothing of now; ground stations send sticks 5 to 50 times a second."""
+"""Older messages are ignored; ground stations send sticks 5 to 50 times a second."""
 
 _INVALID = 32767
 # ArduSub turns full deflection at a pilot gain of 1 into 400 us about 1500 us (joystick.cpp).
@@ -216,8 +216,8 @@ class ArduSubOptions:
         System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
         SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
     station_timeout_s : float or None
-        Without its heartbeat for so long, efforts are not ours to give: our own sticks would keep
-        ArduSub from noticing that its ground station is gone. None where nobody need be there.
+        Without its heartbeat for this time no efforts are sent: our own sticks would keep ArduSub
+        from noticing that its ground station is gone. None if no station is required.
     stick_dead_band : float
         Deflection of the pilot's sticks that counts as centred, as a share of the full one.
     speed : float
@@ -469,8 +469,8 @@ class ArduSubLink:
         """Return when the vehicle was heard last.
 
         Heartbeats come once a second, attitude ten times and more: between two heartbeats attitude
-        tells that the vehicle is there. Without heartbeats it does not: mode and arming are then
-        unknown.
+        tells that the vehicle is there. Without heartbeats it does not count: mode and arming are
+        then unknown.
         """
         heard_ns = beat.received_ns
         attitude = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)

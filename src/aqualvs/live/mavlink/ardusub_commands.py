@@ -181,7 +181,7 @@ class StickCommander:
     Attributes
     ----------
     shaping : StickShaping
-        What the vehicle makes of sticks; ArduSub's default until it has told.
+        The vehicle's conversion of sticks; ArduSub's default until it has reported its own.
     keeps_place : bool
         Whether its mode is POSHOLD.
     """

@@ -24,7 +24,7 @@ FOR_STICKS = (*STATION, STATION_HIGH, PILOT_INPUT, PILOT_TIMEOUT, SPEED_UP, SPEE
 FOR_DISTANCE = (RANGE_TYPE, RANGE_ORIENT, *(name for name, _ in (*RANGE_NEAR, *RANGE_FAR)))
 
 FULL_CLIMB_RATE = 0.5
-"""What a full stick asks for at a pilot gain of 1 in m/s, as the packaged gains take it."""
+"""Speed of a full stick at a pilot gain of 1 in m/s, as the packaged gains assume it."""
 
 _DISABLED, _DISARM = 0, 2
 _MAVLINK_RANGEFINDER, _FORWARD = 10, 0
@@ -66,7 +66,7 @@ class StationRange:
     Parameters
     ----------
     parameters : mapping
-        As the vehicle told them.
+        As the vehicle reported them.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:

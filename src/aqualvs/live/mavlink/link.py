@@ -26,7 +26,7 @@ from aqualvs.sources.base import PartHealth, State
 MAV_COMP_ID_ONBOARD_COMPUTER = 191
 HEARTBEAT_EVERY_S = 1.0
 SILENT_AFTER_S = MOVES_AFTER_S
-"""A vehicle without a heartbeat for so long counts as gone."""
+"""A vehicle without a heartbeat for this time counts as gone."""
 
 _LOOK_EVERY_S = 0.1
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
@@ -290,7 +290,7 @@ class MavlinkLink:
             self.send(asked, to_vehicle=True)
 
     def parameters(self) -> dict[str, float]:
-        """Return the parameters that the autopilot has sent, whoever requested them."""
+        """Return the parameters that the autopilot has sent, also for other requesters."""
         with self._receiving:
             return dict(self._parameters)
 

@@ -122,7 +122,7 @@ Peer: TypeAlias = tuple[object, ...]
 """Address of a sender, as the system writes it; empty where a connection has only one."""
 
 MOVES_AFTER_S = 5.0
-"""A system id that was silent for so long may be heard from another address."""
+"""A system id that was silent for this time may be heard from another address."""
 
 # Messages are sent to the vehicle and at most so many others, heard within so many seconds.
 _HEARD_S, _MAX_OTHERS = 10.0, 8

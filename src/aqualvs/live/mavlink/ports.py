@@ -46,7 +46,7 @@ class NetAddress:
     Attributes
     ----------
     kind : str
-        `udpout` sends to the address; `udpin` listens there and answers whoever was heard;
+        `udpout` sends to the address; `udpin` listens there and answers all known senders;
         `udpbcast` sends to a broadcast address; `tcp` connects.
     host : str
         Name or number.

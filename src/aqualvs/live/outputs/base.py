@@ -9,8 +9,8 @@ from aqualvs.sources.base import PartHealth
 class Output(Protocol):
     """Interface of an output: a small class for each kind of receiver.
 
-    Made by its constructor without waiting for a peer; a peer that is not there, goes or returns is
-    no exception but told by `health`.
+    Made by its constructor without waiting for a peer; a peer that is absent, leaves or returns is
+    reported by `health` and raises no exception.
 
     Attributes
     ----------

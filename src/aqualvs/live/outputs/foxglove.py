@@ -102,7 +102,7 @@ def laser_lines(
     normal : array, shape (3,)
         Of the target.
     points : ScanPoints
-        Those that the posture rests on count.
+        Only the posture's inliers count.
     """
     found = []
     for i, laser in enumerate(lasers):

@@ -38,7 +38,7 @@ posture."""
 
 FILTERED_NAMES = ("aqf_valid", "aqf_range", "aqf_pitch", "aqf_yaw", "aqf_speed")
 """The same from the time filter, while it is switched on: 1 or 0, mm, degrees, and the rate of the
-range in mm/s. NaN where the filter has nothing to say."""
+range in mm/s. NaN where the filter has no value."""
 
 
 class MavlinkOutput:

@@ -40,7 +40,7 @@ FLU_FROM_DOME.flags.writeable = False
 FRD_FROM_DOME.flags.writeable = False
 
 UNOBSERVABLE_VARIANCE = 1.0e4
-"""Variance, in m² and rad², of what a plane tells nothing about: 100 m, 100 rad."""
+"""Variance, in m² and rad², of what a plane leaves undetermined: 100 m, 100 rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +309,7 @@ POINT_FIELDS = (
     PointField("label", 21, _UINT8, "u1"),
     PointField("used", 22, _UINT8, "u1"),
 )
-"""What a point of the cloud consists of: metres, grey levels, indices, `Label` and 0 or 1."""
+"""Fields of a point of the cloud: metres, grey levels, indices, `Label` and 0 or 1."""
 
 POINT_TYPE = np.dtype(
     {

@@ -20,7 +20,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
 
 FORMAT_VERSION = 1
-"""Rises when a key changes its meaning or goes; new keys may come at any time."""
+"""Increased when a key changes its meaning or is removed; keys may be added at any time."""
 
 Value: TypeAlias = str | int | float | bool | None
 
@@ -72,7 +72,7 @@ def json_line(sample: LiveSample) -> bytes:
 def json_fields(sample: LiveSample) -> dict[str, Value]:
     """Return a sample as plain values: the rounded ones of `posture.csv`, and the live ones.
 
-    None stands for what is not known, and for numbers that are not finite.
+    Unknown values and numbers that are not finite are None.
     """
     scan, posture = sample.scan, sample.scan.posture
     refusal = posture if isinstance(posture, Refusal) else None
