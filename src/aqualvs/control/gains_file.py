@@ -1,7 +1,7 @@
 """The gains file, a short YAML with unit suffixes (docs/control.md), and its strict reader.
 
-`load_settings` also reads the other files that people write for the controllers: it
-checks each key and reports a fault in one line.
+`load_settings` also reads the other files that people write for the controllers: it checks each key
+and reports a fault in one line.
 """
 
 import difflib
