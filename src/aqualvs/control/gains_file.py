@@ -171,7 +171,7 @@ class DragPart(Part):
 
 
 class ThrustPart(Part):
-    """`thrust`: what an effort of 1 gives, and how it gets there."""
+    """Section `thrust`: thrust of an effort of 1, and the curve up to it."""
 
     forward_n: Positive
     backward_n: Positive
@@ -182,7 +182,7 @@ class ThrustPart(Part):
 
 
 class VehiclePart(Part):
-    """`vehicle`: what is taken for granted."""
+    """Section `vehicle`: its assumed properties."""
 
     mass_kg: Positive
     forward_drag: DragPart

@@ -63,7 +63,7 @@ class Guidance:
 
 
 class Mission(Protocol):
-    """A plan that unfolds by what the vehicle and the lasers tell."""
+    """Plan that is updated by the states of vehicle and target."""
 
     @property
     def sways(self) -> bool:
@@ -278,7 +278,7 @@ def bearing_of(posture: Posture, state: VehicleState) -> float | None:
 
 
 class Leg:
-    """One way along the net: counts what has been gone.
+    """One way along the net, with the time and distance covered.
 
     Parameters
     ----------
@@ -473,7 +473,7 @@ class SurveyMission:
 
     @property
     def depth(self) -> float:
-        """Of the present leg, in metres."""
+        """Depth of the present leg, in metres."""
         return self._options.depths[min(self.i_leg, len(self._options.depths) - 1)]
 
     def restart(self) -> None:

@@ -44,7 +44,7 @@ class LegPart(Part):
 
 
 class SurveyPart(Part):
-    """`survey`: the depths, and what happens between them."""
+    """Section `survey`: the depths, and what happens between them."""
 
     depths_m: Annotated[list[NotNegative], Field(min_length=1)]
     step_m: Positive | None = None
@@ -54,7 +54,7 @@ class SurveyPart(Part):
 
 
 class LossPart(Part):
-    """`loss`: what to do without the target."""
+    """Section `loss`: behaviour without the target."""
 
     after_s: Positive = 0.15
     steady_s: NotNegative = 0.1

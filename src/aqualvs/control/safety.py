@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture
 
 
 class Reason(StrEnum):
-    """Why an effort was changed or stopped; the value is what logs say in `reason`."""
+    """Reason why an effort was changed or stopped; the value is what logs write in `reason`."""
 
     NOT_ENGAGED = "not_engaged"
     NO_HEARTBEAT = "no_heartbeat"
@@ -400,7 +400,7 @@ class AnswerLimits:
 
 
 class _Moment(NamedTuple):
-    """One posture, and what had been done until then."""
+    """Posture with the integrals of the efforts until then."""
 
     time_s: float
     range: float

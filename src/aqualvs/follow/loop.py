@@ -205,12 +205,12 @@ class SimulatedLoop:
 
     @property
     def seen_s(self) -> float:
-        """When a valid posture came last; -inf before the first."""
+        """Time of the last valid posture; -inf before the first."""
         return self._sight.seen_s
 
     @property
     def filtered(self) -> FilteredPosture | None:
-        """What the time filter made of the last step; None where it does not run."""
+        """State of the time filter at the last step; None where it does not run."""
         return self._filtered
 
     def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:

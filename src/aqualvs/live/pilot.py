@@ -149,7 +149,7 @@ class PilotReport:
 
     @property
     def words(self) -> str:
-        """What it does, or why it does not, in one line."""
+        """Action of the pilot, or the reason for none, in one line."""
         told = words_of(self.reason, self.state) if self.reason else _aim(self.guidance)
         return f"{told}; {self.state.doubt}" if self.engaged and self.state.doubt else told
 

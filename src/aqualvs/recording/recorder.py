@@ -322,7 +322,7 @@ def _words(fault: OSError) -> str:
 
 
 class RecorderSwitch:
-    """An output that records when told to; every start makes a file of its own.
+    """Output whose recording is switched on and off; every start makes a file of its own.
 
     Parameters
     ----------

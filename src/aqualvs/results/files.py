@@ -186,7 +186,7 @@ _ENDS = 1 << 16
 
 
 class Claim(Closing):
-    """Files that a command is about to write; a context manager that notes what they became.
+    """Files that a command is about to write; a context manager that notes their checksums.
 
     A command that is killed leaves its files noted without a checksum: they stay its own.
 

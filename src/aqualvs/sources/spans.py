@@ -169,7 +169,7 @@ class _Packets:
 
     @property
     def checksum(self) -> int:
-        """Of all packets."""
+        """Checksum of all packets."""
         return joint_checksum(self._sums)
 
     @property
@@ -293,7 +293,7 @@ _SEEK_BEFORE_S = (0, 2, 20, 1_000_000)
 
 
 class UnlikeSurveyError(Exception):
-    """A part of a dive does not hold what it should; the dive must be measured in one piece."""
+    """Difference between a span and its description; the dive must be measured in one piece."""
 
 
 class VideoParts(Closing):

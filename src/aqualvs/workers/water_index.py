@@ -29,7 +29,7 @@ _PLACE_MM, _TURN_DEG = 0.2, 0.1
 
 
 class WaterFollowingScanner:
-    """A scanner that measures each frame in the water that the index target tells.
+    """Scanner that measures each frame in the water as tracked by the index target.
 
     Parameters
     ----------

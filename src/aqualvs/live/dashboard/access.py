@@ -53,7 +53,7 @@ class RecordCommand(_Message):
 
 
 class SetpointCommand(_Message):
-    """Set what is to be held; without a range it is taken back."""
+    """Command that sets what to hold; without a range, the setpoint is taken back."""
 
     kind: Literal["setpoint"]
     range_m: float | None

@@ -187,7 +187,7 @@ class _QuietHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
 
 
 class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
-    """Server of calls, each in a thread that nobody waits for."""
+    """Server of calls, each in a daemon thread."""
 
     daemon_threads = True
     block_on_close = False
