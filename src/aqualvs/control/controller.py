@@ -6,9 +6,9 @@ the centre it turns about, closes in by
 
     c = -d(range)/dt = u cos psi + (v + a r) sin psi,      d(psi)/dt = -r.
 
-`RangeYawController` holds the range along the body's forward axis alone, whatever the sea and a
-target that is not square do; motion to the side, and the dome's swing in a turn, are compensated in
-advance.
+`RangeYawController` holds the range along the body's forward axis alone; motion to the side, and
+the dome's swing in a turn, are compensated in advance. It rejects disturbances by the sea and by a
+target that is not square.
 
 - `Pid`: a PID controller for loops that are closed over frames; the measurement brings its time.
 - `SwellFilter`: a model of swell inside the loop, which counteracts periodic disturbances.
