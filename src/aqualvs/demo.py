@@ -1,4 +1,4 @@
-"""`aqualvs demo`: the bundled dive, measured and compared with its truth."""
+"""The command `aqualvs demo`: the bundled dive, measured and compared with its truth."""
 
 import importlib.resources
 from collections.abc import Callable
@@ -13,7 +13,7 @@ _FILES = ("dive.mp4", "rig.yaml", "truth.csv")
 
 
 def demo(out: Path, tell: Callable[[str], object], *, overwrite: bool = False) -> int:
-    """Run the bundled dive, tell posture and error, and return the exit code.
+    """Run the bundled dive, print posture and error, and return the exit code.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""`aqualvs run`: from a dive to posture, points and report.
+"""The command `aqualvs run`: from a dive to posture, points and report.
 
-What watches over the lasers while a run goes on.
+`agreement_of` sets up the check of the lasers against each other during the run.
 """
 
 import time
@@ -26,7 +26,7 @@ from aqualvs.workers.water_index import WaterFollowingScanner
 
 
 def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
-    """Return what watches over the lasers of a rig, None where there is nothing to watch.
+    """Return the check of a rig's lasers against each other, None if there is nothing to check.
 
     One laser agrees with itself; and where refraction at the dome is left out, the lasers disagree
     for that reason alone.
@@ -41,7 +41,7 @@ def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
     Raises
     ------
     RigError
-        If what the rig says about its uncertainty cannot be understood.
+        If the rig's uncertainty cannot be parsed.
     """
     if len(rig.lasers) < 2:
         return None
@@ -53,7 +53,7 @@ def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunResult:
-    """How a run went.
+    """Result of a run.
 
     Attributes
     ----------
@@ -63,11 +63,11 @@ class RunResult:
         Name of the signal that stopped it, or empty.
     tally : Tally
     dome_lines : list of str
-        What the dome model is worth, in words.
+        Effect of the dome model, as lines of text.
     water_lines : list of str
-        What was found of the water's index, in words; empty where it was given.
+        Result for the water's index, as lines of text; empty where it was given.
     net_lines : list of str
-        The state of the net, in words; empty where nobody asked.
+        State of the net, as lines of text; empty if not requested.
     elapsed_s : float
         From the first frame to the complete folder, without the report.
     report : Path or None
@@ -156,7 +156,7 @@ def run(
 
 
 def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
-    """Run a dive, tell how it went line by line, and return the exit code.
+    """Run a dive, print its results line by line, and return the exit code.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
 
 
 def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
-    """Return what the command prints at the end."""
+    """Return the lines that the command prints at the end."""
     lines = [f"{request.source}: {result.tally.n_frames} frames in {result.elapsed_s:.1f} s"]
     lines += result.tally.lines()
     lines += result.water_lines
@@ -208,12 +208,12 @@ def _replay(request: RunRequest) -> Replay | None:
 
 
 def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
-    """Return what measures and follows the water, None where nobody asked for that.
+    """Return the scanner that tracks the water's index, None if that is not requested.
 
     Raises
     ------
     AqualvsError
-        If the target that tells the water's index cannot be used.
+        If the target for the water's index cannot be used.
     """
     if request.index_target is None:
         return None
@@ -223,7 +223,7 @@ def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None
 
 
 def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork | None:
-    """Return how processes can share the dive; None where one alone can do what is asked."""
+    """Return how processes can share the dive; None where one process must measure all of it."""
     alone = request.overlay or request.mcap or request.index_target is not None
     if alone or request.n_processes < 2:
         return None
@@ -231,12 +231,12 @@ def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork |
 
 
 def agreement_for(request: RunRequest, rig: Rig) -> LaserAgreement | None:
-    """Return what watches over the lasers of a dive, None where a run watches nothing.
+    """Return the check of a dive's lasers against each other, None if there is none.
 
     Raises
     ------
     RigError
-        If what the rig says about its uncertainty cannot be understood.
+        If the rig's uncertainty cannot be parsed.
     """
     if request.no_dome:
         return None

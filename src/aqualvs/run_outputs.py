@@ -1,14 +1,11 @@
-"""What a run leaves behind: its folder's files, its report, and how it compares with the truth.
+"""Outputs of a run: the files of its folder, its report, and the comparison with the truth.
 
-The state of the net while a dive is run, if it is wanted.
+`RunWriters` writes all files frame by frame. Its parts, beside the folder itself:
 
-`dive.mcap`: the recording that a run writes on request.
-
-The video that shows what the scanner saw.
-
-What ignoring the dome would have made of a run, frame by frame.
-
-Everything that a run writes, frame by frame.
+- `RunBareLens`: `posture_bare.csv`, the posture without the dome model.
+- `RunOverlay`: `overlay.mp4`, the video of what the scanner detected.
+- `RunMcap`: `dive.mcap`, the recording, on request.
+- `RunNet`: the state of the net, on request.
 """
 
 import statistics
@@ -62,7 +59,7 @@ if TYPE_CHECKING:
 
 
 class RunNet:
-    """Evaluates the net as the frames come; does nothing where nobody asked.
+    """Evaluation of the net as the frames come; does nothing if not requested.
 
     Parameters
     ----------
@@ -86,7 +83,7 @@ class RunNet:
             self._net.add(scan)
 
     def write(self, folder: Path, source: str) -> list[str]:
-        """Finish, write the net's files and return the summary in words.
+        """Finish, write the net's files and return the summary as lines.
 
         Parameters
         ----------
@@ -111,7 +108,7 @@ MeasuredFrame = tuple[Rig, Scan, dict[SearchAxis, Returns]]
 
 
 class RunMcap(Closing):
-    """Writes `dive.mcap` while a run goes on, or does nothing; a context manager.
+    """Writer of `dive.mcap` during a run, or of nothing; a context manager.
 
     Parameters
     ----------
@@ -138,7 +135,7 @@ class RunMcap(Closing):
                 self._recording = _recording(self._path, options)
 
     def recorded(self, scanner: ScansFrames) -> ScansFrames:
-        """Return a scanner that measures as this one does, and has what it finds recorded."""
+        """Return a scanner that measures as this one does, and records its results."""
         return scanner if self._recording is None else _RecordedScanner(self, scanner)
 
     def write(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> None:
@@ -161,7 +158,7 @@ class RunMcap(Closing):
             scan=scan,
             returns=returns,
             frame=None,
-            # As if the dive had begun with the run.
+            # Times as if the dive had started with the run.
             utc_ns=self._began_ns + at_ns,
             instants=Instants(at_ns, at_ns, at_ns),
             filtered=None,
@@ -176,7 +173,7 @@ class RunMcap(Closing):
 
 
 class _RecordedScanner:
-    """Measures as another scanner does, and records what it finds."""
+    """Scanner that measures as another one does, and records the results."""
 
     def __init__(self, mcap: RunMcap, scanner: ScansFrames) -> None:
         self._mcap, self._scanner = mcap, scanner
@@ -188,14 +185,14 @@ class _RecordedScanner:
 
 
 def _recording(path: Path, options: ScannerOptions) -> "Recording":
-    """Open a recording; what records is imported here and above, as few runs write one."""
+    """Open a recording; its modules are imported here and above, as few runs write one."""
     from aqualvs.recording import RecorderOptions, Recording
 
     return Recording(path, RecorderOptions(scanner=options))
 
 
 def check_source_stays(folder: Path, source: str) -> None:
-    """Make sure that a run in a folder does not replace what it reads.
+    """Make sure that a run does not replace its own source.
 
     Raises
     ------
@@ -209,7 +206,7 @@ def check_source_stays(folder: Path, source: str) -> None:
 
 
 def _measured(scanner: ScansFrames, frame: Frame) -> MeasuredFrame:
-    """Return the scan of a frame, and what it was made with and of."""
+    """Return the scan of a frame, with its rig and stripes."""
     if isinstance(scanner, Replay):
         return scanner.measured(frame)
     if isinstance(scanner, WaterFollowingScanner):
@@ -226,7 +223,7 @@ _FPS_WITHOUT_CLOCK = 25.0
 
 
 class RunOverlay(Closing):
-    """Writes `overlay.mp4` while a run goes on, or does nothing; a context manager.
+    """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
 
     Parameters
     ----------
@@ -268,7 +265,7 @@ class RunOverlay(Closing):
 
 
 class RunBareLens(Closing):
-    """Writes `posture_bare.csv` while a run goes on, or does nothing for a rig without a dome.
+    """Writer of `posture_bare.csv` during a run; of nothing for a rig without a dome.
 
     Parameters
     ----------
@@ -304,7 +301,7 @@ class RunBareLens(Closing):
             self._file.write(*rows)
 
     def lines(self) -> list[str]:
-        """Say in words what the dome is worth."""
+        """Return the effect of the dome model as lines of text."""
         if not self._ratios:
             return []
         percent = 100.0 * (statistics.median(self._ratios) - 1.0)
@@ -345,11 +342,11 @@ class RunWriters:
         return self._outputs.tally
 
     def recorded(self, scanner: ScansFrames) -> ScansFrames:
-        """Return the scanner to measure with: it has what it finds recorded, if that is wanted."""
+        """Return the scanner to measure with, which records its results if requested."""
         return self._mcap.recorded(scanner)
 
     def write(self, *found: Measured) -> None:
-        """Write what was found in frames, and what stands for lost ones, in their order."""
+        """Write the results of frames, and scans of lost ones, in their order."""
         self._outputs.write(*(measured.scan for measured in found))
         self._bare_lens.write(*found)
         for measured in found:
@@ -364,11 +361,11 @@ class RunWriters:
         self._outputs.status = Status.INTERRUPTED
 
     def dome_lines(self) -> list[str]:
-        """Say what the dome model is worth."""
+        """Return the effect of the dome model as lines of text."""
         return self._bare_lens.lines()
 
     def net_lines(self, folder: Path, source: str) -> list[str]:
-        """Write the state of the net, if it was wanted, and say it in words."""
+        """Write the state of the net, if requested, and return it as lines of text."""
         return self._net.write(folder, source)
 
 
@@ -402,7 +399,7 @@ def writers(
 def write_all(
     blocks: Iterable[list[Measured]], writers: RunWriters, stop: StopSignals, tick: Tick
 ) -> None:
-    """Write what is found until it ends, or a signal stops it."""
+    """Write all results until they end, or a signal stops the run."""
     for block in blocks:
         writers.write(*block)
         tick(len(block))

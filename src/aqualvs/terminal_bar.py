@@ -16,7 +16,7 @@ from rich.progress import (
 from rich.text import Text
 
 # Until the first frame is done; compiled code is kept for the next run.
-_FIRST_RUN = "(the first run on a machine compiles for about 20 s)"
+_FIRST_RUN = "(the first run on a machine compiles for a minute or two)"
 
 
 class _Rate(ProgressColumn):

@@ -1,4 +1,4 @@
 """Control of the vehicle: controllers, missions, gains and safety.
 
-Imports the scanner; knows no link and no thread.
+Imports the scanner; uses no link and no thread.
 """

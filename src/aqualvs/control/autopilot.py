@@ -1,4 +1,7 @@
-"""Mission, controller and safety gate in one, fed frame by frame: no clock, no threads, no link."""
+"""Mission, controller and safety gate combined, updated frame by frame.
+
+Uses no clock, no threads and no link.
+"""
 
 import math
 from dataclasses import dataclass
@@ -32,7 +35,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What one step came to.
+    """Result of one step.
 
     Attributes
     ----------
@@ -53,7 +56,7 @@ class Decision:
 
 
 class NetPilot:
-    """Holds and follows by what the lasers see.
+    """Autopilot that holds and follows by the measured posture.
 
     Parameters
     ----------
@@ -113,7 +116,7 @@ class NetPilot:
         filtered: Motion | None,
         state: VehicleState,
     ) -> Decision:
-        """Return what to send for one frame, or for a silent stream.
+        """Return the effort for one frame, or for a silent stream.
 
         Parameters
         ----------
@@ -126,7 +129,7 @@ class NetPilot:
         filtered : Motion or None
             From the time filter, as of this frame, where there is one.
         state : VehicleState
-            What the vehicle tells.
+            As the vehicle reports it.
         """
         if self._other_stream(time_s):
             _, reason = self.gate.check(now_s, math.inf, None, state, NEUTRAL)
@@ -184,7 +187,7 @@ class NetPilot:
         return posture
 
     def _guide(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Ask the mission; it stands still while nobody steers."""
+        """Update the mission; it pauses while disengaged."""
         if not self.engaged:
             return _IDLE
         return self.mission.update(now_s, posture, state)
@@ -196,12 +199,12 @@ class NetPilot:
         filtered: Motion | None,
         guidance: Guidance,
     ) -> Effort | None:
-        """Return what the controller wants; None, and the controller at rest, where it must not."""
+        """Return the controller's effort; None, and the controller at rest, if it must not act."""
         motion = _motion(posture, filtered)
         if guidance.setpoint is None or guidance.stage.halts:
             return None
         if motion is None:
-            # A frame or two without a posture: the gate limits for how long this goes on.
+            # A frame or two without a posture: the gate limits the duration.
             return self._asked
         return self.controller.update(
             time_s,
@@ -215,7 +218,7 @@ class NetPilot:
         )
 
     def _settle(self, asked: Effort | None, effort: Effort, reason: Reason | None) -> None:
-        """Tell the controller what became of its effort."""
+        """Report the sent effort to the controller."""
         self._asked = asked
         if asked is None or (reason is not None and effort == NEUTRAL):
             self.controller.pause()
@@ -224,7 +227,7 @@ class NetPilot:
             self.controller.applied(effort)
 
 
-# Frames that the network held up may be so late; older ones are of another stream.
+# Frames delayed by the network may be this late; older ones belong to another stream.
 _LATE_S = 0.5
 _IDLE = Guidance(setpoint=None, stage=Stage.IDLE)
 
@@ -240,7 +243,7 @@ def _mission_says(guidance: Guidance) -> Reason | None:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What the controller takes; rates are None where no filter knows them."""
+    """Input of the controller; rates are None where no filter knows them."""
 
     range: float
     yaw: float

@@ -1,4 +1,4 @@
-"""Holds range and yaw to the target; the sea and a target that is not square stay out of it.
+"""Controller of range and yaw to the target, and its parts: PID, swell filter, ramp and quiet zone.
 
 Signs: with the posture's yaw psi, n = (cos psi, sin psi) is the target's far normal along the
 body's (forward, right). A vehicle that moves by (u, v) and turns at r, with its dome `a` ahead of
@@ -6,14 +6,13 @@ the centre it turns about, closes in by
 
     c = -d(range)/dt = u cos psi + (v + a r) sin psi,      d(psi)/dt = -r.
 
-Range is held along the body's forward axis alone; motion to the side, and the dome's swing in a
-turn, are made up for beforehand.
+`RangeYawController` holds the range along the body's forward axis alone; motion to the side, and
+the dome's swing in a turn, are compensated in advance. It rejects disturbances by the sea and by a
+target that is not square.
 
-A PID controller for loops that are closed over frames: time comes with the measurement.
-
-A model of swell inside the loop: what comes back every few seconds is met before it is felt.
-
-Setpoints that change at a bounded speed, and turning rates that rest at zero.
+- `Pid`: a PID controller for loops that are closed over frames; the measurement brings its time.
+- `SwellFilter`: a model of swell inside the loop, which counteracts periodic disturbances.
+- `Ramp`: setpoints that change at a bounded speed; `QuietZone`: suppression of small turning rates.
 """
 
 import math
@@ -54,7 +53,7 @@ class PidOptions:
     longest_step: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse what cannot work.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -117,7 +116,7 @@ class Pid:
     def engage(
         self, time_s: float, setpoint: float, measured: float, output: float, forward: float = 0.0
     ) -> None:
-        """Start such that the output goes on from `output`: the integral takes what is missing.
+        """Start such that the output continues from `output`: the integral takes the difference.
 
         Parameters
         ----------
@@ -144,7 +143,7 @@ class Pid:
         self._integral *= kept
 
     def applied(self, output: float) -> None:
-        """Take in what the actuator really did with the last output, where others limit it."""
+        """Correct the last output by the value that the actuator applied, where it is limited."""
         if math.isfinite(output):
             self._output = output
 
@@ -209,7 +208,7 @@ class Pid:
         return allowed
 
     def _near_last(self, wanted: float, step: float) -> float:
-        # A first update has no step; it may move as far as in a short one.
+        # The first update has no time step; its output may change as much as in a short one.
         most = self.options.output_rate * (step or _FIRST_STEP_S)
         return min(max(wanted, self._output - most), self._output + most)
 
@@ -221,7 +220,7 @@ _FIRST_STEP_S = 0.04
 
 
 class SwellFilter:
-    """Passes what swings with about one period, and little else.
+    """Band-pass filter about one period, that of the swell.
 
     In parallel to a proportional gain it raises the loop's gain about that period alone (internal
     model principle; Francis and Wonham 1976, doi:10.1016/0005-1098(76)90006-6):
@@ -249,11 +248,11 @@ class SwellFilter:
 
     @property
     def amplitude(self) -> float:
-        """Of what swings now."""
+        """Present amplitude of the filter's output."""
         return math.hypot(self._output, self._sum)
 
     def update(self, step: float, value: float) -> float:
-        """Return what of `value` swings; unchanged if `step` seconds are not positive.
+        """Return the swinging part of `value`; unchanged if `step` seconds are not positive.
 
         Backward Euler: any step is stable.
         """
@@ -269,7 +268,7 @@ class SwellFilter:
 
 
 class Ramp:
-    """Follows a goal with bounded speed and acceleration, and stops on it.
+    """Setpoint that follows a goal with bounded speed and acceleration, and stops on it.
 
     Parameters
     ----------
@@ -302,7 +301,7 @@ class Ramp:
             return
         left = goal - self.value
         most = self._most * dt
-        # The speed from which one more step, and then braking, ends on the goal.
+        # Speed at which one more step and then braking end on the goal.
         brake = math.sqrt(0.25 * most * most + 2.0 * self._most * abs(left)) - 0.5 * most
         wanted = math.copysign(min(self._speed, max(brake, 0.0), abs(left) / dt), left)
         before = self.rate
@@ -315,9 +314,9 @@ class Ramp:
 
 
 class QuietZone:
-    """Leaves small turning rates out, so that the vehicle's own heading hold has its say.
+    """Suppression of small turning rates, so that the vehicle's own heading hold can act.
 
-    From rest a rate must exceed `quiet`; one that has begun ends when it changes its sign.
+    From rest a rate must exceed `quiet`; a turn ends when the rate changes its sign.
 
     Parameters
     ----------
@@ -342,14 +341,14 @@ class QuietZone:
         return asked if self._side else 0.0
 
 
-# Beyond this yaw forward hardly changes the range, in radians.
+# Beyond this yaw, in radians, forward motion hardly changes the range.
 _GREATEST_YAW = math.radians(60.0)
-# Time constant in seconds with which a small integral fades while thrust changes its side.
+# Time constant in seconds of a small integral's decay while thrust changes its sign.
 _FORGETS_S = 1.0
 
 
 class RangeYawController:
-    """Efforts for a range, a yaw and a speed along the target.
+    """Controller of range, yaw and speed along the target, by efforts.
 
     A cascade for the range: its error asks for a closing speed, the speed's error for an
     acceleration; the integral is the force that current, tether and trim take. Drag is put in
@@ -398,7 +397,7 @@ class RangeYawController:
         self._slope = _Slope(gains.rate_time)
         band = thrust, near.crossing_impulse, near.crossing_share
         self._pairs = (DeadBandCrossing(*band), DeadBandCrossing(*band))
-        # A force whose impulse in that time does not cross the dead band is none.
+        # A force whose impulse in that time does not cross the dead band counts as zero.
         self._least = near.crossing_impulse * thrust.forward / mass / _FORGETS_S
         self._quiet = QuietZone(turn.quiet_rate)
         self.reset()
@@ -416,7 +415,7 @@ class RangeYawController:
         self._effort = Effort()
 
     def pause(self) -> None:
-        """Stop: neutral until the next update, which goes on with what it knew of the current."""
+        """Stop: neutral until the next update, which starts with the known current."""
         if self._running:
             self._stopped_s = self._time_s
         self._running = False
@@ -427,7 +426,7 @@ class RangeYawController:
         self._let_go()
 
     def engage(self, time_s: float, range: float, yaw: float, effort: Effort) -> None:
-        """Take over from somebody who steers, without a jump.
+        """Take over from a human pilot without a jump.
 
         Parameters
         ----------
@@ -450,7 +449,7 @@ class RangeYawController:
         self._turn.engage(time_s, 0.0, 0.0, -effort.yaw * vehicle.turning_rate)
 
     def applied(self, effort: Effort) -> None:
-        """Take in what was sent in place of the last effort."""
+        """Correct the last effort by the one that was sent in its place."""
         vehicle = self.gains.vehicle
         forward, _ = vehicle.thrust.forces(effort.forward, effort.right)
         self._speed.applied(forward / vehicle.mass)
@@ -507,7 +506,7 @@ class RangeYawController:
         self._quiet.reset()
 
     def _start(self, time_s: float, range: float, yaw: float) -> None:
-        """Begin at a posture, with what is still known of the disturbance."""
+        """Begin at a posture, with the remembered part of the disturbance."""
         if not 0.0 <= time_s - self._stopped_s <= self.gains.memory:
             self._speed.reset()
             self._turn.reset()
@@ -522,7 +521,7 @@ class RangeYawController:
     def _turning(self, time_s: float, yaw: float, yaw_rate: float | None) -> float:
         """Return the turning rate asked for, clockwise."""
         ramp = self._yaw_ramp
-        # The derivative acts on the measurement; what the ramp itself asks for is given back.
+        # The derivative acts on the measurement; the ramp's own rate is added back.
         forward = ramp.rate + self.gains.yaw.derivative * ramp.seen_rate
         return -self._turn.update(time_s, ramp.seen, yaw, yaw_rate, forward)
 
@@ -536,7 +535,7 @@ class RangeYawController:
         side = sway * c if vehicle.can_sway else 0.0
         aside = (side + vehicle.dome_forward * turn) * s
         mending = self._mending(range)
-        # Speeds and accelerations as seen along the forward axis.
+        # Speeds and accelerations along the forward axis.
         ahead = (mending - ramp.rate - aside) / c
         asked, found = (mending - ramp.seen_rate) / c, -rate / c
         turns = self._turns(step)
@@ -567,15 +566,15 @@ class RangeYawController:
         return True
 
     def _mending(self, range: float) -> float:
-        """Return the closing speed that mends the range's error."""
+        """Return the closing speed that corrects the range's error."""
         gains = self.gains.range
         wanted = gains.position * (range - self._range_ramp.seen)
         return min(max(wanted, -gains.greatest_speed), gains.greatest_speed)
 
     def _against_drag(self, ahead: float) -> tuple[float, tuple[float, float]]:
-        """Return the acceleration that keeps a speed, beyond what the integral gives.
+        """Return the acceleration that keeps a speed, in addition to the integral.
 
-        The integral keeps the vehicle in its place: it tells how fast the water passes there. With
+        The integral keeps the vehicle in its place, so it gives the speed of the water there. With
         it come the factors on the gains in that water: drag damps the vehicle as the speed's gain
         does, and lets gain and integral be greater.
         """

@@ -1,8 +1,8 @@
-"""The area that a dive has seen, as a map of cells that a picture can be made of.
+"""Map of the area that a dive has seen, in cells.
 
-Down go depths. Across go bearings of the net, where the vehicle tells its heading: round a cage
-they are places. Else across go metres along the net by the speed asked for, which a current
-shifts.
+The vertical axis is depth. The horizontal axis is the bearing of the net, where the vehicle reports
+its heading: round a cage, bearings are places. Else it is the way along the net in metres by the
+speed asked for, which a current shifts.
 """
 
 import math
@@ -20,7 +20,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 
 
 class Across(StrEnum):
-    """What counts along the net."""
+    """Quantity of the map's horizontal axis."""
 
     BEARING = "bearing"
     """Of the net's far normal, in radians."""
@@ -30,7 +30,7 @@ class Across(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageOptions:
-    """How fine the map is.
+    """Resolution of the map, and the size of the field of view.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class CoverageOptions:
 
 @dataclass(frozen=True, slots=True)
 class CoverageMap:
-    """What has been seen.
+    """Map of what has been seen.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class CoverageMap:
 
 
 class Coverage:
-    """Gathers what a dive sees.
+    """Builder of the coverage map, step by step.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Coverage:
         Defaults if left out.
     """
 
-    # Steps that are longer are gaps, in seconds.
+    # Longer steps are gaps, in seconds.
     LONGEST_STEP_S = 1.0
 
     def __init__(self, options: CoverageOptions | None = None) -> None:
@@ -128,7 +128,7 @@ class Coverage:
         decision: Decision,
         state: VehicleState,
     ) -> None:
-        """Take in one step; without a posture or a depth nothing is seen."""
+        """Add one step; without a posture or a depth nothing is seen."""
         step = now_s - self._last_s
         step = step if 0.0 < step <= self.LONGEST_STEP_S else 0.0
         self._last_s = now_s

@@ -1,4 +1,4 @@
-"""`follow.csv`: one row for every step of the controllers, on disk as soon as it is taken."""
+"""`follow.csv`: one row for every step of the controllers, on disk as soon as the step is taken."""
 
 import csv
 import io
@@ -39,17 +39,17 @@ FOLLOW_COLUMNS = (
     "heading_deg",
     "bearing_deg",
 )
-"""`posture` is "valid" or why there is none; errors are measured less wanted. What is not known is
-empty."""
+"""`posture` is "valid" or the reason of a refusal; errors are measured less wanted. Unknown values
+are empty."""
 
 
 class FollowLog:
-    """Writes the log, row by row.
+    """Writer of the log, row by row.
 
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
 
     Raises
     ------
@@ -61,7 +61,7 @@ class FollowLog:
         self._path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Without a buffer a row outlives the process.
+            # Unbuffered, so that rows survive the death of the process.
             self._file = path.open("wb", buffering=0)
         except OSError as fault:
             raise self._trouble(fault) from None
@@ -150,7 +150,7 @@ def follow_row(
 def _seen(
     posture: Posture | Refusal | None, decision: Decision, state: VehicleState
 ) -> dict[str, str]:
-    """Return what depends on a posture and its setpoint."""
+    """Return the cells that depend on a posture and its setpoint."""
     wanted = decision.guidance.setpoint
     row = {}
     if wanted is not None:

@@ -1,6 +1,7 @@
-"""What a controller must know: the vehicle it steers, and how hard to steer it.
+"""Controller gains, facts about the vehicle that they are for, and the map from force to effort.
 
-From forces to efforts: thrusters have a dead band and a bent curve, controllers neither.
+Controllers compute forces; thrusters have a dead band and a curved response. `ThrustMap` inverts
+the response, and `DeadBandCrossing` crosses the dead band with hysteresis.
 """
 
 import math
@@ -11,7 +12,7 @@ from aqualvs.errors import OptionError
 
 
 class Layout(StrEnum):
-    """How the level thrusters stand."""
+    """Arrangement of the horizontal thrusters."""
 
     VECTORED = "vectored"
     """Askew, in two pairs: one does forward plus right, the other forward minus right."""
@@ -47,7 +48,7 @@ class ThrustMap:
     layout: Layout = Layout.VECTORED
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be turned round.
+        """Refuse maps that cannot be inverted.
 
         Raises
         ------
@@ -113,13 +114,13 @@ class ThrustMap:
 
     def _past_dead_band(self, size: float) -> float:
         bent = 1.0 - self.linear
-        # The root of bent x² + linear x = size in the form that holds for bent = 0.
+        # Root of bent x² + linear x = size, in the form that is valid for bent = 0.
         x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
         return self.dead_band + (1.0 - self.dead_band) * x
 
 
 class DeadBandCrossing:
-    """Efforts of one pair of thrusters: its dead band is crossed once, with hysteresis.
+    """Effort of one pair of thrusters, whose dead band is crossed once, with hysteresis.
 
     Where the thrust asked for changes its sign, the effort waits at the edge of the dead band, with
     the thrusters about to start, until the impulse that it owes is great, or the thrust is. What
@@ -163,7 +164,7 @@ class DeadBandCrossing:
             if abs(owed) <= self._impulse and abs(share) < self._great:
                 self._owed = owed
                 return self._edge()
-            # What has waited is late: the loop asks for it anew where it is still needed.
+            # Delayed thrust is dropped: the loop requests it again if it is still needed.
             self._side, self._stood_s, owed = -self._side, 0.0, share * step
         self._owed = 0.0
         given = owed / step if step > 0.0 else share
@@ -173,8 +174,8 @@ class DeadBandCrossing:
         return self._side * self._thrust.dead_band
 
 
-# Noise of postures owes less than that share of the impulse; and so long thrust must stand on one
-# side, in seconds, before it is more than a correction of the last one.
+# Noise of postures owes less than this share of the impulse; and thrust must stay on one side for
+# this time, in seconds, before it is more than a correction of the last one.
 _WAITING_SHARE, _STANDS_S = 1.0 / 3.0, 2.0
 
 
@@ -205,7 +206,7 @@ class Drag:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleFacts:
-    """What is taken for granted of a vehicle.
+    """Assumed properties of a vehicle.
 
     Attributes
     ----------
@@ -230,7 +231,7 @@ class VehicleFacts:
     dome_forward: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a vehicle that cannot exist.
+        """Refuse impossible vehicles.
 
         Raises
         ------
@@ -253,7 +254,7 @@ class VehicleFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeGains:
-    """Of the cascade that holds the range.
+    """Gains of the cascade that holds the range.
 
     Attributes
     ----------
@@ -312,7 +313,7 @@ class RangeGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class YawGains:
-    """Of the loop that holds the yaw.
+    """Gains of the loop that holds the yaw.
 
     Attributes
     ----------
@@ -331,7 +332,7 @@ class YawGains:
     lag : float
         As of the range.
     quiet_rate : float
-        Turning rate below which none is begun, in rad/s.
+        Turning rate below which no turn begins, in rad/s.
     """
 
     proportional: float
@@ -405,11 +406,11 @@ def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
     )
 
 
-# Drag damps as the speed's gain does, but what is known of it may be twice the truth. The limit is
-# for that too: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever more.
+# Drag damps like the speed's gain, but its assumed value may be twice the truth. The limit allows
+# for that, and for pitch: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever more.
 _DAMPING_SHARE, _GREATEST_SCHEDULE = 0.8, 2.2
-# Drag makes the loop stiff in position; the integral has to keep up with that, or it takes 10 s to
-# find the force of a strong current.
+# Drag makes the loop stiff in position; without a greater gain, the integral takes 10 s to find the
+# force of a strong current.
 _INTEGRAL_SHARE, _GREATEST_INTEGRAL = 1.2, 6.0
 
 

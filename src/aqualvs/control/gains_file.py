@@ -1,6 +1,7 @@
-"""The gains file: a short YAML with unit suffixes (docs/control.md).
+"""The gains file, a short YAML with unit suffixes (docs/control.md), and its strict reader.
 
-Files that people write for the controllers: strict YAML, faults told in one line.
+`load_settings` also reads the other files that people write for the controllers: it checks each key
+and reports a fault in one line.
 """
 
 import difflib
@@ -170,7 +171,7 @@ class DragPart(Part):
 
 
 class ThrustPart(Part):
-    """`thrust`: what an effort of 1 gives, and how it gets there."""
+    """Section `thrust`: thrust of an effort of 1, and the curve up to it."""
 
     forward_n: Positive
     backward_n: Positive
@@ -181,7 +182,7 @@ class ThrustPart(Part):
 
 
 class VehiclePart(Part):
-    """`vehicle`: what is taken for granted."""
+    """Section `vehicle`: its assumed properties."""
 
     mass_kg: Positive
     forward_drag: DragPart
@@ -413,5 +414,5 @@ def _drag_part(drag: Drag) -> DragPart:
 
 
 def _degrees(angle: float) -> float:
-    # More digits than anybody sets, fewer than rounding leaves.
+    # More digits than users set, fewer than rounding errors leave.
     return float(f"{math.degrees(angle):.10g}")

@@ -1,8 +1,8 @@
-"""What a mission asks of the controllers, update by update; and the simplest one: hold.
+"""Missions: what the controllers are to hold, updated step by step; hold, follow and survey.
 
-Follow a net: constant distance, square to it, at a constant speed along it.
-
-Survey a net as one mows a lawn: along it, down a step, and back.
+- `HoldMission`: hold a range and yaw.
+- `FollowMission`: follow a net at a constant distance, square to it, at a constant speed along it.
+- `SurveyMission`: survey a net in legs, one at each depth, back and forth.
 """
 
 import math
@@ -16,7 +16,7 @@ from aqualvs.scanning.posture import Posture
 
 
 class Stage(StrEnum):
-    """Where a mission is; the value is what logs say in `stage`."""
+    """Stage of a mission; the value is what logs write in `stage`."""
 
     IDLE = "idle"
     """Nobody steers."""
@@ -43,7 +43,7 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guidance:
-    """What a mission wants now.
+    """Present request of a mission.
 
     Attributes
     ----------
@@ -63,21 +63,21 @@ class Guidance:
 
 
 class Mission(Protocol):
-    """A plan that unfolds by what the vehicle and the lasers tell."""
+    """Plan that is updated by the states of vehicle and target."""
 
     @property
     def sways(self) -> bool:
         """Whether it needs a vehicle that can move sideways."""
 
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Return what to do now.
+        """Return the present guidance.
 
         Parameters
         ----------
         now_s : float
             Monotonic, in seconds. Only steps forward of up to a second count as time spent.
         posture : Posture or None
-            The present one; None where there is none. While nobody steers there are no updates.
+            The present one; None where there is none. While disengaged there are no updates.
         state : VehicleState
             Depth and heading are used where they are known.
         """
@@ -88,14 +88,14 @@ class Mission(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossOptions:
-    """What to do without the target.
+    """Behaviour without the target.
 
     Attributes
     ----------
     after : float
         Seconds without a posture after which the mission waits.
     steady : float
-        Seconds of postures in a row before it goes on.
+        Seconds of consecutive postures before it continues.
     give_up : float
         Seconds of waiting after which it ends.
     """
@@ -105,7 +105,7 @@ class LossOptions:
     give_up: float = 10.0
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -120,7 +120,7 @@ class LossOptions:
 
 
 class LossWatch:
-    """Tells whether the target is there, waited for, or gone.
+    """State of the target: present, waited for, or lost.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class LossWatch:
         self._last_s, self._away_s, self._back_s = math.nan, 0.0, 0.0
 
     def update(self, now_s: float, there: bool) -> Stage | None:
-        """Take in whether there is a posture at this time; return the stage."""
+        """Update by the presence of a posture at this time; return the stage."""
         step = now_s - self._last_s
         step = step if 0.0 < step <= self.LONGEST_STEP_S else 0.0
         self._last_s = now_s
@@ -174,7 +174,7 @@ class HoldMission:
     Parameters
     ----------
     setpoint : Setpoint or None
-        Kept in `setpoint`, which may be set anew at any time.
+        Kept in `setpoint`, which may be changed at any time.
     duration : float, optional
         Seconds with the target after which it is `Stage.OVER`; endless if left out.
     loss : LossOptions, optional
@@ -234,7 +234,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LegOptions:
-    """How far one goes along the net before turning round or ending; whichever comes first.
+    """End of a leg along the net: time, distance or sector, whichever comes first.
 
     Attributes
     ----------
@@ -252,7 +252,7 @@ class LegOptions:
     sector: Sector | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -278,7 +278,7 @@ def bearing_of(posture: Posture, state: VehicleState) -> float | None:
 
 
 class Leg:
-    """One way along the net: counts what has been gone.
+    """One way along the net, with the time and distance covered.
 
     Parameters
     ----------
@@ -371,14 +371,14 @@ def paced(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Gu
     return Guidance(setpoint=setpoint, sway=sway, stage=Stage.FOLLOWING)
 
 
-# Descent asked for by a depth's error, in m/s per m, and how near a depth must be come to.
+# Speed of descent by a depth's error, in m/s per m, and the tolerance of a depth.
 _DESCENT_GAIN, _DEPTH_REACHED = 0.8, 0.07
-# Seconds that a depth must be kept before the next leg, so that a wave does not count.
+# Seconds that a depth must be kept before the next leg, longer than a wave.
 _DEPTH_STEADY_S = 1.0
 
 
 class Turn(StrEnum):
-    """What happens at the end of a leg."""
+    """Action at the end of a leg."""
 
     BACK = "back"
     """The next leg goes the other way: a part of a net."""
@@ -415,7 +415,7 @@ class SurveyOptions:
     patience: float = 20.0
 
     def __post_init__(self) -> None:
-        """Refuse what has no end or no direction.
+        """Refuse surveys without end or direction.
 
         Raises
         ------
@@ -473,7 +473,7 @@ class SurveyMission:
 
     @property
     def depth(self) -> float:
-        """Of the present leg, in metres."""
+        """Depth of the present leg, in metres."""
         return self._options.depths[min(self.i_leg, len(self._options.depths) - 1)]
 
     def restart(self) -> None:
@@ -481,7 +481,7 @@ class SurveyMission:
         self._watch.restart()
 
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Return what leg or change of depth asks for."""
+        """Return the guidance of the leg or the change of depth."""
         lost = self._watch.update(now_s, posture is not None)
         if self.i_leg >= len(self._options.depths) or lost is not None:
             over = self.i_leg >= len(self._options.depths)

@@ -1,4 +1,4 @@
-"""The plan file: what to do, how to stay safe, and what to do without the target."""
+"""The plan file: mission, safety limits, and behaviour without the target."""
 
 import math
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ from aqualvs.errors import OptionError
 VERSION = 1
 """Version of the format that is read."""
 _KEY = "aqualvs_plan"
-# A setpoint so near to the least range leaves no room to swing, in metres.
+# Least distance of a setpoint from the least range, in metres: room to swing.
 _ROOM = 0.1
-# Depths of a survey, at most; more are a slip of the pen.
+# Greatest number of depths of a survey; more are a typing error.
 _MOST_DEPTHS = 1000
 
 Two = Annotated[list[Number], Field(min_length=2, max_length=2)]
@@ -44,7 +44,7 @@ class LegPart(Part):
 
 
 class SurveyPart(Part):
-    """`survey`: the depths, and what happens between them."""
+    """Section `survey`: the depths, and what happens between them."""
 
     depths_m: Annotated[list[NotNegative], Field(min_length=1)]
     step_m: Positive | None = None
@@ -54,7 +54,7 @@ class SurveyPart(Part):
 
 
 class LossPart(Part):
-    """`loss`: what to do without the target."""
+    """Section `loss`: behaviour without the target."""
 
     after_s: Positive = 0.15
     steady_s: NotNegative = 0.1
@@ -90,7 +90,7 @@ class PlanFile(Part):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a plan file says.
+    """Contents of a plan file.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ def _depths(part: SurveyPart) -> tuple[float, ...]:
         raise OptionError(f"survey.step_m {part.step_m:g} makes {n} legs; choose a greater one")
     step = math.copysign(part.step_m, last - first)
     depths = [first + i * step for i in range(n)]
-    # The last depth counts even where the step does not meet it.
+    # The last depth is included even if the step does not meet it.
     if abs(depths[-1] - last) > 1e-6:
         depths.append(last)
     return tuple(depths)

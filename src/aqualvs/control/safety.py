@@ -1,11 +1,11 @@
-"""The last word on every effort: what keeps vehicle and net whole, whoever steers.
+"""Safety gate for every effort, and detection of postures that do not respond to the efforts.
 
-The gate sits between controllers and vehicle. It never adds thrust towards the target, never arms,
-never changes the mode; docs/missions.md has its rules as a table.
+`SafetyGate` sits between controllers and vehicle, whoever steers, and protects vehicle and net. It
+never adds thrust towards the target, never arms, never changes the mode; docs/missions.md has its
+rules as a table.
 
-Whether a posture answers to what is done, or stands still while the vehicle moves.
-
-Independent of the pictures: it looks at postures, efforts and what the autopilot tells.
+`AnswerWatch` detects postures that stand still while the vehicle moves. It does not use the
+pictures: it compares postures, efforts and the autopilot's reports.
 """
 
 import math
@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture
 
 
 class Reason(StrEnum):
-    """Why an effort was changed or stopped; the value is what logs say in `reason`."""
+    """Reason why an effort was changed or stopped; the value is what logs write in `reason`."""
 
     NOT_ENGAGED = "not_engaged"
     NO_HEARTBEAT = "no_heartbeat"
@@ -45,7 +45,7 @@ class Reason(StrEnum):
 
     @property
     def words(self) -> str:
-        """What to tell the pilot."""
+        """Text for the pilot."""
         return _WORDS[self]
 
     @property
@@ -102,7 +102,7 @@ _REFUSED_MODES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
-    """Where the gate steps in.
+    """Limits at which the gate intervenes.
 
     Attributes
     ----------
@@ -121,8 +121,8 @@ class SafetyLimits:
         allowed shrinks with the way that is left.
     retreat_effort : float
         With which it backs away from too close; more where the controller asks for more. Must
-        exceed the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: whoever
-        still comes closer is pushed by the water.
+        exceed the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: a
+        vehicle that still comes closer is pushed by the water.
     brake_effort : float
         With which it brakes what closes in by two thirds or more faster than allowed; likewise.
         Below it is less in proportion: braking is not to throw the vehicle out of sight.
@@ -159,7 +159,7 @@ class SafetyLimits:
 
 
 class SafetyGate:
-    """Lets efforts pass, changes them or stops them; pure, all time comes from outside.
+    """Gate that passes, changes or stops efforts; pure, all time comes from outside.
 
     It starts disengaged.
 
@@ -184,7 +184,7 @@ class SafetyGate:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
         refused = self._vehicle_refuses(now_s, state)
         if refused is None and state.rival:
-            # Which of them is the vehicle nobody knows; one who comes later is the other.
+            # At the start it is unknown which of them is the vehicle; later, the newcomer is not.
             refused = Reason.CONFLICT
         self.latched = Reason.NOT_ENGAGED if refused else None
         return refused
@@ -204,7 +204,7 @@ class SafetyGate:
         range_rate: float | None = None,
         doubt: Reason | None = None,
     ) -> tuple[Effort, Reason | None]:
-        """Return what may be sent, and why it differs from what was asked.
+        """Return the effort that may be sent, and the reason if it differs from the request.
 
         Parameters
         ----------
@@ -215,7 +215,7 @@ class SafetyGate:
         posture : Posture or None
             The last valid one; None if there never was any.
         state : VehicleState
-            What the vehicle tells.
+            As the vehicle reports it.
         effort : Effort
             What controllers ask for.
         range_rate : float, optional
@@ -229,12 +229,12 @@ class SafetyGate:
             return NEUTRAL, refused or Reason.NO_POSTURE
         near = min(posture.range, posture.nearest)
         closing = self._closing_speed(now_s - posture_age_s, near, range_rate)
-        # What came closer goes on coming closer while nobody sees it.
+        # A target that approached is assumed to approach further while it is not seen.
         return self._guarded(effort, near - max(closing, 0.0) * posture_age_s, closing)
 
     def _clock_refuses(self, now_s: float) -> Reason | None:
         backwards = not now_s >= self._last_s
-        # Counts from the new time on: a clock that was set back must not stop us for good.
+        # Continue from the new time: a clock that was set back must not stop the gate for good.
         self._last_s = now_s if math.isfinite(now_s) else -math.inf
         if backwards or not math.isfinite(now_s):
             self._seen.clear()
@@ -252,7 +252,7 @@ class SafetyGate:
         return self.latched or doubt
 
     def _vehicle_refuses(self, now_s: float, state: VehicleState) -> Reason | None:
-        # A heartbeat from the future is of another clock, and tells nothing.
+        # A heartbeat from the future is by another clock, and useless.
         if not -self.limits.heartbeat_age <= now_s - state.heard_s <= self.limits.heartbeat_age:
             return Reason.NO_HEARTBEAT
         if not state.armed:
@@ -290,7 +290,7 @@ class SafetyGate:
         return gentle + max(firm - gentle, 0.0) * min(within / _FIRM_WITHIN_M, 1.0)
 
     def _guarded(self, effort: Effort, near: float, closing: float) -> tuple[Effort, Reason | None]:
-        """Return the effort without what brings the target too close."""
+        """Return the effort without the part that brings the target too close."""
         limits = self.limits
         left = near - limits.least_range
         if left < 0.0:
@@ -302,11 +302,11 @@ class SafetyGate:
         return _clipped(effort), None
 
 
-# The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat is
-# firm before.
+# The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat
+# reaches its full effort before that.
 _FIRM_WITHIN_M = 0.05
 _FIRM_ABOVE = 2.0 / 3.0
-# Postures that far apart tell the closing speed to some cm/s in spite of their noise.
+# Postures this far apart give the closing speed to some cm/s in spite of their noise.
 _SPEED_WINDOW_S = 0.4
 _LEAST_WINDOW_S = 0.15
 
@@ -334,40 +334,41 @@ def _clipped(effort: Effort) -> Effort:
     )
 
 
-# Second differences of three quantities from so many postures in a row tell their noise.
+# Number of consecutive postures whose second differences, of three quantities, measure the noise.
 _N_NOISE, _N_USUAL = 8, 50
 _ORDER = 6.0
-# Postures of less noise come from a simulation without any: metres and radians.
+# Postures with less noise come from a simulation without noise: metres and radians.
 _LEAST_RANGE, _LEAST_ANGLE = 2e-5, math.radians(0.005)
-# The force that holds the vehicle in its place is the mean over so many seconds of thrust; known
-# after so many. Before, a current that the controller has yet to find takes as much.
+# The force that holds the vehicle in place is the mean thrust over so many seconds; known after so
+# many. Before that, a current that the controller has yet to find takes as much.
 _BALANCE_S, _BALANCED_S = 4.0, 10.0
 _SLOPE_S = 0.3
-# Means over parts of the window do not differ by more where a posture stands still: as share of the
-# range, in radians; and how many parts there are.
+# Greatest difference between means over parts of the window where a posture stands still, as share
+# of the range and in radians; and the number of parts.
 _STILL_RANGE, _STILL_YAW, _N_MEANS = 0.006, math.radians(0.6), 6
-# Efforts towards the target must have lasted so long, in seconds.
+# Least duration of efforts towards the target, in seconds.
 _PUSHED_S = 0.5
-# The range must lie so far beyond the one asked for, in metres.
+# Least distance of the range beyond its setpoint, in metres.
 _OFF = 0.05
-# Between two reports of a heading; more is a compass that was set anew.
+# Greatest change between two reports of a heading; a greater one is a reset compass.
 _GREATEST_TURN = math.radians(20.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerLimits:
-    """What counts as no answer.
+    """Limits beyond which a posture counts as not responding.
 
     Attributes
     ----------
     repeats_s : float
-        So long the same posture to the last bit, while an effort is in force, is a frozen picture.
+        Time after which a posture that is the same to the bit, while an effort is in force, counts
+        as a frozen picture.
     quiet : float
         Noise of the postures, as share of the usual standard deviation, below which the picture is
         frozen. Twelve and more differences are looked at: sound noise is so small by chance once in
         10^10 frames.
     window_s : float
-        Efforts and motion are compared over so many seconds.
+        Efforts and motion are compared over this time, in seconds.
     promised : float
         Way towards the target by the efforts, in metres, that a posture which stands still must
         answer to. Standing still is 0.6 % of the range and 0.6 degrees: waters that take so much
@@ -399,12 +400,12 @@ class AnswerLimits:
 
 
 class _Moment(NamedTuple):
-    """One posture, and what had been done until then."""
+    """Posture with the integrals of the efforts until then."""
 
     time_s: float
     range: float
     yaw: float
-    # Closing speed and way that the efforts beyond the balance have given since the start.
+    # Closing speed and way due to the efforts beyond the balance, since the start.
     speed: float
     way: float
     # Heading without jumps.
@@ -412,11 +413,11 @@ class _Moment(NamedTuple):
 
 
 class AnswerWatch:
-    """Looks for postures that do not answer.
+    """Detector of postures that do not respond to efforts.
 
     `Reason.FROZEN` while postures repeat to the bit, or their noise has all but vanished: a picture
     that stands still. `Reason.NO_ANSWER` where the efforts must have brought the vehicle nearer, or
-    the autopilot tells that it has turned, and the posture shows nothing of it: a picture that
+    the autopilot reports that it has turned, and the posture shows nothing of it: a picture that
     stands still in spite of its noise, a vehicle that is caught, sticks that turn the other way.
 
     Parameters
@@ -452,14 +453,14 @@ class AnswerWatch:
         self._heading, self._told = 0.0, math.nan
 
     def done(self, now_s: float, effort: Effort, wanted: float | None = None) -> None:
-        """Take in which effort was sent, and for which range in metres."""
+        """Add a sent effort, and the range in metres that it was for."""
         self._wanted = math.inf if wanted is None else wanted
         if effort != NEUTRAL:
             self._pushed_s = now_s
         self._effort = effort
 
     def see(self, now_s: float, posture: Posture, state: VehicleState) -> Reason | None:
-        """Take in a new posture; return why it is not to be trusted, None if it may be.
+        """Add a new posture; return why it cannot be used, None if it can.
 
         Parameters
         ----------
@@ -467,7 +468,7 @@ class AnswerWatch:
         posture : Posture
             Of a frame that has not been seen before.
         state : VehicleState
-            What the vehicle tells.
+            As the vehicle reports it.
         """
         if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
             return None
@@ -497,7 +498,7 @@ class AnswerWatch:
             self._moments.clear()
             self._told = math.nan
             step = 0.0
-        # Thrust to the side is for the drag of a way along the target, and promises nothing.
+        # Sideways thrust balances the drag of a way along the target; it predicts no approach.
         forward, _ = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
         push = forward * math.cos(yaw) / self._vehicle.mass
         if push <= 0.0:
@@ -525,7 +526,7 @@ class AnswerWatch:
         promised = last.way - begin.way + (before - begin.speed) * span
         turned = abs(last.heading - begin.heading)
         pushed = last.time_s - self._backed_s > _PUSHED_S and self._thrust_s > _BALANCED_S
-        # Near its setpoint the vehicle leans on the water as that changes.
+        # Near its setpoint the vehicle's thrust balances the changing current.
         pushed = pushed and last.range - self._wanted > _OFF
         promises = promised > self.limits.promised and pushed
         if not promises and turned < self.limits.turned:
@@ -545,7 +546,7 @@ def _swing(values: list[float]) -> float:
 
 
 class _Noise:
-    """Compares the noise of the last postures with what it usually is."""
+    """Comparison of the noise of the last postures with the usual noise."""
 
     def __init__(self, quiet: float) -> None:
         self._quiet = quiet * quiet
@@ -558,7 +559,7 @@ class _Noise:
         self._n = 0
 
     def vanished(self, posture: Posture) -> bool:
-        """Take in a posture; return whether the noise has all but vanished."""
+        """Add a posture; return whether the noise has almost vanished."""
         self._postures.append((posture.range, posture.pitch, posture.yaw))
         if len(self._postures) < 3:
             return False

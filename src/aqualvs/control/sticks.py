@@ -1,4 +1,4 @@
-"""From efforts to the stick positions that ArduSub makes them of: its dead zones taken out.
+"""Stick positions for efforts, with ArduSub's dead zones compensated.
 
 ArduSub 4.5 and later (joystick.cpp, Attitude.cpp, mode_althold.cpp, mode_poshold.cpp and
 RC_Channel.cpp of ArduPilot) turns `MANUAL_CONTROL` into pulses about 1500 us, 0.4 us times the
@@ -40,7 +40,7 @@ class Sticks:
     x, y, r : int
         Forward, right, clockwise, -1000 to 1000.
     z : int
-        Up, 0 to 1000; 500 is neutral, whatever the MAVLink specification says.
+        Up, 0 to 1000; 500 is neutral, contrary to the MAVLink specification.
     """
 
     x: int = 0
@@ -68,7 +68,7 @@ class StickChannel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickShaping:
-    """What ArduSub makes of sticks; the defaults are its own.
+    """ArduSub's conversion of sticks; the defaults are its own.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class StickShaping:
     right: StickChannel = field(default_factory=StickChannel)
 
     def sticks(self, effort: Effort, *, keeps_place: bool = False) -> Sticks:
-        """Return the stick positions at which ArduSub does what an effort says.
+        """Return the stick positions that make ArduSub carry out an effort.
 
         An effort of 1 is a full stick, one of 0 the middle of the dead zone, and what is between
         is in proportion to what the vehicle does. Pulses are whole microseconds.
@@ -200,7 +200,7 @@ PARAMETERS: tuple[str, ...] = (
 
 
 def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
-    """Return the shaping of a vehicle that told its parameters.
+    """Return the shaping of a vehicle by its reported parameters.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
             reverse=parameters.get(f"RC{n}_REVERSED", 0.0) == 1.0,
         )
         if name == "throttle":
-            # A range: its middle is that of its limits, and its trim means nothing.
+            # A range channel: its middle is that of its limits, and its trim is not used.
             channel = replace(channel, trim=0.5 * (channel.least + channel.most))
         found[name] = channel if channel.is_sound else default
     shaping = StickShaping(
@@ -228,7 +228,7 @@ def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
         throttle_dead_zone=_within(parameters.get("THR_DZ"), 0.0, 400.0, own.throttle_dead_zone),
         **found,
     )
-    # Trims beyond what sticks reach cannot be made up for.
+    # Trims beyond the reach of the sticks cannot be compensated.
     return shaping if shaping.turning_share > 0.0 and shaping.climbing_share > 0.0 else own
 
 

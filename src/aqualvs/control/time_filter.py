@@ -1,4 +1,4 @@
-"""Smoothing of range, pitch and yaw over time; optional, raw values stay available."""
+"""Time filter of range, pitch and yaw; optional, raw values stay available."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -9,7 +9,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Refusal
 
-# A micrometre and a microradian: keeps a measurement that claims to be exact invertible.
+# A micrometre and a microradian: keeps the covariance of an exact measurement invertible.
 _LEAST_VARIANCE = 1e-12 * np.eye(3)
 
 
@@ -53,13 +53,13 @@ class FilteredPosture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureFilterOptions:
-    """How the vehicle moves, and what the filter believes.
+    """Motion model and gate of the filter.
 
     Attributes
     ----------
     range_acceleration : float
         Random acceleration towards and from the target, in m/s², that acts for about a second: the
-        speed a second ahead is uncertain by so many m/s.
+        speed a second ahead is uncertain by the same number in m/s.
     pitch_acceleration, yaw_acceleration : float
         The same for the angles, in rad/s².
     initial_speed, initial_turn_rate : float
@@ -67,7 +67,7 @@ class PostureFilterOptions:
     gate_probability : float
         Share of sound measurements that pass the gate.
     n_rejected : int
-        Rejected measurements in a row that agree with each other, after which the filter believes
+        Rejected measurements in a row that agree with each other, after which the filter accepts
         them: the target itself is elsewhere.
     max_coast : float
         Seconds without an accepted measurement after which there is no filtered posture.
@@ -130,7 +130,7 @@ class PostureFilter:
         self._rival: _Track | None = None
 
     def update(self, time_s: float, posture: Posture | Refusal) -> FilteredPosture | None:
-        """Take in what one frame gave, and return the state at its time.
+        """Update by the measurement of one frame, and return the state at its time.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class PostureFilter:
         return track
 
     def _take(self, time_s: float, measured: FloatArray, cov: FloatArray) -> bool:
-        """Update the track by a measurement that fits, else its rival; tell whether it entered."""
+        """Update the track or its rival by a measurement; return whether it entered the track."""
         if self._track is None:
             self._track = self._motion.started(time_s, measured, cov)
             return True
@@ -217,7 +217,7 @@ class _Track:
 
 
 class _Motion:
-    """How a track moves on and takes measurements in."""
+    """Motion model: forecast of a track, and its update by measurements."""
 
     def __init__(self, options: PostureFilterOptions) -> None:
         accelerations = (

@@ -1,4 +1,4 @@
-"""Gains for a vehicle model: the fastest that stay stable in the worst case.
+"""Gains for a vehicle model: the fastest that stay stable in the worst case, and their margins.
 
 Range: linearised about rest in still or moving water, the vehicle is 1 / (m s (s + b)) with the
 drag's slope b over mass, behind its thrusters' lag and the delay of picture, link and sampling.
@@ -9,9 +9,9 @@ the open loop is
            exp(-delay s),
 
 g = 1 + 0.8 b / k1, at most 2.2, and h = 1 + 1.2 b / k1, at most 6, being the controller's schedule
-in moving water. The shares k0 = 0.3 k1, ki = 0.25 k1² and that of H were chosen among some hundred:
-they let little of swell and of changes of the current through at given margins, over all three
-vehicles. So one number is left; it is the greatest for which the modulus margin stays at
+in moving water (`gain_schedule`). The ratios k0 = 0.3 k1, ki = 0.25 k1² and that of H were chosen
+among some hundred: they pass little of swell and of changes of the current at given margins, over
+all three vehicles. So one number is left; it is the greatest for which the modulus margin stays at
 `least_modulus` with the usual delay, and at `least_late_modulus` with the greatest, in every
 corner: mass and drag off by the factors asked for, water at rest and at the greatest current.
 
@@ -20,9 +20,8 @@ thrusters; L(s) = (kp s + ki) / s² / (lag s + 1) exp(-delay s) with ki = 0.15 k
 greatest for the same margin, the rate loop being as calculated or, in the thrusters' dead band,
 several times slower.
 
-What a controller should know of a simulated vehicle.
-
-How far a loop is from instability: the delay and the gain that may still be added to it.
+`facts_of` states what a controller should know of a simulated vehicle. `Margins` are the distances
+of a loop from instability, among them the delay and the gain that may still be added.
 """
 
 import itertools
@@ -53,7 +52,7 @@ from aqualvs.simulation.vehicle.models import FORWARD, RIGHT, YAW, VehicleModel
 
 
 def facts_of(model: VehicleModel) -> VehicleFacts:
-    """Return what a controller should know of a simulated vehicle, its pilot gain included."""
+    """Return the properties of a simulated vehicle for its controller, with the pilot gain."""
     sticks, shaping = model.sticks, shaping_of_model(model)
     return VehicleFacts(
         name=model.name,
@@ -68,7 +67,7 @@ def facts_of(model: VehicleModel) -> VehicleFacts:
 
 
 def shaping_of_model(model: VehicleModel) -> StickShaping:
-    """Return what a link must take out of a simulated vehicle's sticks."""
+    """Return the stick shaping of a simulated vehicle, which a link must compensate."""
     sticks, own = model.sticks, StickShaping()
     yaw, forward, right = sticks.trims
     return StickShaping(
@@ -113,7 +112,7 @@ def _thrust_map(model: VehicleModel) -> ThrustMap:
 
 @dataclass(frozen=True, slots=True)
 class Turning:
-    """How late a vehicle's own autopilot follows a turning rate, in seconds.
+    """Lag of a vehicle's own autopilot behind a turning rate, in seconds.
 
     The shaping of the stick, the thrusters' lag, and the rate loop: inertia over the moment that it
     gives for a rate.
@@ -128,7 +127,7 @@ class Turning:
     rate_loop: float
 
     def lag(self, slower: float = 1.0) -> float:
-        """Return the whole, with a rate loop that is so many times slower."""
+        """Return the total lag, with a rate loop that is slower by a factor."""
         return self.shaping + self.thrusters + slower * self.rate_loop
 
 
@@ -143,13 +142,13 @@ def turning_of(model: VehicleModel) -> Turning:
 
 
 def tidy(value: float) -> float:
-    """Return a number rounded to what a file for people should hold: four digits."""
+    """Return a number rounded to four digits, for readable files."""
     return float(f"{value:.4g}")
 
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
-# From a slow drift to what thrusters no longer follow, in rad/s.
+# Frequencies from a slow drift to the limit of the thrusters, in rad/s.
 _OMEGA = np.geomspace(1e-2, 1e2, 1600)
 _PADE = 4
 
@@ -189,7 +188,7 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Of one loop.
+    """Stability margins of one loop.
 
     Attributes
     ----------
@@ -220,7 +219,7 @@ def margins(loop: Loop) -> Margins:
     """Return the margins of a loop."""
     along = loop.at(_OMEGA)
     size = np.abs(along)
-    # Phase beyond -180 degrees, 0 to 2 pi: what is left where the gain is 1.
+    # Phase above -180 degrees, 0 to 2 pi: the margin where the gain is 1.
     left = np.mod(np.angle(along) + math.pi, 2.0 * math.pi)
     ones = np.flatnonzero((size[:-1] > 1.0) != (size[1:] > 1.0))
     return Margins(
@@ -253,30 +252,30 @@ def _pade(delay: float) -> FloatArray:
         math.factorial(2 * n - k) / (math.factorial(k) * math.factorial(n - k)) * delay**k
         for k in range(n, -1, -1)
     ]
-    # A vanishing delay leaves zeros in front, which are no powers of s.
+    # A vanishing delay leaves leading zeros, which are no powers of s.
     return np.trim_zeros(np.array(terms) / terms[-1], "f")
 
 
 _POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.3, 0.25, 0.15
 _SWELL = 1.2
-# Metres: the closing speed that lacks, summed over time, before thrust changes its side. With 15 mm
-# a BlueROV2 Heavy in calm water does so more than 20 times a minute, with 21 mm the step of a
-# BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of their thrust
-# times seconds: with 0.022 the step of a VideoRay-like vehicle does.
+# Integral of the missing closing speed before thrust changes its sign, in metres. With 15 mm, the
+# thrust of a BlueROV2 Heavy in calm water changes its sign more than 20 times a minute; with 21 mm,
+# the step of a BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of
+# their thrust times seconds: with 0.022 the step of a VideoRay-like vehicle takes twice the time.
 _CROSSING, _GREATEST_CROSSING = 0.018, 0.0175
-# In the thrusters' dead band the autopilot follows a turning rate so many times later.
+# Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
 _SLUGGISH = 4.0
-# Where the bisection of a gain begins and ends, in 1/s.
+# Limits of the bisection of a gain, in 1/s.
 _LEAST, _GREATEST = 0.05, 20.0
-# Delays and frames in seconds, and m/s: beyond them nothing is steered.
+# Greatest delays and frame intervals in seconds, and greatest current in m/s.
 _MOST_S, _MOST_CURRENT = 60.0, 10.0
-# Packaged gains have 0.40 to 0.55, half as much again 0.28 to 0.37, twice as much 0.13 to 0.19.
+# Packaged gains have 0.40 to 0.55; 1.5 times these gains 0.28 to 0.37, twice these 0.13 to 0.19.
 _LEAST_USABLE_MODULUS = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneOptions:
-    """What the loops must stand.
+    """Conditions under which the loops must stay stable.
 
     Attributes
     ----------
@@ -285,7 +284,7 @@ class TuneOptions:
     greatest_delay : float
         What it may become; performance may suffer there, stability must not.
     frame : float
-        Seconds between frames; half of it counts as delay, for efforts are held so long.
+        Seconds between frames; half of it counts as delay: efforts are held until the next frame.
     mass_factor, drag_factor : float
         By which mass and drag may be off, either way.
     current : float
@@ -310,7 +309,7 @@ class TuneOptions:
     least_yaw_modulus: float = 0.45
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -339,7 +338,7 @@ class TuneOptions:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """What tuning came to.
+    """Result of tuning.
 
     Attributes
     ----------
@@ -478,7 +477,7 @@ def _range_loop(
     pushes = np.polymul([speed, integral], swell)
     pushes = np.polyadd(pushes, speed * np.polymul([1.0, 0.0], swings))
     above = np.polymul(pushes, [1.0, gains.position])
-    # Drag is put in beforehand at the speed asked for, which follows the position.
+    # Drag is fed forward at the requested speed, which follows the position.
     ahead = known * gains.position
     above = np.polyadd(above, ahead * np.polymul([1.0, 0.0], swell)) / mass
     below = np.polymul(np.polymul([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)

@@ -1,8 +1,8 @@
-"""What the controllers know of a vehicle, whoever it is: a simulated one, or ArduSub by MAVLink.
+"""Interface of a vehicle for the controllers: state, efforts, and the setpoint to hold.
 
-Body axes are forward, right, down (FRD), at the vehicle's centre; yaw is clockwise from above.
-
-What pilot and controller agree on: the range and yaw to hold.
+A vehicle is a simulated one, or ArduSub by MAVLink. Body axes are forward, right, down (FRD), at
+the vehicle's centre; yaw is clockwise from above. `SetpointHolder` shares the range and yaw to hold
+between pilot and controller.
 """
 
 import math
@@ -82,7 +82,7 @@ class SetpointHolder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """What a pilot's sticks would ask for, -1 to 1: what ArduSub's depth hold takes.
+    """Effort as by a pilot's sticks, -1 to 1, as ArduSub's depth hold takes it.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ NEUTRAL = Effort()
 
 
 class Mode(StrEnum):
-    """Who steers; what the pilot has chosen on the vehicle."""
+    """Flight mode that the pilot has chosen on the vehicle: who steers."""
 
     OURS = "ours"
     """A mode in which the vehicle takes our efforts (depth hold: it keeps its own depth)."""
@@ -124,7 +124,7 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """What a vehicle tells of itself; None where it does not, or has not of late.
+    """State as the vehicle reports it; None where it does not, or not recently.
 
     Attributes
     ----------
@@ -141,9 +141,9 @@ class VehicleState:
     heading, roll, pitch : float or None
         Radians; heading clockwise from north.
     doubt : str
-        Why it seems not to do what it is told; empty if it does, or nothing is known.
+        Why it seems not to obey; empty if it does, or nothing is known.
     rival : str
-        Who else speaks as the vehicle, and agrees with it; empty if nobody does.
+        Other sender that speaks as the vehicle, and agrees with it; empty if there is none.
     """
 
     heard_s: float = float("-inf")
@@ -160,11 +160,11 @@ class VehicleState:
 
 
 class VehicleLink(Protocol):
-    """Commands a vehicle and hears from it; never arms it, never changes its mode."""
+    """Interface to command a vehicle and read its state; never arms it or changes its mode."""
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the vehicle in messages."""
 
     def state(self) -> VehicleState:
         """Return the latest state; returns at once."""

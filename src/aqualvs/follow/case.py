@@ -1,6 +1,6 @@
-"""What is simulated in one run: vehicle, sea, net, delays; and how it becomes a loop.
+"""Setup of a simulated run (vehicle, sea, net, delays), and the three trials that judge a loop.
 
-The three trials that a loop is judged by: hold, step, follow; in one sea before one net.
+The trials are hold, step and follow, all in the same sea and before the same net.
 """
 
 import math
@@ -39,7 +39,7 @@ class SimCase:
     model : VehicleModel
         The true vehicle.
     gains : ControlGains
-        Of the controller, for what it believes the vehicle to be.
+        Of the controller, for its model of the vehicle.
     water : WaterMotion
     net : NetWall
     start_range, start_yaw : float
@@ -150,18 +150,18 @@ def sea(
 
 
 RANGE, STEP, SWAY = 0.6, 0.2, 0.2
-"""Held, by how much it is stepped, in metres; speed along the net, in m/s."""
+"""Range to hold and its step, in metres; speed along the net, in m/s."""
 FROM_REST_S = 10.0
-"""A run begins at rest in the current; so long it may take to settle."""
+"""Time to settle in a run, which begins at rest in the current."""
 STEP_S, HOLD_END_S, FOLLOW_END_S = 40.0, 52.0, 70.0
-"""When the step comes, and when the two runs end."""
+"""Times of the step and of the ends of the two runs, in seconds."""
 CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1.0))
 """The inside of a cage of 10 m radius, that sways and rocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """Runs of one vehicle.
+    """Trials of one vehicle.
 
     Parameters
     ----------

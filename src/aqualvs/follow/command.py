@@ -1,8 +1,7 @@
-"""`aqualvs follow --sim`: the loop in simulation, as a log, figures and a summary.
+"""The command `aqualvs follow --sim`: a simulated loop with log, figures and summary.
 
-A simulated loop on the pilot's page, in real time.
-
-What is told while a loop is simulated, and when it ends.
+`LoopPage` shows the loop on the pilot's page, in real time. `RunWatch` reports progress in the
+terminal and ends the run.
 """
 
 import math
@@ -43,14 +42,14 @@ from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import Health, PartHealth, State
 from aqualvs.terminal import StopSignals
 
-# So far behind the clock, a run does not try to catch up.
+# Lag behind the clock beyond which a run does not catch up.
 _LATE_S = 0.2
-# Frames that the share of valid ones counts.
+# Number of frames over which the share of valid ones is taken.
 _N_SHARE = 50
 
 
 class LoopPage:
-    """Shows a loop step by step, and lets it run no faster than the clock.
+    """Page that shows a loop step by step, in real time at most.
 
     Parameters
     ----------
@@ -142,9 +141,9 @@ class LoopPage:
 
 
 _TELL_EVERY_S = 10.0
-# A plan that is over goes on to hold: long enough to see that it does.
+# A plan that is over continues to hold: time to show that it does.
 _HOLDS_ON_S = 5.0
-# A report needs some rows.
+# Least length of a run: a report needs some rows.
 _LEAST_S = 1.0
 
 
@@ -160,7 +159,7 @@ class RunWatch:
         Takes one line.
     stop : StopSignals
     slow : bool
-        Whether a second takes seconds, so that the way is told.
+        Whether a simulated second takes seconds, so that progress is printed.
     """
 
     def __init__(
@@ -177,7 +176,7 @@ class RunWatch:
         self._over_s = math.inf
 
     def __call__(self, now_s: float) -> bool:
-        """Tell what has changed; False ends the run."""
+        """Report changes; return False to end the run."""
         if now_s - self._told_s >= _TELL_EVERY_S:
             self._told_s = now_s
             self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
@@ -204,7 +203,7 @@ FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aim:
-    """What the loop shall do: a plan file, or a range and yaw to hold.
+    """Aim of the loop: a plan file, or a range and yaw to hold.
 
     Attributes
     ----------
@@ -244,7 +243,7 @@ _DEFAULT_RANGE = 0.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimRequest:
-    """What to simulate.
+    """Request for a simulation.
 
     Attributes
     ----------
@@ -304,7 +303,7 @@ class SimRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated.
+        """Refuse requests that cannot be simulated.
 
         Raises
         ------
@@ -335,12 +334,12 @@ class SimRequest:
 
 
 _FOLLOW_LEAST_S, _LEAST_RADIUS = 1.0, 2.0
-# A day; the slowest and fastest that cameras are.
+# A day; frame rates of the slowest and the fastest cameras.
 _MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
 
 
 def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:
-    """Run the loop, write log, figures and page, and tell the summary; returns 0.
+    """Run the loop, write log, figures and page, and print the summary; return 0.
 
     Raises
     ------

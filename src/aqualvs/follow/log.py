@@ -1,7 +1,4 @@
-"""What a simulated loop did, frame by frame, with the truth beside it.
-
-How well a simulated loop did, from its log.
-"""
+"""Log of a simulated loop, frame by frame with the truth, and measures of its performance."""
 
 import csv
 import math
@@ -15,7 +12,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.results.files import writing
 
 NEUTRAL_WITHIN_S = 0.2
-"""Without a valid posture for so long there must be no thrust."""
+"""Without a valid posture for this time there must be no thrust."""
 
 
 class LoopRow(NamedTuple):
@@ -39,7 +36,7 @@ class LoopRow(NamedTuple):
     forward, right, down, turn : float
         The last effort sent.
     depth, heading : float
-        As the vehicle tells.
+        As the vehicle reports them.
     engaged : bool
     stage, reason, refusal : str
         Of the mission; why the effort was changed; why there is no posture.
@@ -81,10 +78,10 @@ class LoopLog:
     ----------
     rows : list of LoopRow
     blind_thrust_s : list of float
-        For each stretch of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
+        For each period of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
         reached: time from the last valid posture to neutral.
     n_blind : int
-        Such stretches, with or without thrust.
+        Such periods, with or without thrust.
     """
 
     rows: list[LoopRow] = field(default_factory=list)
@@ -97,11 +94,11 @@ class LoopLog:
         return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
 
     def note_neutral(self, seen_s: float, now_s: float) -> None:
-        """Take in that thrust ended, at a time after the last valid posture."""
+        """Note that thrust ended, at a time after the last valid posture."""
         self._neutral_s = now_s - seen_s
 
     def note_sight(self, seen_s: float, now_s: float, thrusts: bool) -> None:
-        """Take in that a valid posture came, when one had come before, and the effort till now."""
+        """Note a valid posture, with the one before and the effort until now."""
         gap = now_s - seen_s
         if NEUTRAL_WITHIN_S < gap < math.inf:
             self.n_blind += 1
@@ -121,7 +118,7 @@ _UNITS = {
 
 
 def write_log(log: LoopLog, path: Path) -> None:
-    """Write the rows as CSV; units are in the names, cells of what is not known are empty.
+    """Write the rows as CSV; units are in the names, cells of unknown values are empty.
 
     Raises
     ------
@@ -162,14 +159,14 @@ def _cell(value: object, factor: float, digits: int) -> str:
 SETTLED_SHARE = 0.1
 """A step has settled once the range stays within this share of it."""
 LOST_AFTER_S = 2.5
-"""Without sight for longer, in seconds, somebody has to take over."""
-# Swings that are that much greater at the end of a run than in its middle are growing, in metres.
+"""Without sight for longer, in seconds, a human has to take over."""
+# Greater increase of the swings from the middle to the end of a run counts as growth, in metres.
 _GROWS, _GROWS_BY = 2.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoldMeasures:
-    """Of a stretch with a constant setpoint.
+    """Measures of a period with a constant setpoint.
 
     Attributes
     ----------
@@ -211,7 +208,7 @@ class StepMeasures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffortMeasures:
-    """How often an effort turns round: thrusters wear by it, and shake the camera.
+    """Rate of an effort's reversals, which wear thrusters and shake the camera.
 
     Attributes
     ----------
@@ -226,19 +223,19 @@ class EffortMeasures:
 
 
 JUMP = 0.25
-"""Of an effort: about what crossing a dead band takes."""
+"""Least jump of an effort that counts: about the width of a dead band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyMeasures:
-    """Of a whole run.
+    """Safety measures of a whole run.
 
     Attributes
     ----------
     least_clearance : float
         In metres; negative is contact.
     n_blind : int
-        Stretches of more than 0.2 s without a valid posture.
+        Periods of more than 0.2 s without a valid posture.
     neutral_late : float
         Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
     stable : bool
@@ -268,7 +265,7 @@ class SafetyMeasures:
 
 
 def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> HoldMeasures:
-    """Return what a stretch came to; frames without a setpoint count against the last one."""
+    """Return the measures of a period; frames without a setpoint count against the last one."""
     here = _between(log, start_s, end_s)
     off = log.column("range")[here] - _filled(log.column("wanted_range"))[here]
     turned = log.column("yaw")[here] - _filled(log.column("wanted_yaw"))[here]
@@ -329,7 +326,7 @@ def step_measures(
 
 
 def safety_measures(log: LoopLog) -> SafetyMeasures:
-    """Return what a whole run came to."""
+    """Return the safety measures of a whole run."""
     return SafetyMeasures(
         least_clearance=float(log.column("clearance").min()),
         n_blind=log.n_blind,

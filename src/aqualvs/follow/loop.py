@@ -1,10 +1,10 @@
 """The closed loop in simulated time: frames, time filter, pilot, vehicle, water and net.
 
-What decides is what decides live: the time filter, `NetPilot` with mission, controller and safety
-gate, and the rules of the live pilot's watchdog. Delays are those of events: a frame is exposed,
-arrives a while later, and its effort reaches the vehicle after the wire's latency.
+Decisions are made by the code of a live run: the time filter, `NetPilot` with mission, controller
+and safety gate, and the rules of the live pilot's watchdog. Delays are those of events: a frame is
+exposed, arrives later, and its effort reaches the vehicle after the latency of the wire.
 
-The simulated vehicle behind the link that control knows.
+`SimulatedLink` gives the simulated vehicle the interface that the controllers use.
 """
 
 import math
@@ -24,12 +24,12 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 
-# A vehicle tells its attitude ten times a second.
+# A vehicle reports its attitude ten times a second.
 _TELLS_HZ = 10.0
 
 
 class SimulatedLink:
-    """Commands a simulated vehicle and hears from it, in its own time.
+    """Link to a simulated vehicle, in its own time.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ class SimulatedLink:
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the vehicle in messages."""
         return f"simulated {self.vehicle.model.name}"
 
     def state(self) -> VehicleState:
-        """Return what the vehicle tells of itself, by the vehicle's clock."""
+        """Return the vehicle's reported state, by the vehicle's clock."""
         told = self.vehicle.telemetry()
         return VehicleState(
             heard_s=math.floor(told.time_s * _TELLS_HZ) / _TELLS_HZ,
@@ -88,7 +88,8 @@ class SimulatedLink:
         self._closed = True
 
 
-# The live run tells a silent stream after so long, and then so often; the watchdog looks so often.
+# Time after which the live run reports a silent stream, the period of further reports, and that of
+# the watchdog's checks.
 _SILENT_AFTER_S, _SILENT_EVERY_S, _DOG_LOOKS_S = 0.20, 0.10, 0.02
 
 
@@ -96,15 +97,15 @@ OnStep: TypeAlias = Callable[[float, float, Posture | Refusal, Decision, Vehicle
 
 
 class Eye(Protocol):
-    """Measures the net's posture from a vehicle."""
+    """Interface of a sensor that measures the net's posture from a vehicle."""
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
-        """Return what the frame exposed now gives; None where there is no frame at all."""
+        """Return the result for the frame exposed now; None for a lost frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """When frames come.
+    """Timing of the frames.
 
     Attributes
     ----------
@@ -118,7 +119,7 @@ class Timing:
     delay: float = 0.06
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -142,20 +143,20 @@ class _Arrival(NamedTuple):
 
 @dataclass(slots=True)
 class _Sight:
-    """What is known of the stream, as the live run and the pilot's watchdog know it."""
+    """State of the stream, as the live run and the pilot's watchdog know it."""
 
     patience_s: float
     coming: deque[_Arrival] = field(default_factory=deque)
-    # When a frame came last, and when a silent stream was told last.
+    # Times of the last frame and of the last report of a silent stream.
     heard_s: float = 0.0
     told_s: float = -math.inf
     # Exposure of that frame.
     exposed_s: float = 0.0
-    # When a valid posture came last.
+    # Time of the last valid posture.
     seen_s: float = -math.inf
 
     def silence_s(self) -> float:
-        """Return when a silent stream is told next."""
+        """Return when a silent stream is reported next."""
         return max(self.heard_s + _SILENT_AFTER_S, self.told_s + _SILENT_EVERY_S)
 
     def bark_s(self, thrusts: bool) -> float:
@@ -204,12 +205,12 @@ class SimulatedLoop:
 
     @property
     def seen_s(self) -> float:
-        """When a valid posture came last; -inf before the first."""
+        """Time of the last valid posture; -inf before the first."""
         return self._sight.seen_s
 
     @property
     def filtered(self) -> FilteredPosture | None:
-        """What the time filter made of the last step; None where it does not run."""
+        """State of the time filter at the last step; None where it does not run."""
         return self._filtered
 
     def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:

@@ -1,4 +1,4 @@
-"""Many short dives with everything drawn at random: what the safety of the loop rests on."""
+"""Monte Carlo simulation of short dives: evidence for the safety of the loop."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -27,10 +27,10 @@ from aqualvs.simulation.vehicle.models import VehicleModel
 
 SECONDS = 40.0
 """Length of a random dive."""
-# Sight is not lost before the loop has begun.
+# Sight is not lost before the loop has started.
 _FIRST_LOSS_S, _GREATEST_LOSS_S = 6.0, 1.0
 _GIVEN_UP_S = LOST_AFTER_S + 0.5
-# What a careful pilot holds: so many metres, and so many more for each m/s of current.
+# Range that a careful pilot holds: in metres, and in metres more for each m/s of current.
 _ROOM, _ROOM_BY_SPEED = 0.5, 0.6
 _WORKING_RANGE = bluerov2_rig().working_range
 
@@ -47,7 +47,7 @@ class RandomDive:
     sway : float
         In m/s; 0 is a dive that holds.
     blind : tuple of Blind
-        Stretches without sight.
+        Periods without sight.
     """
 
     seed: int
@@ -63,7 +63,7 @@ class RandomDive:
         return HoldMission(self.setpoint)
 
     def run(self, seconds: float = SECONDS) -> LoopLog:
-        """Dive until the end, or until somebody must take over, and return the log."""
+        """Dive until the end, or until a human must take over, and return the log."""
         rng = np.random.default_rng([self.seed, 43])
         noise = PostureNoise(outliers=0.005)
         eye = SampledEye(self.case.net, rng, noise, self.blind, _WORKING_RANGE)
@@ -73,7 +73,7 @@ class RandomDive:
 
 @dataclass(frozen=True, slots=True)
 class DiveResult:
-    """What one dive came to; `hold` counts from 10 s on, or the second half of a shorter one."""
+    """Result of one dive; `hold` counts from 10 s on, or the second half of a shorter one."""
 
     seed: int
     safety: SafetyMeasures
@@ -82,12 +82,12 @@ class DiveResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """How widely dives are drawn.
+    """Widths of the distributions that dives are drawn from.
 
     Attributes
     ----------
     mass : float
-        Greatest deviation from what the controller believes, as a share.
+        Greatest deviation from the controller's value, as a share.
     drag : float
         Greatest factor either way.
     current : float
@@ -180,7 +180,7 @@ def _net(rng: np.random.Generator) -> NetWall:
 
 
 def _blind(rng: np.random.Generator) -> tuple[Blind, ...]:
-    """Draw stretches without sight of up to a second, a few seconds apart."""
+    """Draw periods without sight of up to a second, a few seconds apart."""
     stretches: list[Blind] = []
     start_s = _FIRST_LOSS_S + rng.exponential(3.0)
     while start_s < SECONDS - 2.0:

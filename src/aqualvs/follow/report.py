@@ -1,9 +1,8 @@
-"""The page and the summary of a simulated run.
+"""Page, summary and figures of a simulated run.
 
-Pictures of a loop over time, after figures 22 and 23 of the paper.
-
-Constantinou, Georgiades and Loizou, Robotics 2021, 10, 126. Matplotlib is asked for when a picture
-is drawn, and only its Agg canvas: no display is needed.
+The figures follow figures 22 and 23 of the paper (Constantinou, Georgiades and Loizou, Robotics
+2021, 10, 126). Matplotlib is imported when a figure is drawn, and only its Agg canvas: no display
+is needed.
 """
 
 import html
@@ -39,7 +38,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 8.0,
     "legend.frameon": False,
 }
-# An axis shows at least so much, so that noise does not fill it: metres, degrees.
+# Least span of an axis, so that noise does not fill it: metres, degrees.
 _LEAST_DEPTH, _LEAST_RANGE, _LEAST_ANGLE = 0.2, 0.1, 6.0
 
 
@@ -82,7 +81,7 @@ def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
 
 
 def _motion(log: LoopLog) -> "Figure":
-    """As figure 22: depth, range, heading and target yaw."""
+    """Draw figure 22: depth, range, heading and target yaw."""
     figure, axes = _panels(3, 6.4)
     time_s = log.column("time_s")
     depth, ranges, angles = axes
@@ -102,7 +101,7 @@ def _motion(log: LoopLog) -> "Figure":
 
 
 def _control(log: LoopLog) -> "Figure":
-    """As figure 23: setpoint, measurement and command of both controllers."""
+    """Draw figure 23: setpoint, measurement and command of both controllers."""
     figure, axes = _panels(4, 8.0)
     time_s = log.column("time_s")
     _loop(axes[0], log, "range", 1.0)
@@ -188,7 +187,7 @@ SETTLED_S = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:
-    """What was simulated, in the words of the page."""
+    """Setup of the simulation, as text of the page."""
 
     vehicle: str
     current: float
@@ -207,7 +206,7 @@ class RunFacts:
 
 
 def summary(log: LoopLog) -> list[tuple[str, str]]:
-    """Return what a run came to, as names and values."""
+    """Return the results of a run, as names and values."""
     rows = log.rows
     start_s = SETTLED_S if rows[-1].time_s > 2.0 * SETTLED_S else 0.5 * rows[-1].time_s
     hold, safety = hold_measures(log, start_s), safety_measures(log)

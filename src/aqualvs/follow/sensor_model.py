@@ -1,6 +1,7 @@
-"""A scanner that is sampled instead of run: the true posture with noise, and with losses.
+"""Models of the scanner for simulated loops: sampled postures, or the scanner on rendered pictures.
 
-A scanner that is run on rendered pictures: every frame goes through the real pipeline.
+`SampledEye` gives the true posture with noise and losses. `RenderedEye` renders every frame and
+measures in it by the real pipeline.
 """
 
 import math
@@ -23,7 +24,7 @@ from aqualvs.simulation.net_motion import NetPosture, NetWall
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene
 
-# More than are under way from the exposure to the pilot.
+# More pictures than are in transit from the exposure to the pilot.
 _N_KEPT = 8
 
 
@@ -34,7 +35,7 @@ def net_scene(seed: int = 0) -> Scene:
 
 
 class RenderedEye:
-    """Renders what the camera sees from a vehicle, and measures in it.
+    """Sensor that renders the camera's picture from a vehicle, and measures in it.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ class RenderedEye:
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
-        """Return what the frame exposed now gives."""
+        """Return the result for the frame exposed now; None for a lost frame."""
         if self._planes is None or time_s < self._freeze_s:
             self._planes = self._rendered(world_from_dome, time_s)
         frame = Frame(self._n_frames, time_s, *self._planes)
@@ -101,13 +102,13 @@ class RenderedEye:
         return planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
 
 
-# What a posture of the example rig rests on, about.
+# Approximate number of inliers of a posture by the example rig.
 _N_POINTS = 400
 _GREATEST_ANGLE = math.radians(60.0)
 
 
 class Loss(StrEnum):
-    """How sight is lost."""
+    """Kind of loss of sight."""
 
     TARGET = "target"
     """Frames come, but nothing is measured in them."""
@@ -121,7 +122,7 @@ class Loss(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Blind:
-    """A stretch without a valid posture.
+    """Period without a valid posture.
 
     Attributes
     ----------
@@ -156,7 +157,7 @@ class PostureNoise:
 
 
 class SampledEye:
-    """Gives the true posture with noise.
+    """Sensor that gives the true posture with noise.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ class SampledEye:
     noise : PostureNoise, optional
         Defaults if left out.
     blind : sequence of Blind
-        Stretches without sight.
+        Periods without sight.
     working_range : (float, float)
         Outside of it nothing is measured, in metres.
     """
@@ -187,12 +188,12 @@ class SampledEye:
         self._last: Posture | Refusal | None = None
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
-        """Return what the frame exposed now gives."""
+        """Return the result for the frame exposed now; None for a lost frame."""
         self._last = self._look(self._net.posture_at(world_from_dome, time_s), time_s)
         return self._last
 
     def _look(self, truth: NetPosture, time_s: float) -> Posture | Refusal | None:
-        # Drawn in any case: the noise of a frame does not depend on what happened before.
+        # Always drawn: the noise of a frame does not depend on earlier frames.
         draws = self._rng.normal(size=3)
         wild = self._rng.uniform() < self._noise.outliers
         blind = next((one for one in self._blind if one.start_s <= time_s < one.end_s), None)

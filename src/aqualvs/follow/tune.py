@@ -1,6 +1,6 @@
-"""`aqualvs tune`: gains for a vehicle, with the margins they leave and a step in the simulator.
+"""The command `aqualvs tune`: gains for a vehicle, their margins, and a step of the range.
 
-A step of the range in the simulator: what tuning promises, tried on the whole vehicle.
+The step is simulated with the whole vehicle, to test what the linear model of tuning promises.
 """
 
 import math
@@ -22,7 +22,7 @@ from aqualvs.simulation.vehicle.models import VEHICLES, VehicleModel
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle, level_pose
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
 
-# The wall stands across north, so far from the origin; the vehicle is so deep, in metres.
+# Distance of the wall north of the origin, and depth of the vehicle, in metres.
 _WALL, _DEPTH = 5.0, 5.0
 _REST_S, _AFTER_S = 6.0, 12.0
 _BAND = 0.05
@@ -30,7 +30,7 @@ _BAND = 0.05
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """What is tried.
+    """Options of the simulated step.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class StepOptions:
 
 @dataclass(frozen=True, slots=True)
 class StepAnswer:
-    """What came of it.
+    """Response to the step.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneRequest:
-    """What the command line asks for.
+    """Request of the command line.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
-    """Return what to say of gains: margins at both delays, as it is and at worst; steps."""
+    """Return the report on gains: margins at both delays, nominal and worst case; steps."""
     usual, most = options.delay, options.greatest_delay
     lines = [
         f"{model.name}: margins with the model as it is, and in the worst corner (mass "

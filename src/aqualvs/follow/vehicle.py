@@ -1,6 +1,6 @@
-"""`aqualvs follow SOURCE`: hold and follow with a real vehicle.
+"""The command `aqualvs follow SOURCE`: hold and follow with a real vehicle, with a log.
 
-The log of a real dive under control; the disk never holds the pilot up.
+A thread of its own writes the log, so that the disk never delays the pilot.
 """
 
 import contextlib
@@ -43,12 +43,12 @@ _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 
 
 class FollowLogOutput:
-    """Writes what the pilot did, step by step; comes after the pilot among the outputs.
+    """Writer of the pilot's steps; comes after the pilot among the outputs.
 
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
     pilot : Pilot
 
     Raises
@@ -70,7 +70,7 @@ class FollowLogOutput:
         self._thread.start()
 
     def send(self, sample: LiveSample) -> None:
-        """Take in the pilot's last step; returns at once."""
+        """Take the pilot's last step; return at once."""
         report = self._pilot.latest
         if report is None or report is self._told:
             return
@@ -78,13 +78,13 @@ class FollowLogOutput:
         self._waiting.put((report, sample.scan.time_s, sample.scan.posture))
 
     def health(self) -> PartHealth:
-        """Return whether it can be written."""
+        """Return whether the log can be written."""
         if self._trouble:
             return PartHealth(self.name, State.FAULT, self._trouble)
         return PartHealth(self.name, State.OK)
 
     def close(self) -> None:
-        """Write what is left and close the file; further calls do nothing."""
+        """Write the remaining rows and close the file; further calls do nothing."""
         if self._thread.is_alive():
             self._waiting.put(None)
             self._thread.join(2.0)
@@ -103,7 +103,7 @@ class FollowLogOutput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FollowRequest:
-    """What to steer, and by what.
+    """Request to steer a vehicle.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ class FollowRequest:
 def follow_and_tell(
     request: FollowRequest, tell: Callable[[str], object], keys: TextIO | None = None
 ) -> int:
-    """Run until the source ends or somebody stops it; returns 0.
+    """Run until the source ends or the user stops it; return 0.
 
     It starts disengaged: a line on `keys` (the terminal) engages or disengages.
 
@@ -192,13 +192,13 @@ def _runner(
     holder: SetpointHolder,
     tell: Callable[[str], object],
 ) -> LiveRunner:
-    """Make the live loop; what was made before a part that fails is closed."""
+    """Make the live loop; if a part fails, the parts made before it are closed."""
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
         undo.callback(pilot.close)
         feed = request.feed.opened(request.source, realtime=True)
         undo.callback(feed.close)
-        # The pilot first: what others do must not hold an effort up.
+        # The pilot first: other outputs must not delay an effort.
         outputs: list[Output] = [pilot, MavlinkOutput(link)]
         outputs.append(FollowLogOutput(request.out / FOLLOW_CSV, pilot))
         undo.callback(outputs[-1].close)

@@ -1,8 +1,7 @@
-"""`aqualvs live`: from a stream to pilot, autopilot and log.
+"""The command `aqualvs live`: from a stream to pilot, autopilot and recording.
 
-Following the water's index beside a live run, so that no frame waits for it.
-
-What a live run says in the terminal: one line that stays, or a line now and then in a log.
+`WaterFollower` tracks the water's refractive index in a thread of its own, so that no frame waits
+for it. `Console` reports in the terminal: a status line that stays, or occasional lines in a log.
 """
 
 import math
@@ -39,7 +38,7 @@ _PATIENCE_S = 3.0
 
 
 class WaterFollower:
-    """Supplies the scanner for the water as it is known, from a thread that reads the target.
+    """Provider of the scanner for the present water; a thread reads the target.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class WaterFollower:
         return self._sigma
 
     def offer(self, frame: Frame) -> None:
-        """Have a frame looked at when it is due and nobody is looking."""
+        """Pass on a frame for reading the target, when one is due and the thread is idle."""
         if self._following.is_due(frame) and self._frames.empty():
             self._frames.put_nowait(frame)
 
@@ -89,7 +88,7 @@ _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
 
 
 class Console:
-    """An output for whoever started the run.
+    """Output to the terminal of the user who started the run.
 
     Parameters
     ----------
@@ -161,13 +160,13 @@ def status_line(sample: LiveSample) -> str:
     return f"{told}  | {health.rate_hz:.0f} Hz{delay}{dropped}"
 
 
-# Threads wait for the interpreter at most so long; Python's own 5 ms would show in the delays.
+# Longest wait of a thread for the interpreter; Python's default of 5 ms would show in the delays.
 SWITCH_S = 0.0005
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeedRequest:
-    """How the source shall deliver, where it has a choice; see `open_feed`.
+    """Request for the delivery of a source, where it has a choice; see `open_feed`.
 
     Attributes
     ----------
@@ -213,7 +212,7 @@ def _size_px(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveRequest:
-    """What to run live.
+    """Request for a live run.
 
     Attributes
     ----------
@@ -238,7 +237,7 @@ class LiveRequest:
     water : Water
     scanner : ScannerOptions
     index_target : Path or None
-        Markers on the vehicle that tell the water's index.
+        Markers on the vehicle that show the water's index.
     """
 
     source: str
@@ -258,7 +257,7 @@ class LiveRequest:
 
 
 def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
-    """Run until the source ends or somebody stops it, which is how live runs end; returns 0.
+    """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises
     ------
@@ -310,7 +309,7 @@ def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> l
 
 
 def recorder_options(scanner: ScannerOptions, *, video: bool) -> RecorderOptions:
-    """Return what recordings hold: with `video` the pictures, too."""
+    """Return the options of recordings; with `video`, pictures are included."""
     return RecorderOptions(pictures=PictureFormat.JPEG if video else None, scanner=scanner)
 
 

@@ -1,10 +1,8 @@
-"""Keeps account of how a live run goes.
+"""Health of a live run: rates, delays, lasers that moved, and frozen pictures.
 
-Notice a picture that stands still while its time stamps run on.
-
-Encoders and capture cards repeat their last picture when the camera fails; the stream looks alive.
-
-Watching for a laser that has moved, beside the live loop: a verdict takes its time.
+`FrozenPicture` detects a picture that stands still while its time stamps run on: encoders and
+capture cards repeat their last picture when the camera fails, and the stream looks alive.
+`DriftWatch` detects a laser that has moved, in a thread of its own, because its test takes long.
 """
 
 import itertools
@@ -27,21 +25,21 @@ from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import ImagePlane, Scan
 from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 
-# Means over cells of so many pixels a side; every fourth row of cells is looked at.
+# Side of a cell in pixels; every fourth row of cells is compared.
 _CELL, _EVERY = 8, 4
 _ONES = np.ones(_CELL, np.float32)
-# Stripes of lasers fill a hundredth of a picture and more.
+# Laser stripes fill at least a hundredth of a picture.
 _QUANTILE = 0.99
-# Changes of a live picture that are kept, and how many are needed to know what is usual.
+# Number of stored changes of a live picture, and the least number for their quantile.
 _N_KEPT, _N_KNOWN = 250, 25
 _USUAL = 0.05
-# A stream that has been away for so long begins anew, in seconds.
+# A stream that returns after this time counts as a new one, in seconds.
 _GAP_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrozenOptions:
-    """When a picture counts as frozen.
+    """Thresholds by which a picture counts as frozen.
 
     Attributes
     ----------
@@ -49,8 +47,8 @@ class FrozenOptions:
         Pictures so far apart, in seconds, are compared: long enough for cameras that repeat each
         picture two or four times, as they do in dim light.
     greatest : float
-        A greater change is never that of a frozen picture, in grey levels. What an encoder goes on
-        to improve in a still is less after 0.4 s.
+        A greater change is never that of a frozen picture, in grey levels. An encoder's
+        improvements of a still are less after 0.4 s.
     least : float
         A smaller change is always that of a frozen picture, in grey levels.
     share : float
@@ -64,7 +62,7 @@ class FrozenOptions:
     share: float = 0.65
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse impossible values.
 
         Raises
         ------
@@ -78,12 +76,12 @@ class FrozenOptions:
 
 
 class FrozenPicture:
-    """Compares each picture of a stream with one a quarter of a second older.
+    """Detector of frozen pictures: compares each with one a quarter of a second older.
 
     The statistic is the 99 % quantile, over cells of 8 x 8 pixels in a quarter of the rows, of how
-    much a cell's mean luma has changed. Means tell motion, and noise of the sensor, from what an
-    encoder does to a still: it adds detail to the cells and leaves their means. A stripe that moves
-    by a thirtieth of a pixel changes its cells by half a grey level.
+    much a cell's mean luma has changed. Means separate motion, and noise of the sensor, from the
+    encoder's changes of a still: it adds detail to the cells and leaves their means. A stripe that
+    moves by a thirtieth of a pixel changes its cells by half a grey level.
 
     Parameters
     ----------
@@ -162,7 +160,7 @@ class FrozenPicture:
         elif math.isnan(self._moved_s):
             self._moved_s = time_s
         elif time_s - self._moved_s > self.options.span_s:
-            # A key frame changes a still once: it is in the comparison for one span.
+            # A key frame changes a still once, so it affects the comparison for one span.
             self._since_s = self._moved_s = math.nan
 
 
@@ -186,7 +184,7 @@ _VERDICT_EVERY_S, _PATIENCE_S = 5.0, 3.0
 
 
 class DriftWatch:
-    """Judges the lasers every few seconds, in a thread of its own.
+    """Detector of lasers that moved: tests every few seconds, in a thread of its own.
 
     Parameters
     ----------
@@ -211,7 +209,7 @@ class DriftWatch:
             self._thread.start()
 
     def offer(self, scan: Scan) -> None:
-        """Pass a scan on; one that finds the thread busy is not missed."""
+        """Pass a scan on; scans are skipped while the thread is busy."""
         if self._thread is not None and not self._scans.full():
             self._scans.put_nowait(scan)
 
@@ -240,7 +238,7 @@ def _agreement_of(rig: Rig) -> LaserAgreement | None:
     try:
         return LaserAgreement(rig)
     except RigError:
-        # What the rig says of its own uncertainty does not parse; measuring does not need it.
+        # The rig's uncertainty cannot be parsed; measuring does not need it.
         return None
 
 
@@ -252,19 +250,19 @@ def _off(agreement: LaserAgreement) -> dict[int, str]:
 
 
 WINDOW_S = 5.0
-"""Rates and delays are those of so many last seconds."""
+"""Time over which rates and delays are taken, in seconds."""
 
 STAGES = ("wait", "measure", "send", "total")
-"""From the decoded frame to the moment the measuring thread takes it; the measurement; the sending
-to outputs that never wait; all of it."""
+"""Delay from the decoded frame until the measuring thread takes it; of the measurement; of sending
+to outputs that never wait; and of all of it."""
 
-# A laser that shows nothing on the target for so long, while others do, is off or covered.
+# A laser without points on the target for this time, while others have some, is off or covered.
 _DARK_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Passed:
-    """What is kept of one frame."""
+    """Figures kept of one frame."""
 
     at_ns: int
     valid: bool
@@ -273,7 +271,7 @@ class _Passed:
 
 
 class HealthMonitor:
-    """Gathers figures frame by frame; `health` is cheap.
+    """Health statistics, gathered frame by frame; `health` is cheap.
 
     Parameters
     ----------

@@ -1,10 +1,8 @@
-"""From the words of the command line to the outputs of a live run.
+"""Options of a live run: outputs, the vehicle file, and the pilot's page.
 
-The vehicle file: who the vehicle is on MAVLink, how it is steered, and who must be there.
-
-From the words of the command line to a vehicle on MAVLink.
-
-The pilot's page of `aqualvs live` and `follow`, where its packages are installed.
+The vehicle file states the vehicle's MAVLink identity, how it is steered, and which ground station
+must be present. `vehicle_setup` combines it with the command line. `serve_page` serves the pilot's
+page of `aqualvs live` and `follow`, if its packages are installed.
 """
 
 import math
@@ -54,7 +52,7 @@ class VehicleFile(Part):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleSetup:
-    """What a vehicle file says.
+    """Contents of a vehicle file.
 
     Attributes
     ----------
@@ -68,7 +66,7 @@ class VehicleSetup:
 
 
 def load_vehicle(path: Path) -> VehicleSetup:
-    """Return what a vehicle file says; its key file is looked for beside it.
+    """Return the contents of a vehicle file; its key file is looked for beside it.
 
     Raises
     ------
@@ -129,7 +127,7 @@ FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputRequest:
-    """Which outputs a live run has; all are off by default.
+    """Request for outputs of a live run; all are off by default.
 
     Attributes
     ----------
@@ -232,7 +230,7 @@ def serve_page(
     recorder: RecorderSwitch | None,
     tell: Callable[[str], object],
 ) -> Output:
-    """Serve the page and tell its address.
+    """Serve the page and print its address.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
-"""The output that closes the loop: each sample becomes an effort, or none.
+"""The output that closes the control loop: each sample becomes an effort, or none.
 
-Stops the thrusters when the loop that steers them does not come round.
-
-What the pilot's page and the health list show of the pilot that aqualvs is.
+`Watchdog` stops the thrusters when no new effort comes in time. `PilotReport` describes each step
+for the pilot's page and the health list.
 """
 
 import logging
@@ -27,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """Passes efforts on, and sends neutral after one that nobody renews.
+    """Watchdog of efforts: passes them on, and sends neutral after one that is not renewed.
 
     Neither a frame that takes seconds to measure nor a controller that hangs must leave thrust
     standing; the vehicle's own fail-safe comes later, and does not act while others send it sticks.
@@ -36,7 +35,7 @@ class Watchdog:
     ----------
     vehicle : VehicleLink
     patience_s : float
-        So long an effort may stand.
+        Time that an effort may stay in force.
 
     Attributes
     ----------
@@ -46,7 +45,7 @@ class Watchdog:
 
     def __init__(self, vehicle: VehicleLink, patience_s: float) -> None:
         self._vehicle, self._patience_s = vehicle, patience_s
-        # Only ever held for a call that returns at once, so that nothing can keep neutral back.
+        # Held only for calls that return at once, so that nothing can delay neutral.
         self._sending = threading.Lock()
         self._known_s = float("-inf")
         self._thrusting = threading.Event()
@@ -56,13 +55,13 @@ class Watchdog:
         self._thread.start()
 
     def send(self, effort: Effort, known_s: float) -> Effort:
-        """Send an effort, or neutral in its place if it is too old already; return what was sent.
+        """Send an effort, or neutral if it is already too old; return the sent effort.
 
         Parameters
         ----------
         effort : Effort
         known_s : float
-            When what it rests on was known, by `time.monotonic`.
+            Time at which its posture was known, by `time.monotonic`.
 
         Raises
         ------
@@ -73,7 +72,7 @@ class Watchdog:
             if time.monotonic() - known_s > self._patience_s:
                 effort = NEUTRAL
             self._known_s = known_s
-            # Before it is sent: one that went out in spite of an error is stopped all the same.
+            # Before sending: an effort that was sent despite an error is stopped all the same.
             if effort == NEUTRAL:
                 self._thrusting.clear()
             else:
@@ -137,7 +136,7 @@ class PilotReport:
     guidance : Guidance
         What the mission wants.
     state : VehicleState
-        What the vehicle told.
+        As the vehicle reported it.
     """
 
     at_ns: int
@@ -150,20 +149,20 @@ class PilotReport:
 
     @property
     def words(self) -> str:
-        """What it does, or why it does not, in one line."""
+        """Action of the pilot, or the reason for none, in one line."""
         told = words_of(self.reason, self.state) if self.reason else _aim(self.guidance)
         return f"{told}; {self.state.doubt}" if self.engaged and self.state.doubt else told
 
     @property
     def colour(self) -> State:
-        """How it is, for the health list."""
+        """State for the health list."""
         if not self.engaged:
             return State.OFF
         return State.WARN if self.reason or self.state.doubt else State.OK
 
 
 def words_of(reason: Reason, state: VehicleState) -> str:
-    """Return why efforts do not pass, with what the vehicle says of it."""
+    """Return the reason why efforts do not pass, with the vehicle's report of it."""
     told = state.mode_name if reason in _TELL_MODE else ""
     if reason is Reason.CONFLICT and state.mode is not Mode.CONFLICT:
         told = state.rival
@@ -171,7 +170,7 @@ def words_of(reason: Reason, state: VehicleState) -> str:
 
 
 def _aim(guidance: Guidance) -> str:
-    """Return what a mission aims at."""
+    """Return the aim of a mission."""
     setpoint = guidance.setpoint
     if setpoint is None:
         return guidance.stage.value.replace("_", " ")
@@ -180,12 +179,12 @@ def _aim(guidance: Guidance) -> str:
     return f"{guidance.stage.value.replace('_', ' ')}: {aim}{sway}"
 
 
-# Datagrams may be lost. A pilot who holds his sticks is not to be disturbed: one will do.
+# Several, as datagrams may be lost; only one while the pilot moves his sticks, not to disturb him.
 _GOODBYES, _GOODBYES_TO_STICKS = 3, 1
 
 
 class Pilot:
-    """Steers a vehicle by what the lasers see, as an output of a live run.
+    """Output of a live run that steers a vehicle by the measured posture.
 
     It starts disengaged and sends nothing. `engage` lets efforts pass; a mode change, the pilot's
     sticks, disarming and a silent vehicle end that until `engage` is called again. Then neutral
@@ -233,7 +232,7 @@ class Pilot:
         return self._latest
 
     def engage(self) -> None:
-        """Take over, as somebody wants it.
+        """Engage on request of the user.
 
         Raises
         ------
@@ -262,7 +261,7 @@ class Pilot:
         _log.info("pilot: disengaged")
 
     def send(self, sample: LiveSample) -> None:
-        """Take one step; never waits, and never raises for what control or vehicle do."""
+        """Take one step; never waits, and never raises faults of control or vehicle."""
         with self._stepping:
             now_s = time.monotonic()
             try:
@@ -284,7 +283,7 @@ class Pilot:
         self._tell(self._latest)
 
     def health(self) -> PartHealth:
-        """Return what the pilot does, or why it does not."""
+        """Return the pilot's action, or the reason for none."""
         trouble = self._fault or self._unsent
         if trouble:
             return PartHealth(self.name, State.FAULT, trouble, self._n_unsent)
@@ -303,7 +302,7 @@ class Pilot:
         self._vehicle.close()
 
     def _begin(self) -> tuple[Reason | None, VehicleState]:
-        """Let control begin; return why not, and what the vehicle told."""
+        """Start control; return the reason if it cannot start, and the vehicle's state."""
         try:
             state = self._vehicle.state()
             return self._steering.engage(time.monotonic(), state), state
@@ -324,7 +323,7 @@ class Pilot:
         )
 
     def _present(self, sample: LiveSample, now_s: float) -> Posture | Refusal:
-        """Return the posture, unless measuring took so long that it is one no more."""
+        """Return the posture, unless measuring took so long that it is outdated."""
         posture, arrived_s = sample.scan.posture, 1e-9 * sample.instants.arrived_ns
         if not posture:
             return posture
@@ -334,7 +333,7 @@ class Pilot:
         return posture
 
     def _obey(self, decision: Decision) -> Effort:
-        """Send what was decided; return what went out."""
+        """Send the decided effort; return the sent one."""
         if decision.engaged:
             self._goodbyes = -1
             return self._send(decision.effort)
@@ -347,7 +346,7 @@ class Pilot:
         return NEUTRAL
 
     def _send(self, effort: Effort) -> Effort:
-        """Send an effort that rests on the last posture; return what went out."""
+        """Send an effort that rests on the last posture; return the sent one."""
         try:
             sent = self._watchdog.send(effort, self._seen_s)
         except (OSError, ValueError) as fault:
@@ -358,7 +357,7 @@ class Pilot:
         return sent
 
     def _give_up(self, fault: Exception) -> None:
-        """Stop after what control has raised, until somebody engages again."""
+        """Stop after an exception of control, until engaged again."""
         words = f"stopped by a fault: {fault}"
         if words != self._fault:
             _log.exception("pilot: %s", words)
@@ -382,7 +381,7 @@ class Pilot:
         return self._holder is not None and self._holder.setpoint is not None
 
     def _tell(self, report: PilotReport) -> None:
-        """Log what has changed."""
+        """Log changes."""
         told = (report.engaged, report.reason, report.state.doubt)
         if told == self._told:
             return

@@ -1,12 +1,13 @@
-"""The live loop: the latest frame in, a sample to every output; nothing stops it but its owner.
+"""The live loop: it measures the latest frame and hands a sample to every output.
 
-Making a scanner ready, so that the first frame of a stream does not wait for it.
+Only its owner ends the loop; faults of frames and outputs do not.
 
-Runs one output so that whatever happens to it disturbs nothing else.
-
-Handing frames from the thread that decodes to the one that measures, without adding delay.
-
-The thread that moves frames from a feed to the mailbox.
+- `FrameReader`: the thread that reads the feed and puts frames into the mailbox.
+- `Mailbox`: room for the latest frame, from the decoding thread to the measuring one, without
+  adding delay.
+- `LiveRunner`: the loop itself; `warm_up` loads the compiled kernels before it starts, so that the
+  first frame does not wait.
+- `OutputWorker`: a thread for each output, so that its faults do not affect anything else.
 """
 
 import logging
@@ -70,14 +71,14 @@ def wall_frame(rig: Rig) -> Frame:
     return Frame(0, 0.0, luma, (u, np.full_like(u, 110)))
 
 
-# Samples that a recorder may be behind, which keep their pictures: 300 MB at 1920x1080.
+# Samples that may wait for a recorder, with their pictures: 300 MB at 1920x1080.
 _QUEUE = 100
 _PATIENCE_S = 5.0
 _log = logging.getLogger(__name__)
 
 
 class OutputWorker:
-    """Hands samples to an output, in a thread of its own unless the output never waits.
+    """Worker of one output: a thread of its own, unless the output never waits.
 
     Parameters
     ----------
@@ -104,7 +105,7 @@ class OutputWorker:
         return self._output.name
 
     def offer(self, sample: LiveSample) -> None:
-        """Pass a sample on; returns at once."""
+        """Pass a sample on; return at once."""
         if self._thread is None:
             self._send(sample)
             return
@@ -116,7 +117,7 @@ class OutputWorker:
             self._changed.notify()
 
     def health(self) -> PartHealth:
-        """Return how the output is, with what could not be handed to it."""
+        """Return the state of the output, with the number of dropped samples."""
         try:
             found = self._output.health()
         except Exception as fault:
@@ -129,7 +130,7 @@ class OutputWorker:
         return replace(found, n_dropped=found.n_dropped + self._n_dropped)
 
     def close(self) -> None:
-        """Let what waits go out, for a few seconds at most, and close the output."""
+        """Send waiting samples, for a few seconds at most, and close the output."""
         if self._thread is not None:
             with self._changed:
                 self._closing = True
@@ -192,7 +193,7 @@ class Mailbox:
     Attributes
     ----------
     n_dropped : int
-        Frames that were replaced by a newer one before anybody took them.
+        Frames that were replaced by a newer one before they were taken.
     """
 
     def __init__(self, *, keep_every: bool = False) -> None:
@@ -237,12 +238,12 @@ class Mailbox:
 
 # A feed promises to end within a second of being closed.
 _READER_PATIENCE_S = 3.0
-# After a fault that nobody foresaw the feed is begun again.
+# After an unexpected exception the feed is restarted.
 _AGAIN_S = 1.0
 
 
 class FrameReader:
-    """Reads a feed in a thread of its own; a context manager.
+    """Reader of a feed in a thread of its own; a context manager.
 
     Parameters
     ----------
@@ -297,7 +298,7 @@ class FrameReader:
                     self.fault = fault
                     return None
                 except Exception as fault:
-                    # The thread must not die without a word: the pilot would see an old picture.
+                    # The thread must not die silently: the pilot would see an old picture.
                     _log.exception("%s: reading failed; trying again", self._feed.name)
                     self._trouble = f"{type(fault).__name__}: {fault}"
                     self._closing.wait(_AGAIN_S)
@@ -314,12 +315,12 @@ class FrameReader:
             self._mailbox.put(frame)
 
 
-# How often a silent stream is told to the outputs, and a request to stop is looked for.
+# Period of samples that report a silent stream, and of checks for a request to stop.
 _SILENT_EVERY_S, _LOOK_EVERY_S, _HEALTH_EVERY_S = 0.1, 0.05, 0.1
 
 
 class ScannerSupply(Protocol):
-    """Gives the scanner to measure with; another one as the water's index is followed."""
+    """Provider of the scanner, which changes as the water's index is tracked."""
 
     @property
     def scanner(self) -> Scanner:
@@ -337,7 +338,7 @@ class ScannerSupply(Protocol):
 
 
 class FixedScanner:
-    """Always the same scanner.
+    """Provider of always the same scanner.
 
     Parameters
     ----------
@@ -357,14 +358,14 @@ class FixedScanner:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
-    """How the loop runs.
+    """Options of the live loop.
 
     Attributes
     ----------
     stale_after_s : float
-        A stream that is silent for so long has no posture any more.
+        A stream that is silent for this time has no posture any more.
     keep_every : bool
-        Measure every frame, whatever delay that adds: for files.
+        Measure every frame regardless of the delay: for files.
     frozen : FrozenOptions or None
         When a picture counts as frozen, and has no posture; None where none does.
     """
@@ -375,7 +376,7 @@ class LiveOptions:
 
 
 class LiveRunner:
-    """Measures a feed as it comes and hands the answers on.
+    """Live loop: measures a feed as it comes and passes the results to the outputs.
 
     Parameters
     ----------
@@ -403,7 +404,7 @@ class LiveRunner:
         self._mailbox = Mailbox(keep_every=self._options.keep_every)
         self._reader = FrameReader(feed, self._mailbox)
         self._monitor = HealthMonitor(supply.scanner.rig)
-        # Those that never wait come first: waking a thread takes longer than a datagram.
+        # Outputs that never wait come first: waking a thread takes longer than a datagram.
         ordered = sorted(outputs, key=lambda output: not output.inline)
         self._workers = [OutputWorker(output) for output in ordered]
         frozen = self._options.frozen
@@ -414,7 +415,7 @@ class LiveRunner:
         self._health, self._health_ns = Health(), 0
 
     def run(self, stop: Callable[[], bool]) -> AqualvsError | None:
-        """Run until the feed ends or `stop` returns True; returns what ended the feed, if a fault.
+        """Run until the feed ends or `stop` returns True; return the fault that ended the feed.
 
         Whatever fails meanwhile is logged and shown in the samples' health.
         """
@@ -435,7 +436,7 @@ class LiveRunner:
         return self._reader.fault
 
     def health(self) -> Health:
-        """Return how the run goes; figures are at most a tenth of a second old."""
+        """Return the health of the run; figures are at most a tenth of a second old."""
         now_ns = time.monotonic_ns()
         if now_ns - self._health_ns > 1e9 * _HEALTH_EVERY_S:
             self._health_ns = now_ns

@@ -1,4 +1,4 @@
-"""Recording of dives as MCAP files that are readable whenever the writing ends."""
+"""Recordings of dives as MCAP files that stay readable however the writing ends."""
 
 from aqualvs.recording.encoding import PictureFormat
 from aqualvs.recording.messages import RecorderOptions

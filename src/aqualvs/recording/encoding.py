@@ -1,14 +1,12 @@
-"""The topics of a recording and the definitions of their messages, in ROS 2's language.
+"""Topics and message definitions of a recording, and the encoding of its messages (CDR).
 
-Pictures in a recording: JPEG, small; or PNG of the planes as they are, without loss.
+Definitions are in the message language of ROS 2. CDR, its encoding, is little-endian here, and
+implemented as far as these messages need it: primitives are aligned to multiples of their size,
+counted from the end of the four bytes at the start of every message. A sequence is its length as
+uint32, then its elements; an empty one has no gap after its length.
 
-A rig and the scanner's options as a recording keeps them.
-
-ROS 2's encoding of messages (CDR, little endian) as far as our messages need it.
-
-Primitives lie at multiples of their size, counted from the end of the four bytes that every message
-begins with. A sequence is its length as uint32, then its elements; an empty one has no gap after
-its length.
+Pictures are JPEG (small) or PNG of the planes as they are (lossless). The rig is recorded as the
+text of its file and its exact numbers; the scanner's options as JSON.
 """
 
 import json
@@ -37,7 +35,7 @@ from aqualvs.scanning.target import TargetKind
 from aqualvs.sources.base import bgr_of
 from aqualvs.yamlfile import parse_yaml, rig_text
 
-# Noise leaves little to a search for what repeats: runs alone are smaller, and no slower.
+# In noise a search for repetitions finds little: run-length coding is smaller and no slower.
 _PNG = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
@@ -45,7 +43,7 @@ _PNG = [
 
 
 class PictureFormat(StrEnum):
-    """How pictures are kept."""
+    """Format of recorded pictures."""
 
     JPEG = "jpeg"
     PNG = "png"
@@ -109,7 +107,7 @@ def rig_yaml(rig: Rig) -> str:
 
 
 def rig_exact(rig: Rig) -> str:
-    """Return what a rig file rounds, as JSON, whose numbers lead back to the same bits."""
+    """Return the exact values of the numbers that a rig file rounds, as JSON."""
     pose, dome = rig.dome_from_cam, rig.dome
     found = {
         "rotation": pose.rotation.tolist(),
@@ -176,7 +174,7 @@ def options_from_text(text: str) -> ScannerOptions:
     found = json.loads(text)
     detector = dict(found["detector"])
     kind = {"ridge": StripeOptions, "threshold": ThresholdOptions}[detector.pop("kind")]
-    # Recordings of 0.1.0 name the gate on colour that likelihoods have replaced.
+    # Recordings of 0.1.0 contain the option of a colour gate, since replaced by likelihoods.
     detector.pop("min_green_fall", None)
     mesh = found["mesh_filter"]
     return ScannerOptions(
@@ -210,7 +208,7 @@ _NS = 1_000_000_000
 
 
 class CdrWriter:
-    """Puts values together, in the order of the message's fields."""
+    """Writer of a CDR message, field by field in their order."""
 
     def __init__(self) -> None:
         self._content = bytearray(_HEAD)
@@ -255,7 +253,7 @@ class CdrWriter:
 
 
 class CdrReader:
-    """Takes a message apart, in the order of its fields.
+    """Reader of a CDR message, field by field in their order.
 
     Parameters
     ----------
@@ -341,7 +339,7 @@ class Topic:
 
 
 def _definition(own: str, *parts: tuple[str, str]) -> str:
-    """Return a definition with those of its parts, as ROS 2's recordings have them."""
+    """Return a definition with those of its parts, in the form of ROS 2's recordings."""
     line = 80 * "=" + "\n"
     return "".join([own, *(f"{line}MSG: {name}\n{text}" for name, text in parts)])
 

@@ -1,25 +1,25 @@
-"""An MCAP file that is complete after every single step of writing it.
+"""An MCAP file that is valid after every single write, and the compressed chunks appended to it.
 
 The format ends in a summary and a footer, so a file that is merely appended to cannot be read until
-it has been closed. This one always has them. Its size runs ahead of the data:
+it has been closed. This file always has both. Its size runs ahead of the data:
 
 ::
 
     header, schemas, chunks | padding ........ | data end, summary | padding ..... | footer
                             ^ frontier                             ^ tail
 
-What is new goes into a padding, where no reader looks, all but its first nine bytes, and a smaller
-padding behind it. Then the nine bytes that were the old padding's head are replaced. They never
-straddle a page, and a system copies within a page in one go: whoever reads the file, and whenever
-the process is killed, sees the record whole or not at all. The summary's records are added in the
-same way. When one of the paddings is used up the file is made longer by its new footer alone, in
-one write behind a hole; that footer belongs to a second copy of the summary, because a footer in
-the middle of a summary is no valid file. Holes take no place on the disk.
+New data, except for its first nine bytes, is written into a padding, where no reader looks,
+together with the smaller padding behind it. Then the nine bytes that were the old padding's head
+are replaced. They never straddle a page, and a system copies within a page in one go: every reader,
+and every end of the process, finds the record whole or not at all. The summary's records are added
+in the same way. When one of the paddings is used up, the file is made longer by its new footer
+alone, in one write behind a hole; that footer belongs to a second copy of the summary, because a
+footer in the middle of a summary is no valid file. Holes take no space on the disk.
 
-After a loss of power the order in which pages reached the disk counts, and what was written since
-the last `sync` may be torn; `reader.py` leaves out chunks whose checksum is wrong.
+After a loss of power the order in which pages reached the disk counts, and data written since the
+last `sync` may be torn; `McapFile` leaves out chunks whose checksum is wrong.
 
-Chunks: messages of about half a second, compressed together.
+A `Chunk` holds the messages of about half a second, compressed together.
 """
 
 import contextlib
@@ -84,7 +84,7 @@ class Chunk:
 
 
 class ChunkBuilder:
-    """Gathers messages; `seal` compresses them."""
+    """Builder of a chunk: gathers messages; `seal` compresses them."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -103,7 +103,7 @@ class ChunkBuilder:
         self.n_bytes += len(parts[0]) + len(parts[1])
 
     def seal(self) -> Chunk:
-        """Return the chunk of what was gathered: at least one message."""
+        """Return the chunk of the gathered messages, at least one."""
         raw = b"".join(self._parts)
         packed = _codec().compress(raw, asbytes=True)
         times = [entries[end][0] for entries in self._entries.values() for end in (0, -1)]
@@ -130,10 +130,10 @@ def _codec() -> Any:
 
 
 PAGE = 4096
-# Room for chunks, and for their index records, that the file gets at least when it is made longer.
+# Least room for chunks, and for their index records, added when the file is made longer.
 _DATA_BYTES = 8 << 20
 _INDEX_BYTES = 1 << 16
-# For what rounding to pages takes.
+# Margin for rounding to pages.
 _SPARE_BYTES = 3 * PAGE
 # Copying the summary costs at most this share of what is written.
 _DATA_PER_SUMMARY = 8
@@ -204,16 +204,16 @@ class GrowingFile:
         self._make_room(len(chunk.content), len(index))
         self._frontier = self._insert(self._frontier, chunk.content, self._limit)
         self._note(chunk, index)
-        # The chunk is in the file; what cannot be listed now is listed by the next call.
+        # The chunk is in the file; the next call lists records that cannot be listed now.
         with contextlib.suppress(OSError):
             self._list_pending()
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk."""
+        """Wait until all written data are on the disk."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Cut off what the file has too much, and close it; further calls do nothing.
+        """Cut off the unused end of the file and close it; further calls do nothing.
 
         It is closed and readable in any case.
         """
@@ -268,7 +268,7 @@ class GrowingFile:
         self._unlisted.append(index)
 
     def _list_pending(self) -> None:
-        """Add what the summary lacks."""
+        """Add missing records to the summary."""
         while self._unlisted:
             limit = self._size - FOOTER_BYTES
             self._tail = self._insert(self._tail, self._unlisted[0], limit)
@@ -294,13 +294,13 @@ class GrowingFile:
         self._summary_at, self._tail, self._size, self._settled = at, tail, size, False
 
     def _size_for(self, size: int, n_data: int) -> int:
-        """Return the size of a file that is longer by what data and summary will need."""
+        """Return a file size with room for more data and their summary."""
         summary_bytes = self._summary_bytes()
         data_bytes = max(_DATA_BYTES, _DATA_PER_SUMMARY * summary_bytes) + n_data
         return _up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
 
     def _settle(self) -> None:
-        """Put the summary near the end of the file and free what is before it."""
+        """Move the summary near the end of the file and free the space before it."""
         at = _down(self._size - FOOTER_BYTES - self._summary_room())
         limit = at - DATA_END_BYTES
         # Zeros, not a hole: adding to the summary then needs no new place on the disk.
@@ -343,7 +343,7 @@ class GrowingFile:
         self._file.seek(at)
         rest = memoryview(content)
         while len(rest):
-            # A disk that fills up takes a part; the next try makes it say why.
+            # A disk that fills up takes a part; the next attempt raises the reason.
             rest = rest[self._file.write(rest) :]
 
 
@@ -366,7 +366,7 @@ def _publish(draft: Path, path: Path) -> None:
     except FileExistsError:
         raise
     except OSError:
-        # A file system without hard links, as memory cards have.
+        # A file system without hard links, as on memory cards.
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
         os.rename(draft, path)

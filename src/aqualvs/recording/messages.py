@@ -1,9 +1,7 @@
-"""Samples as messages, for the recording and for Foxglove; definitions are in `encoding.py`.
+"""Messages of a recording and of Foxglove, and their creation from samples.
 
-All of them are in the frame `dome`, with angles in degrees as every border has them. Numbers that
-do not exist are NaN.
-
-From samples to the messages of a recording.
+Their definitions are in `encoding.py`. All are in the frame `dome`, with angles in degrees, as
+everywhere outside the library. Numbers that do not exist are NaN.
 """
 
 import math
@@ -74,7 +72,7 @@ def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
 
 
 def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
-    """Return what was detected, bit for bit, or why nothing was measured."""
+    """Return the detected stripes, bit for bit, or the reason of a refusal."""
     scan, to = sample.scan, CdrWriter()
     refusal = scan.posture if not sample.returns and not scan.posture else None
     to.header(stamp_ns, FRAME_ID)
@@ -111,7 +109,7 @@ def stripes_of(
         axis = SearchAxis(of.text())
         line = of.array("u4").astype(np.int64)
         position, height, width, likelihood = (of.array("f8") for _ in range(4))
-        # Recordings of 0.1.0 hold levels here, of returns that had passed a gate; NaN if grey.
+        # Recordings of 0.1.0 hold levels here, of peaks that passed a colour gate; NaN if grey.
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
         returns[axis] = Returns(line, position, height, width, likelihood)
     return index, time_s, n_water, returns, Refusal(Reason(reason), detail) if reason else None
@@ -167,7 +165,7 @@ def rig_texts(rig: Rig, options: ScannerOptions) -> tuple[str, str, str]:
 
 
 def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
-    """Return what the run measures with, from `rig_texts`."""
+    """Return the message of rig and options, from `rig_texts`."""
     to = CdrWriter()
     to.header(stamp_ns, FRAME_ID)
     for words in texts:
@@ -263,14 +261,14 @@ def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
 
 
 _HEALTH_EVERY_NS = 1_000_000_000
-# The rig is told again after a second, then at intervals that double up to a minute, and at the
-# end: a part that is damaged, the first one too, takes no rig with it.
+# The rig is recorded again after a second, then at intervals that double up to a minute, and at the
+# end: so no damage, not even of the first part, loses the rig.
 _RIG_AGAIN_NS, _RIG_EVERY_NS = 1_000_000_000, 60_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecorderOptions:
-    """What is recorded, and how safely.
+    """Options of a recording: its contents, and how often it is written.
 
     Attributes
     ----------
@@ -309,7 +307,7 @@ class RecorderOptions:
 
 
 class SampleEncoder:
-    """Makes the messages of each sample.
+    """Encoder of samples as messages.
 
     Parameters
     ----------
@@ -352,7 +350,7 @@ class SampleEncoder:
         yield from self.rig_again(stamp_ns)
 
     def rig_again(self, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
-        """Yield the rig that was told last, to the same bit."""
+        """Yield the last recorded rig once more, bit for bit."""
         if self._rig_texts is not None:
             yield RIG, rig_message(self._rig_texts, stamp_ns)
 
@@ -385,7 +383,7 @@ class SampleEncoder:
 
 
 class RecordClock:
-    """Gives every sample a time that rises, whatever the system's clock does.
+    """Clock of a recording: its times rise, whatever the system's clock does.
 
     That of the first sample is the system's; from there on the monotonic clock counts.
 
@@ -409,6 +407,6 @@ class RecordClock:
 
 
 def _is_silence(sample: LiveSample) -> bool:
-    """Return whether a sample stands for no frame at all."""
+    """Return whether a sample reports a silent stream instead of a frame."""
     posture = sample.scan.posture
     return isinstance(posture, Refusal) and posture.reason is Reason.NO_FRAMES

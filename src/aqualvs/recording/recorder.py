@@ -1,8 +1,8 @@
-"""The recorder of a live run: an output that loses nothing and holds nobody up.
+"""Recorders of dives: for `aqualvs run`, for a live run, and switchable during a live run.
 
-A recording that is written in the caller's own time, as `aqualvs run` does it.
-
-Recording on and off while a run goes on.
+`Recording` writes in the caller's own time. `Recorder` is an output of a live run with a thread of
+its own: it loses nothing and blocks nobody. `RecorderSwitch` starts and stops such recorders while
+the run goes on.
 """
 
 import errno
@@ -27,7 +27,7 @@ MAX_CHUNK_BYTES = 4 << 20
 
 
 class SampleChunks:
-    """Gathers the messages of samples in a chunk until it is due.
+    """Chunk under construction: gathers the messages of samples until it is due.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class SampleChunks:
 
 
 class Recording:
-    """Writes samples to a file that is readable at any time.
+    """Writer of samples to a file that is readable at any time.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class Recording:
             self._flush()
 
     def close(self) -> None:
-        """Write what is left and close the file; further calls do nothing."""
+        """Write the remaining messages and close the file; further calls do nothing."""
         if self._closed:
             return
         self._closed = True
@@ -139,7 +139,7 @@ def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = No
     )
     return GrowingFile(
         path,
-        # The profile tells rosbag2 and its kin that the messages are ROS 2's.
+        # The profile identifies the messages as those of ROS 2, for rosbag2 and similar tools.
         front=mcap_file.MAGIC + mcap_file.header("ros2", f"aqualvs {__version__}") + repeated,
         repeated=repeated,
         n_schemas=len(TOPICS),
@@ -149,13 +149,13 @@ def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = No
 
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-# How often a disk that refused is tried again, and a chunk without company is looked at.
+# Period of retries on a full disk, and of checks for a chunk that is due.
 _RETRY_S, _LOOK_S = 2.0, 0.25
 _PATIENCE_S = 4.0
 
 
 class Recorder:
-    """Writes samples to a file that is readable at any time, by a thread of its own.
+    """Writer of samples by a thread of its own, to a file that is readable at any time.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class Recorder:
     Raises
     ------
     OutputError
-        If the file exists or cannot be begun. Later faults are told by `health`: what does not fit
+        If the file exists or cannot be begun. `health` reports later faults: what does not fit
         on the disk waits, as far as memory is granted, and is tried again.
     """
 
@@ -227,7 +227,7 @@ class Recorder:
         return PartHealth(self.name, State.OK, detail)
 
     def close(self) -> None:
-        """Write what is left and close the file; further calls do nothing."""
+        """Write the remaining messages and close the file; further calls do nothing."""
         with self._changed:
             if not self._closing:
                 self._chunks.finish()
@@ -322,7 +322,7 @@ def _words(fault: OSError) -> str:
 
 
 class RecorderSwitch:
-    """An output that records when told to; every start makes a file of its own.
+    """Output whose recording is switched on and off; every start makes a file of its own.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ class RecorderSwitch:
             recorder.send(sample)
 
     def health(self) -> PartHealth:
-        """Return how the recording is; off says what the last one was."""
+        """Return the state of the recording; when off, that of the last one."""
         recorder = self._recorder
         if recorder is not None:
             return recorder.health()

@@ -1,4 +1,4 @@
-"""A recorded dive, frame by frame, as the scanner found it."""
+"""A recorded dive, frame by frame, with the stripes that the scanner detected."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """What a recording holds of a frame.
+    """Frame as a recording holds it.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class DiveRecording:
         self.rig: Rig | None = None
         self.options: ScannerOptions | None = None
         self._no_rig = "its rig is in none of its undamaged parts; add --rig"
-        # Told every minute, the rig outlives the part that held it first.
+        # The rig is recorded every minute, so it survives the loss of the first part.
         stored = next(self._file.messages([RIG.name]), None)
         if stored is not None:
             self._read_rig(stored.data)

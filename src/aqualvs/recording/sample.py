@@ -1,4 +1,4 @@
-"""What a live run hands to its outputs, frame by frame."""
+"""Samples: the result of one frame of a live run, as passed to its outputs."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from aqualvs.sources.base import Health
 
 @dataclass(frozen=True, slots=True)
 class Instants:
-    """When a frame passed the stages, by `time.monotonic_ns`.
+    """Times at which a frame passed the stages, by `time.monotonic_ns`.
 
     Attributes
     ----------

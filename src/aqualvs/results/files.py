@@ -1,12 +1,13 @@
-"""What goes wrong with files and folders, in one line that names the remedy.
+"""Writing of files: append and replace without torn results, one-line errors, and overwriting.
 
-A file that grows by whole pieces: a piece is in it entirely, or not at all.
+`AppendFile` appends a piece entirely or not at all. Errors of the operating system become one line
+that names the remedy (`writing`, `explain`).
 
-The one rule for what commands replace: what they wrote themselves, and only when asked.
-
-Every folder notes in `.aqualvs.json` which command wrote which of its files, and the size and
-checksum that the file had. A file that is not noted there, or has changed since, belongs to the
-user: no option replaces it. Rig files follow a rule of their own: `save_rig` keeps a dated copy.
+`Claim` is the one rule for overwriting: commands replace only files that they wrote themselves, and
+only when asked. Every folder notes in `.aqualvs.json` which command wrote which of its files, and
+the size and checksum that the file had. A file that is not noted there, or has changed since,
+belongs to the user: no option replaces it. Rig files follow a rule of their own: `save_rig` keeps a
+dated copy.
 """
 
 import contextlib
@@ -25,7 +26,7 @@ from aqualvs.yamlfile import read_text
 
 try:
     import fcntl
-except ImportError:  # Windows locks open files by itself.
+except ImportError:  # Windows locks open files anyway.
     fcntl = None  # type: ignore[assignment]
 
 
@@ -38,7 +39,7 @@ class AppendFile:
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
     exclusive : bool
         Whether to raise `FileExistsError` where there is a file.
 
@@ -57,7 +58,7 @@ class AppendFile:
         rest = memoryview(piece)
         try:
             while len(rest):
-                # A disk that fills up takes a part; the next try makes it say why.
+                # A disk that fills up takes a part; the next attempt raises the reason.
                 rest = rest[self._file.write(rest) :]
         except OSError:
             self._take_back()
@@ -166,7 +167,7 @@ def read_json(path: Path) -> Any:
 
 
 def explain(path: Path, fault: OSError) -> str:
-    """Return what is wrong with `path` and what to do about it."""
+    """Return the fault of `path` and its remedy."""
     if fault.errno in _FULL:
         return (
             f"{path}: the disk is full ({fault.strerror}); what was written stays readable, "
@@ -177,15 +178,15 @@ def explain(path: Path, fault: OSError) -> str:
 
 
 RECORD = ".aqualvs.json"
-"""File in which a folder notes who wrote its files."""
+"""File of a folder that records which command wrote its files."""
 
 _WRITER, _MARK = "writer", "mark"
-# A video has gigabytes: its beginning and end, with the size, tell it from another.
+# A video has gigabytes: its beginning and end, with the size, identify it.
 _ENDS = 1 << 16
 
 
 class Claim(Closing):
-    """Files that a command is about to write; a context manager that notes what they became.
+    """Files that a command is about to write; a context manager that notes their checksums.
 
     A command that is killed leaves its files noted without a checksum: they stay its own.
 
@@ -230,7 +231,7 @@ class Claim(Closing):
                 _note(folder, {name: {_WRITER: writer, _MARK: None} for name in names})
 
     def close(self) -> None:
-        """Note what the files are now; call it when they are complete."""
+        """Note size and checksum of the files; call it when they are complete."""
         for folder, names in self._names.items():
             written = {
                 name: {_WRITER: self._writer, _MARK: _mark(folder / name)}
@@ -238,7 +239,7 @@ class Claim(Closing):
                 else None
                 for name in names
             }
-            # The files are more worth than the note; without it they stay noted as begun.
+            # The files matter more than the note; without it they stay noted as incomplete.
             with contextlib.suppress(OSError):
                 _note(folder, written)
 
@@ -282,7 +283,7 @@ def _note(folder: Path, entries: Mapping[str, dict[str, Any] | None]) -> None:
 
 
 def _mark(path: Path) -> list[int] | None:
-    """Return size and checksum of a file's two ends; None for a folder or what cannot be read."""
+    """Return size and checksum of a file's two ends; None for a folder or an unreadable file."""
     try:
         if not path.is_file():
             return None

@@ -1,17 +1,15 @@
-"""The folder that a run writes, kept readable whenever and however the run ends.
+"""The folder of a run, readable at any time and however the run ends.
 
 ==================  ========================================================================
-`posture.csv`       one row for every frame, on disk when the frame is done
+`posture.csv`       one row for every frame, on disk as soon as the frame is done
 `posture_bare.csv`  the same without the dome model, for comparison
-`points.arrows`     the points while the run is under way; the next two stand for it at its end
+`points.arrows`     the points during the run; replaced by the next two files at its end
 `points.parquet`    every stripe point
 `points.ply`        the points on the target; both are `.part` until the run ends
 `run.yaml`          source, options, versions, rig, status and summary
 ==================  ========================================================================
 
-The report, the state of a net and the overlay video are written beside them by their own modules.
-
-`posture.csv`: one row for every frame, on disk as soon as the frame is done.
+Other modules write the report, the state of a net and the overlay video beside them.
 """
 
 import contextlib
@@ -61,9 +59,8 @@ POSTURE_COLUMNS = (
     "sigma_yaw_total_deg",
 )
 """Curvatures, horizontal and vertical, are empty unless the target is a curved net. `sigma_range_m`
-and its like are what the frame's noise makes, `sigma_..._rig_...` what the uncertainty of the rig
-does, which is common to all frames, and `sigma_..._total_...` the root of the sum of the squares of
-both."""
+and its like are due to the frame's noise, `sigma_..._rig_...` to the uncertainty of the rig, which
+is common to all frames; `sigma_..._total_...` is the root of the sum of the squares of both."""
 _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 
 
@@ -73,7 +70,7 @@ class PostureCsv(Closing):
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
 
     Raises
     ------
@@ -166,7 +163,7 @@ RUN_FILES = (
     REPORT_HTML,
     *NET_FILES,
 )
-"""What belongs to a run; nothing else in its folder is ever removed or replaced."""
+"""Files of a run; nothing else in its folder is ever removed or replaced."""
 
 _KILLED = "the run ended before it could close its files; the folder was completed afterwards"
 
@@ -207,7 +204,7 @@ class RunOutputs:
         self.tally = Tally()
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
-            # First of all: of two runs that begin at the same moment, one gets no further.
+            # First, so that only one of two runs that begin at the same moment continues.
             self._points = stack.enter_context(_new_journal(folder))
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
@@ -226,7 +223,7 @@ class RunOutputs:
             try:
                 self._export.add(batch)
             except OSError:
-                # The journal has it all: the next attempt, at the end, tells what is wrong.
+                # The journal is complete: the next attempt, at the end, reports the fault.
                 self._discard_export()
         for scan in scans:
             self.tally.add(scan)
@@ -241,7 +238,7 @@ class RunOutputs:
         fault: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Complete the folder: `points.parquet` and `points.ply` stand for the journal."""
+        """Complete the folder: `points.parquet` and `points.ply` replace the journal."""
         if isinstance(fault, OutputError):
             self._leave_as_it_is(fault)
             return
@@ -259,7 +256,7 @@ class RunOutputs:
             raise refusal from full
 
     def _leave_as_it_is(self, fault: OutputError) -> None:
-        """Close what is open without writing more than a disk in need can take."""
+        """Close open files, writing no more than a full disk can take."""
         self._discard_export()
         self._points.abandon()
         self._posture.close()
@@ -376,7 +373,7 @@ def _new_journal(folder: Path) -> PointsJournal:
     Raises
     ------
     OutputError
-        If another run has begun one since `prepare_folder`.
+        If another run has started one since `prepare_folder`.
     """
     try:
         with locked_folder(folder):

@@ -1,8 +1,10 @@
-"""Scans of a run that is on disk, read back one by one from `posture.csv` and its points.
+"""The net's condition over a dive: evaluation scan by scan, its files, and scans of a stored run.
 
-The net's condition over a dive: from scans, one by one, to the files that tell of it.
+`NetPass` takes scans one by one and writes the files. `stored_scans` reads the scans of a run back
+from `posture.csv` and its points.
 
-What evaluates and draws is imported where it is used: every run reads this module, few want a net.
+Modules that evaluate and draw are imported where they are used, because every run imports this
+module and few evaluate a net.
 """
 
 import csv
@@ -45,13 +47,13 @@ if TYPE_CHECKING:
     from aqualvs.nets.tables import NetWall
 
 
-# The posture is that of a net if so much of what it rests on is net.
+# Least share of net among the inliers for the posture to be that of a net.
 _NET_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class NetResult:
-    """What was found of a net and written.
+    """Result of a net's evaluation, as written to its files.
 
     Attributes
     ----------
@@ -72,7 +74,7 @@ class NetResult:
 
 
 class NetPass:
-    """Takes a dive's scans in turn, and writes what they say of the net.
+    """Evaluation of a dive's net, scan by scan, and the writer of its files.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ class NetPass:
         self._n_frames = 0
 
     def add(self, scan: Scan) -> None:
-        """Take the next scan; what is not a net is passed over."""
+        """Take the next scan; scans of other targets than nets are ignored."""
         self._n_frames += 1
         posture = scan.posture
         if not isinstance(posture, Posture) or not _is_net(scan):
@@ -109,7 +111,7 @@ class NetPass:
         self._condition.add(scan)
 
     def write(self, folder: Path, video: Path | None = None) -> NetResult:
-        """Finish, write the files of `NET_FILES` and return what was found.
+        """Finish, write the files of `NET_FILES` and return the result.
 
         Parameters
         ----------
@@ -283,7 +285,7 @@ def _posture(row: dict[str, str]) -> Posture | Refusal:
 
 
 def _variances(row: dict[str, str], names: tuple[str, ...]) -> FloatArray:
-    """Return a covariance (3, 3) without what is between its numbers."""
+    """Return a covariance (3, 3) with zero correlations."""
     sigma = np.array([_number(row.get(name)) for name in names])
     sigma[1:] = np.deg2rad(sigma[1:])
     return np.diag(sigma**2)
@@ -327,7 +329,7 @@ class _Points:
 
 
 def _pieces(run_folder: Path) -> Iterator[tuple[int, Columns]]:
-    """Yield each frame's points, in pieces where the file's batches part them."""
+    """Yield each frame's points, in parts where the file's batches split them."""
     for columns in _batches(run_folder):
         frame = columns["frame"]
         edges = [0, *(np.flatnonzero(np.diff(frame)) + 1).tolist(), len(frame)]
@@ -381,7 +383,7 @@ def _plain(name: str, column: Any) -> NDArray[Any]:
 
 
 def _scan_points(parts: list[Columns]) -> ScanPoints:
-    """Join the pieces of one frame's points."""
+    """Join the parts of one frame's points."""
 
     def of(*names: str) -> FloatArray:
         columns = [np.concatenate([part[name] for part in parts] or [_NONE]) for name in names]

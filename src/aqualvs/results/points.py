@@ -1,9 +1,8 @@
-"""`points.parquet` and `points.ply`, batch by batch.
+"""Stripe points of a run: `points.arrows` during it, `points.parquet` and `points.ply` at its end.
 
-`points.arrows`: the points of a run that is under way, as an Arrow IPC stream.
-
-Parquet cannot be read before its footer is written; a stream can be read up to its last whole
-batch, whatever happened after it.
+`points.arrows` is an Arrow IPC stream: it can be read up to its last whole batch, whatever happened
+after it, whereas Parquet cannot be read before its footer is written. All are written batch by
+batch.
 """
 
 import contextlib
@@ -41,8 +40,9 @@ POINTS_SCHEMA = pa.schema(
 )
 """Columns of `points.arrows` and `points.parquet`: pixels in `image`, metres in `dome`.
 
-`label` says what a point lies on (`Label`), `used` whether it entered the posture; `intensity` is
-the stripe's height above its background in grey levels, `width_px` its full width at half of that.
+`label` is the kind of surface of a point (`Label`), `used` whether it entered the posture;
+`intensity` is the stripe's height above its background in grey levels, `width_px` its full width at
+half of that.
 """
 
 _LABEL_NAMES = pa.array(LABELS, pa.string())
@@ -54,7 +54,7 @@ class PointsJournal:
     Parameters
     ----------
     path : Path
-        Written anew.
+        Created, or overwritten.
     exclusive : bool
         As for `AppendFile`.
 
@@ -103,7 +103,7 @@ class PointsJournal:
         self._file.close()
 
     def _append(self) -> None:
-        """Hand over what Arrow has written as many small parts."""
+        """Append Arrow's many small writes as one piece."""
         self._file.append(self._waiting.getvalue())
         self._waiting.seek(0)
         self._waiting.truncate()
@@ -177,18 +177,18 @@ def check_idle(path: Path) -> None:
 
 
 DRAFT = ".part"
-"""What is added to the names of files that are not finished."""
+"""Suffix of the names of unfinished files."""
 
 _ROWS_PER_GROUP = 1 << 17
 _N_LASERS = 128
-# Only names are worth a dictionary: to look for repetition in numbers takes longer than to write
-# them. What repeats is short once compressed, and of measured numbers the bytes that resemble each
-# other, signs and exponents, are put side by side: the file is a sixth smaller so, and the fast
-# compression makes it hardly larger than the thorough one.
+# Dictionary encoding for names only: to look for repetitions in numbers takes longer than to write
+# them, and compression shortens them anyway. For measured numbers, BYTE_STREAM_SPLIT puts similar
+# bytes (signs, exponents) side by side: the file is a sixth smaller, and the fast compression level
+# makes it hardly larger than the thorough one.
 _NAMES = ("label",)
-# What ascends over the dive, so that a reader of a stretch of it can pass over groups of rows; of
-# all else each group holds everything, and to look for its least and greatest takes a third of the
-# time of writing.
+# Statistics for ascending columns only, so that readers of a part of the dive can skip row groups.
+# In the other columns each group spans the whole range, and to find minimum and maximum takes a
+# third of the time of writing.
 _ASCENDING = ("frame", "time_s")
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -196,7 +196,7 @@ _VERTEX = np.dtype(
 
 
 class PointsExport:
-    """Writes `points.parquet` and `points.ply`; both appear whole, at the end, or not at all.
+    """Writer of `points.parquet` and `points.ply`; both appear whole at the end, or not at all.
 
     Rows are gathered to groups of always the same size, which a thread of its own writes: the files
     do not depend on how the points come, and memory does not grow with their number.
@@ -238,7 +238,7 @@ class PointsExport:
                     write_statistics=[name for name in _ASCENDING if name in schema.names],
                 )
             )
-            # It ends before the files are closed that it writes to.
+            # The thread ends before its files are closed.
             self._thread = stack.enter_context(ThreadPoolExecutor(1))
             self._open_files = stack.pop_all()
 
@@ -265,7 +265,7 @@ class PointsExport:
         return self._n_points
 
     def discard(self) -> None:
-        """Remove what has been written of files that will not be finished."""
+        """Remove the files that will not be finished."""
         with contextlib.suppress(OSError):
             self._open_files.close()
         for draft in self._drafts:

@@ -1,6 +1,6 @@
-"""What `aqualvs run` is asked to do, checked before anything is written.
+"""Request of `aqualvs run`, checked before anything is written, and `run.yaml`, its record.
 
-`run.yaml`: what was run, on what, with what, and how it went.
+`run.yaml` holds source, rig, options, versions, status and summary of a run.
 """
 
 import functools
@@ -36,7 +36,7 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "av")
 
 
 class Status(StrEnum):
-    """How a run stands; the value is what `run.yaml` says in `status`."""
+    """Status of a run, as `run.yaml` states it in `status`."""
 
     RUNNING = "running"
     """Under way, or killed before it could say otherwise."""
@@ -113,7 +113,7 @@ def read_run_yaml(folder: Path) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this package, of Python and of what computes the numbers."""
+    """Return the versions of this package, of Python and of the numerical packages."""
     found = {"aqualvs": __version__, "python": platform.python_version(), "system": sys.platform}
     return found | {name: _installed(name) for name in _LIBRARIES}
 
@@ -137,7 +137,7 @@ _INDEX_LIMITS = (1.0, 1.5)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Water:
-    """What the user says about the medium; all None leaves the rig's own index.
+    """Medium as stated by the user; all None leaves the rig's own index.
 
     Attributes
     ----------
@@ -206,7 +206,7 @@ class FrameWindow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunRequest:
-    """What to run.
+    """Request for a run: its inputs, outputs and options.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ class RunRequest:
         Frame rate of image folders.
     scanner : ScannerOptions
     chosen : frozenset of str or None
-        Fields of `scanner` that count for a recording, whose own options stand for the others.
+        Fields of `scanner` that count for a recording, whose own options apply otherwise.
         None: all of them.
     mcap : bool
         Whether to write `dive.mcap`.
@@ -235,7 +235,7 @@ class RunRequest:
     truth : Path or None
         Truth to compare with.
     index_target : Path or None
-        Markers on the vehicle that tell the water's index, followed frame by frame.
+        Markers on the vehicle that show the water's index, tracked frame by frame.
     net : NetRequest or None
         What to find out about the net on the way, if anything.
     target : str
@@ -348,7 +348,7 @@ def check_fits(source: FrameSource, rig: Rig) -> None:
 
 
 def source_facts(source: FrameSource) -> dict[str, Any]:
-    """Return what identifies a source without reading all of it."""
+    """Return data that identify a source without reading all of it."""
     found: dict[str, Any] = {"name": source.name}
     path = Path(source.name)
     if path.exists():

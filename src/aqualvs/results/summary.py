@@ -1,7 +1,4 @@
-"""Summary numbers of a run, gathered frame by frame.
-
-Posture against truth.
-"""
+"""Summary of a run: counts and ranges, frame by frame, and the comparison with the truth."""
 
 import contextlib
 import csv
@@ -36,7 +33,7 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthComparison:
-    """How far the postures of a run are from the truth.
+    """Deviation of a run's postures from the truth.
 
     Attributes
     ----------
@@ -57,7 +54,7 @@ class TruthComparison:
     yaw_deg: Deviation
 
     def lines(self) -> list[str]:
-        """Return the comparison in words."""
+        """Return the comparison as lines of text."""
         return [
             f"against the truth in {self.n_compared} frames "
             f"({self.n_missed} with truth but without posture):",
@@ -233,7 +230,7 @@ class Tally:
         return found
 
     def lines(self) -> list[str]:
-        """Return the summary in words."""
+        """Return the summary as lines of text."""
         if not self.n_frames:
             return ["no frame was measured"]
         share = 100 * self.n_valid / self.n_frames

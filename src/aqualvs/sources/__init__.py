@@ -1,4 +1,4 @@
-"""Where frames come from: recordings for `run`, and live feeds."""
+"""Sources of frames: recordings for `run`, and live feeds."""
 
 from aqualvs.sources.base import Feed, FrameSource
 from aqualvs.sources.images import ImageSource

@@ -1,6 +1,8 @@
-"""Images from MCAP files: Foxglove's messages, and those of ROS 1 and ROS 2.
+"""Images from ROS bags and MCAP files.
 
-Images from ROS bags: `.bag` of ROS 1, `.db3` and MCAP folders of ROS 2.
+Bags are `.bag` files of ROS 1, and `.db3` or MCAP folders of ROS 2, read by the package `rosbags`.
+Lone MCAP files hold images as messages of Foxglove, ROS 1 or ROS 2, read by the package `mcap`.
+Both give a `MessageSource` for one topic.
 """
 
 import contextlib
@@ -27,7 +29,7 @@ from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, decompressed
 from aqualvs.sources.message_source import MAX_BYTES, Logged, MessageSource, Topic, choose_topic
 from aqualvs.special_files import refuse_special
 
-# Room that is left on the disk where bags are unpacked that are packed as whole files.
+# Disk space to keep free where bags compressed as whole files are unpacked.
 _FREE_BYTES = 1 << 30
 _REMEDY = "check it with ros2 bag info or rosbag reindex"
 
@@ -90,7 +92,7 @@ def _messages(path: Path, topic: str) -> Iterator[Logged]:
         try:
             for connection, log_ns, content in reader.messages(connections=wanted):
                 yield log_ns, _image(reader, content, connection.msgtype)
-        # The package lets through whatever damage leads to, from AssertionError to ZstdError.
+        # Damaged files raise anything in the package, from AssertionError to ZstdError.
         except Exception as fault:
             raise SourceError(f"{path}: the bag breaks off ({_words(fault)})") from fault
 
@@ -158,7 +160,7 @@ def _bound_unpacking() -> None:
 
 
 def _bounded(unpacker: Callable[[], Any]) -> Callable[..., bytes]:
-    """Return what unpacks bytes that are whole and not too many."""
+    """Return a decompressor that limits the size of its output."""
 
     def unpack(packed: bytes, _size: int = 0) -> bytes:
         one = unpacker()
@@ -268,7 +270,7 @@ def _read(path: Path, stream: "_Bounded", topic: str | None) -> Iterator[tuple[A
 
 
 def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[tuple[Any, ...]]:
-    """Yield what the chunks of a topic hold, in the order of their times."""
+    """Yield the messages in the chunks of a topic, in the order of their times."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk, Message
 
@@ -286,7 +288,7 @@ def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[t
 
 
 def _by_order(stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield what a file without index holds, from its beginning on."""
+    """Yield the messages of a file without index, from its beginning on."""
     from mcap.records import Channel, Chunk, Message, Schema
     from mcap.stream_reader import StreamReader
 
@@ -308,7 +310,7 @@ def _records_of(chunk: Any) -> list[Any]:
     """Return the records in a chunk; the package would take any amount of memory for them."""
     from mcap.stream_reader import breakup_chunk
 
-    # Of the smallest messages, records take ten times the room that their bytes take.
+    # Records of the smallest messages take ten times the memory of their bytes.
     if max(chunk.uncompressed_size, len(chunk.data)) > MAX_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
@@ -327,7 +329,7 @@ def _summary(stream: "_Bounded") -> Any:
 
 
 def _mcap_faults() -> tuple[type[Exception], ...]:
-    """Return what a damaged file raises, here and in the package that reads it."""
+    """Return the exceptions that a damaged file causes, here and in the package that reads it."""
     from mcap.exceptions import McapError
     from pyarrow import ArrowException
 
@@ -365,7 +367,7 @@ def _opened_mcap(path: Path) -> Iterator[_Bounded]:
 
 
 def _reader(path: Path, schema: Any, encoding: str) -> _Reader:
-    """Return what reads the messages of a schema."""
+    """Return the function that decodes the messages of a schema."""
     if encoding == "protobuf":
         return image_of_protobuf(schema.name)
     if encoding == "json":

@@ -1,14 +1,12 @@
-"""What every source of frames offers.
+"""Interfaces of all sources of frames, and their common parts.
 
-How well a live run goes: rates, delays, drops, lasers, links.
-
-Frames as colour pictures, for overlays and people.
-
-Luma and chroma of a decoded picture, without copying where its layout allows.
-
-Packets for a decoder, made from bytes that came some other way than through FFmpeg.
-
-What a live run needs of a source of frames.
+- `FrameSource`: frames in order, all of the same size; for `run`.
+- `Feed`: the frames of a live run, from a stream that may stall, change its size or return.
+- `Health`, `PartHealth`, `StageDelay`: rates, delays and drops of a live run, and the state of its
+  lasers and links.
+- `planes_of`: luma and chroma of a decoded picture, not copied where its layout allows;
+  `bgr_of`: a frame as a colour picture for overlays and viewers.
+- `packet_with`: a packet for a decoder, from bytes that FFmpeg has not read itself.
 """
 
 from collections.abc import Iterator
@@ -29,7 +27,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane, Planes
 
 
 class State(StrEnum):
-    """Of a part of the system; a pilot reads it as a colour."""
+    """State of a part of the system; pilots see it as a colour."""
 
     OK = "ok"
     WARN = "warn"
@@ -42,7 +40,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PartHealth:
-    """Of the stream, of one output, of one laser.
+    """Health of one part: the stream, an output or a laser.
 
     Attributes
     ----------
@@ -71,7 +69,7 @@ class StageDelay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """Of a live run, over the last seconds.
+    """Health of a live run, over the last seconds.
 
     Attributes
     ----------
@@ -129,7 +127,7 @@ def bgr_of(frame: Frame) -> ImagePlane:
     height, width = frame.luma.shape
     rows, columns = frame.chroma[0].shape
     i420 = np.empty((3 * rows, 2 * columns), np.uint8)
-    # An odd height or width leaves a row or column of the even picture to be cut off again.
+    # With an odd height or width, the even picture has a row or column too many.
     i420[: 2 * rows] = 0
     i420[:height, :width] = frame.luma
     i420[2 * rows :] = np.stack(frame.chroma).reshape(rows, 2 * columns)
@@ -198,7 +196,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
 
     Decoders read a few dozen bytes beyond a packet's end and count on zeros there
     (AV_INPUT_BUFFER_PADDING_SIZE of FFmpeg). Memory that FFmpeg allocates has them; Python's bytes
-    end where they end, so that a sound picture may be taken for damaged.
+    end where they end, so that an intact picture may count as damaged.
 
     Parameters
     ----------
@@ -211,7 +209,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
 
 
 class Feed(Protocol):
-    """Frames as they come, from a stream that may stall, change its size, go and return.
+    """Frames of a live stream, which may stall, change its size, break off and return.
 
     Attributes
     ----------
@@ -221,7 +219,7 @@ class Feed(Protocol):
 
     @property
     def name(self) -> str:
-        """How health and messages call it."""
+        """Name of the source in health reports and messages."""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until the source ends (a file) or `close` is called (a stream).
@@ -265,7 +263,7 @@ class FrameSource(Protocol):
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Name of the source in messages."""
 
     @property
     def size_px(self) -> tuple[int, int]:

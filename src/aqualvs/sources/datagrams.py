@@ -1,6 +1,7 @@
-"""UDP datagrams, taken from the system as they come.
+"""UDP datagrams: addresses, a receiver with its own thread, and detection of their content.
 
-Datagrams of one kind, told by their content.
+`Datagrams` takes datagrams from the system as they arrive. `Inbox` hands out those of one kind (RTP
+with H.264, MPEG-TS, bare H.264) until the content shows another kind.
 """
 
 import errno
@@ -20,18 +21,18 @@ from aqualvs.sources.rtp import parse_rtp
 from aqualvs.sources.transport_stream import PACKET_BYTES, SYNC
 
 _BUFFER_BYTES = 4 << 20
-"""Asked of the system, which may give less: a key frame comes in one burst."""
+"""Size of the receive buffer; the system may grant less. A key frame comes in one burst."""
 
 _LOOK_S = 0.2
-"""The receiver looks so often whether it shall end."""
+"""Period in which the receiver checks whether to end."""
 
 _MAX_WAITING = 20_000
-"""Datagrams kept for a reader that does not come; later ones are lost, and counted as such."""
+"""Datagrams kept for a late reader; further ones are lost, and counted as such."""
 
 
 @dataclass(frozen=True, slots=True)
 class UdpAddress:
-    """Where to listen.
+    """Address and port to listen on.
 
     Attributes
     ----------
@@ -82,14 +83,14 @@ def parse_udp(where: str) -> UdpAddress:
 
 
 class Datagram(NamedTuple):
-    """What came, and when by the monotonic clock (seconds)."""
+    """Content of a datagram, and its arrival by the monotonic clock (seconds)."""
 
     content: bytes
     arrival: float
 
 
 class Datagrams:
-    """Listens on a port; a thread of its own empties the system's buffer.
+    """Receiver on a UDP port; a thread of its own empties the system's buffer.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ class Datagrams:
             return None
 
     def forget(self) -> int:
-        """Drop what is waiting; returns how many datagrams that were."""
+        """Drop all waiting datagrams; return their number."""
         n = self._waiting.qsize()
         for _ in range(n):
             self.get(0.0)
@@ -154,7 +155,7 @@ class Datagrams:
 
 
 def why_not(address: UdpAddress, fault: OSError) -> str:
-    """Say in a few words why one cannot listen.
+    """Return in a few words why listening is impossible.
 
     Parameters
     ----------
@@ -199,22 +200,22 @@ def _join(made: socket.socket, group: str, *, is_v6: bool) -> None:
 
 
 RTP, TS, BARE = "RTP H.264", "MPEG-TS", "bare H.264"
-"""Kinds of content, in the words of health."""
+"""Kinds of content, as health reports name them."""
 
 _TS_IN_RTP = 33
 
 WAIT_S = 0.2
-"""A wait for datagrams is no longer, so that an end is noticed."""
+"""Longest wait for datagrams, so that an end is noticed."""
 
 MAX_FOREIGN = 5
-"""So many datagrams in a row of another kind: the sender sends something else now."""
+"""Datagrams in a row of another kind, after which the sender has changed its content."""
 
 _MAX_LAG_S = 2.0
-"""What waits longer for decoding is dropped: this machine does not keep up."""
+"""Datagrams that wait longer for decoding are dropped: this machine does not keep up."""
 
 
 def kind_of(datagram: bytes) -> str | None:
-    """Return what a datagram holds, or None if that is none of the kinds known here.
+    """Return the kind of content of a datagram, or None if it is unknown.
 
     Parameters
     ----------
@@ -250,7 +251,7 @@ def transport_content(datagram: bytes) -> bytes | None:
 
 
 class Inbox:
-    """Datagrams of one kind, until something else comes.
+    """Queue of datagrams of one kind, until another kind arrives.
 
     Parameters
     ----------
@@ -296,7 +297,7 @@ class Inbox:
         return peeked or self._datagrams.get(timeout)
 
     def is_late(self, datagram: Datagram) -> bool:
-        """Return whether decoding lags too far behind; what waits is then dropped.
+        """Return whether decoding lags too far behind; if so, drop the waiting datagrams.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
-"""The little of H.264 that a receiver must read itself, to know whether a picture is missing.
+"""NAL units of H.264 and HEVC: their types, and the frame numbers that reveal lost pictures.
 
-Sections and tables are those of ITU-T H.264.
-
-Which units a packet of H.264 or HEVC holds, as far as it matters for cutting.
+Receivers read only what shows whether a picture is missing (`FrameNumbers`, H.264); the search for
+places to cut a video reads only the types of the units (`unit_reader`, H.264 and HEVC). Sections
+and tables without another source are those of ITU-T H.264.
 """
 
 import re
@@ -15,7 +15,7 @@ _START_CODE = b"\x00\x00\x01"
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """What comes before and with the first coded slice of a packet.
+    """Units of a packet up to its first coded slice.
 
     Attributes
     ----------
@@ -31,19 +31,19 @@ class Units:
 
 
 UnitReader: TypeAlias = Callable[[memoryview], Units]
-"""Tells what a packet holds."""
+"""Reader of the units of a packet."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """Types of units by their number (ITU-T H.264, table 7-1; H.265, table 7-1)."""
+    """Codec's unit types by their number (ITU-T H.264, table 7-1; H.265, table 7-1)."""
 
     shift: int
     mask: int
     refresh: frozenset[int]
     slices: range
     parameter_sets: frozenset[int]
-    # Where the size of a unit's length stands in the extradata of a file (ISO/IEC 14496-15).
+    # Position of the size of a unit's length in the extradata of a file (ISO/IEC 14496-15).
     length_at: int
 
 
@@ -54,14 +54,14 @@ _CODECS = {
 
 
 def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
-    """Return what reads the packets of a stream; None for a codec without such units.
+    """Return the function that reads a stream's packets; None for a codec without such units.
 
     Parameters
     ----------
     codec : str
         As FFmpeg names it.
     extradata : bytes
-        Of the stream; tells whether units begin with their length or with a start code.
+        Of the stream; states whether units begin with their length or with a start code.
     """
     found = _CODECS.get(codec)
     if found is None:
@@ -106,7 +106,7 @@ START_CODE = b"\x00\x00\x00\x01"
 
 _START = re.compile(b"\x00\x00\x01")
 _HEAD = 64
-"""Bytes of a unit that hold all that is read here; a long scaling list is left unread."""
+"""Bytes of a unit that hold all fields read here; a long scaling list is left unread."""
 
 _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 
@@ -127,9 +127,9 @@ def nal_units(data: bytes) -> list[bytes]:
 
 
 class FrameNumbers:
-    """Finds missing reference pictures by the numbers that pictures carry (7.4.3, `frame_num`).
+    """Detector of missing reference pictures by their frame numbers (7.4.3, `frame_num`).
 
-    Needed where the transport does not tell of losses. A decoder copies the missing picture from
+    Needed where the transport does not report losses. A decoder copies the missing picture from
     another one and says nothing.
     """
 
@@ -152,7 +152,7 @@ class FrameNumbers:
         Returns
         -------
         gap : bool
-            False also where that cannot be told: before a parameter set, in streams that leave
+            False also where that is unknown: before a parameter set, in streams that leave
             numbers out on purpose.
         """
         for unit in nal_units(data):
@@ -175,13 +175,13 @@ class FrameNumbers:
         last, self._last = self._last, (number, bool(unit[0] & 0x60))
         if last is None or is_idr:
             return False
-        if number == last[0]:  # After a picture nobody refers to, or the other field of one.
+        if number == last[0]:  # After a picture that is no reference, or the other field of one.
             return False
         return not last[1] or number != (last[0] + 1) % (1 << self._bits)
 
 
 class _Bits:
-    """Reads bits and Exp-Golomb codes (9.1) from a unit's payload; past its end come zeros."""
+    """Reader of bits and Exp-Golomb codes (9.1) of a unit's payload; zeros past its end."""
 
     def __init__(self, payload: bytes) -> None:
         raw = payload.replace(b"\x00\x00\x03", b"\x00\x00")
@@ -221,7 +221,7 @@ def _frame_number_bits(unit: bytes) -> int | None:
 
 
 def _skip_chroma(bits: _Bits) -> bool:
-    """Pass the fields of the high profiles; False if scaling matrices follow."""
+    """Skip the fields of the high profiles; return False if scaling matrices follow."""
     if bits.golomb() == 3:
         bits.read(1)
     bits.golomb()
@@ -231,7 +231,7 @@ def _skip_chroma(bits: _Bits) -> bool:
 
 
 def _skip_order(bits: _Bits) -> bool:
-    """Pass the fields of the picture order; False for its type 1, which nobody sends."""
+    """Skip the fields of the picture order; return False for its rare type 1."""
     kind = bits.golomb()
     if kind == 0:
         bits.golomb()

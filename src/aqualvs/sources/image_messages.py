@@ -1,6 +1,7 @@
-"""Images as ROS and Foxglove messages carry them.
+"""Image messages of ROS and Foxglove: conversion of their encodings, and decoding of the pictures.
 
-From the messages of ROS and Foxglove to images.
+Messages may be ROS messages, Foxglove messages in JSON or Foxglove messages in Protobuf; each
+becomes an `ImageMessage`, and `planes_of_message` decodes it to luma and chroma.
 """
 
 import base64
@@ -36,7 +37,7 @@ _TO_BGR = {
 """Channels and OpenCV's conversion; OpenCV names Bayer patterns by their second row."""
 
 _PACKED_422 = {"yuv422_yuy2": 0, "yuyv": 0, "yuv422": 1, "uyvy": 1}
-"""Where luma begins among the bytes of two pixels; ROS's `yuv422` is UYVY."""
+"""Position of luma among the bytes of two pixels; ROS's `yuv422` is UYVY."""
 
 ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
 
@@ -48,7 +49,7 @@ class ImageMessage:
     Attributes
     ----------
     stamp_ns : int
-        Time of the picture, nanoseconds; 0 if the message tells none.
+        Time of the picture, nanoseconds; 0 if the message has none.
     encoding : str
         Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
     data : bytes
@@ -170,7 +171,7 @@ _DATA = {"foxglove.CompressedImage": 2, "foxglove.CompressedVideo": 3}
 
 
 def kind_of_schema(name: str) -> str | None:
-    """Return what kind of image a schema holds, or None.
+    """Return the kind of image of a schema, or None.
 
     Parameters
     ----------
@@ -242,7 +243,7 @@ def image_of_json(content: bytes) -> ImageMessage:
 
 
 def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
-    """Return what reads a Foxglove message written as Protobuf.
+    """Return the function that decodes a Foxglove message written as Protobuf.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """Frames from a folder or a list of images.
 
-Decoders of pictures that print what they think of a file: libpng, libjpeg, libtiff.
+libpng, libjpeg and libtiff print their warnings to the standard error of the process;
+`quiet_decoders` silences them while an image is read.
 """
 
 import contextlib
@@ -24,7 +25,7 @@ _before: tuple[int, int] = (-1, 0)
 
 @contextlib.contextmanager
 def quiet_decoders() -> Iterator[None]:
-    """Lead nowhere what OpenCV and the libraries below it print to standard error.
+    """Discard output of OpenCV and the libraries below it on standard error.
 
     They know nothing of Python's streams, so the file of the process itself is replaced meanwhile,
     for all of its threads.
@@ -49,7 +50,7 @@ def quiet_decoders() -> Iterator[None]:
 
 
 def _lead_nowhere() -> int:
-    """Lead standard error nowhere; return a copy of what it was, -1 where it is closed."""
+    """Discard standard error; return a copy of its descriptor, -1 where it is closed."""
     try:
         kept = os.dup(2)
     except OSError:
@@ -64,7 +65,7 @@ IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".
 
 
 class ImageSource(Closing):
-    """Images as frames, in natural order of their names (`img2` before `img10`).
+    """Source of images as frames, in natural order of their names (`img2` before `img10`).
 
     Parameters
     ----------

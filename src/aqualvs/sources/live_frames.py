@@ -1,10 +1,9 @@
-"""From the packets of a stream to numbered, timed frames.
+"""Numbered, timed frames from the packets of a live stream.
 
-Time since the start of a stream, from the stream's own clock.
-
-How a stream is received, for the pilot.
-
-A decoder that delivers sound pictures only, without delay.
+- `LiveFrames`: frames over reconnections and senders that start anew.
+- `LiveDecoder`: a decoder without delay that delivers undamaged pictures only.
+- `StreamClock`, `Unwrapper`: time since the start of the stream, from the stream's own clock.
+- `Reception`: the state of the reception, as shown to the pilot.
 """
 
 import statistics
@@ -26,11 +25,11 @@ from aqualvs.sources.h264 import FrameNumbers
 from aqualvs.sources.video import Ledger
 
 _DISAGREE_S = 5.0
-"""Stream and arrival differ by less while the sender's clock runs on: buffers hold no more."""
+"""Greatest difference of stream and arrival times for one sender: buffers hold no more."""
 
 
 class Unwrapper:
-    """Continues a counter of fixed width past its end.
+    """Unwrapped counter: continues a counter of fixed width past its overflow.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class Unwrapper:
 class StreamClock:
     """Time since the first picture, which never falls, also over a sender that starts anew.
 
-    A sender that starts anew counts from any number. Where its time disagrees with the time of
+    A sender that restarts counts from any number. Where its time disagrees with the time of
     arrival by more than 5 s, or falls, the stream goes on as long after the last picture as the
     new one arrived after it.
 
@@ -126,14 +125,14 @@ class StreamClock:
 
 
 _WINDOW_S = 5.0
-"""Rates and losses are told for so long."""
+"""Rates and losses are reported for this time."""
 
 _SILENT_S = 0.5
 """Longer silence is a fault."""
 
 
 class Reception:
-    """What arrived and when; written by the source, read from another thread.
+    """Log of what arrived and when; written by the source, read from another thread.
 
     Parameters
     ----------
@@ -224,7 +223,7 @@ class Reception:
             self._over = words
 
     def health(self) -> PartHealth:
-        """Return the state in words."""
+        """Return the state of the reception."""
         now = time.monotonic()
         with self._lock:
             self._forget(now)
@@ -275,7 +274,7 @@ before the end of a gradual refresh."""
 
 
 class LiveDecoder:
-    """Decodes the pictures of a stream; after damage it waits for pictures free of it.
+    """Decoder for a stream; after damage it waits for undamaged pictures.
 
     Parameters
     ----------
@@ -365,7 +364,7 @@ class LiveDecoder:
 
 
 class LiveFrames:
-    """Decodes a stream, over reconnections: numbers rise, time never falls.
+    """Frames of a stream over reconnections: numbers rise, time never falls.
 
     Parameters
     ----------
@@ -386,7 +385,7 @@ class LiveFrames:
         self._n_held = 0
 
     def connect(self, codec: VideoCodecContext, tick: float, *, hears_losses: bool) -> None:
-        """Begin with a new decoder; what the old one held is lost.
+        """Begin with a new decoder; pictures in the old one are lost.
 
         Parameters
         ----------
@@ -403,7 +402,7 @@ class LiveFrames:
         self._clock.set_tick(tick)
 
     def restart(self) -> None:
-        """Go on with a sender that has begun anew, on the same decoder."""
+        """Continue with a sender that has started anew, on the same decoder."""
         self.lose()
         self._ledger.restart()
         self._lossy = False
@@ -462,10 +461,10 @@ class LiveFrames:
         return Frame(index, at, luma, chroma)
 
     def _number(self, picture: VideoFrame, at: float) -> int:
-        """Return the picture's number; after a loss the time tells how many are missing."""
+        """Return the picture's number; after a loss, the time gives the number of missing ones."""
         number = self._ledger.number(picture.pts)
         if self._first is None:
-            self._first = number  # What came before was joined too late, not lost.
+            self._first = number  # Earlier ones are not lost: reception began later.
         index = number - self._first
         if self._last_index < 0:
             return index
@@ -480,7 +479,7 @@ class LiveFrames:
 
 
 class _Spacing:
-    """Learns the time between pictures."""
+    """Estimate of the time between pictures."""
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque(maxlen=15)

@@ -1,6 +1,7 @@
-"""Reading recordings back, torn ones too.
+"""MCAP files: encoding of their records, and a reader that also reads truncated or damaged files.
 
-The records of an MCAP file as bytes (format 0, https://mcap.dev/spec).
+Records are those of format 0 (https://mcap.dev/spec). `McapFile` reads; the functions above it
+encode records for `aqualvs.recording`.
 """
 
 import contextlib
@@ -18,7 +19,7 @@ from aqualvs.errors import SourceError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9
-"""Of every record: its kind and the length of what follows."""
+"""Head of every record: its kind and the length of its content."""
 
 
 class Op(IntEnum):
@@ -49,7 +50,7 @@ def head(kind: Op, length: int) -> bytes:
 
 
 def padding_head(span: int) -> bytes:
-    """Return the first bytes of a record of no meaning that spans so many bytes, its head included.
+    """Return the head of a padding record that spans this many bytes, its head included.
 
     Raises
     ------
@@ -73,14 +74,14 @@ def header(profile: str, library: str) -> bytes:
 
 
 def schema(number: int, name: str, definition: str) -> bytes:
-    """Return what describes a kind of message, in ROS 2's language for messages."""
+    """Return the record of a message definition, in ROS 2's language for messages."""
     content = definition.encode("utf-8")
     head_part = struct.pack("<H", number) + text(name) + text("ros2msg")
     return record(Op.SCHEMA, head_part, struct.pack("<I", len(content)), content)
 
 
 def channel(number: int, schema_number: int, topic: str) -> bytes:
-    """Return what says that messages of a schema come on a topic, in ROS 2's encoding."""
+    """Return the record of a topic and the schema of its messages, in ROS 2's encoding."""
     numbers = struct.pack("<HH", number, schema_number)
     return record(Op.CHANNEL, numbers, text(topic), text("cdr"), struct.pack("<I", 0))
 
@@ -184,7 +185,7 @@ DATA_END_BYTES = len(data_end())
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 MAX_RECORD_BYTES = 1 << 29
-"""Size of a record, also when decompressed; more is damage, or meant to fill the memory."""
+"""Greatest size of a record, also when decompressed; more is damage or an attack."""
 # The records of a summary are far smaller than chunks.
 _MAX_SUMMARY_BYTES = 1 << 24
 _KNOWN = frozenset(Op)
@@ -209,7 +210,7 @@ class StoredMessage:
 
 @dataclass(slots=True)
 class _Listing:
-    """What one end of a file tells of it.
+    """Contents of a file as stated by one of its ends.
 
     Attributes
     ----------
@@ -235,9 +236,9 @@ class _Listing:
 class McapFile:
     """An MCAP file whose chunks can be read one after the other.
 
-    What the summary at the end tells is checked against the chunks themselves. Where they differ,
+    The summary at the end is checked against the chunks themselves. Where they differ,
     or the end is missing, as after a loss of power or with a bit that flipped on the disk, the file
-    is read from its beginning as far as it goes, and what the summary tells beyond that is added:
+    is read from its beginning as far as it goes, and further contents of the summary are added:
     damage in one place loses the chunk that it is in.
 
     Parameters
@@ -271,7 +272,7 @@ class McapFile:
                 front = _front(file, size, only_channels=False)
         self._topics = _merged_topics(front, summary)
         self._counts = summary.counts if sound else None
-        # What was read to its end needs no summary, which may itself be damaged.
+        # A file that was read to its end needs no summary, which may itself be damaged.
         listed = summary.chunks if sound else front.chunks
         if not (sound or front.whole):
             listed = front.chunks | summary.chunks
@@ -325,7 +326,7 @@ class McapFile:
 
 
 def _summary(file: BinaryIO, size: int) -> _Listing:
-    """Return what the summary tells; nothing where there is none that can be read to its end."""
+    """Return the contents of the summary; empty if it cannot be read to its end."""
     file.seek(max(0, size - FOOTER_BYTES))
     end = file.read(FOOTER_BYTES)
     if len(end) < FOOTER_BYTES or end[0] != Op.FOOTER:
@@ -346,7 +347,7 @@ def _summary(file: BinaryIO, size: int) -> _Listing:
 
 
 def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
-    """Return what is found from the beginning on, or before the first chunk."""
+    """Return the contents found from the beginning on, or before the first chunk."""
     found, at = _Listing(), len(MAGIC)
     while (first := _record_head(file, at)) is not None:
         kind, length = first
@@ -362,7 +363,7 @@ def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
             break
         at += HEAD_BYTES + length
         if at > size:
-            # The record that seems to reach beyond the end is damaged, a chunk cut off.
+            # A record that seems to reach beyond the end is damaged; a chunk is cut off.
             break
     return found
 
@@ -382,7 +383,7 @@ def _is_sound(file: BinaryIO, summary: _Listing) -> bool:
 def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, ...]]:
     """Return the topics of every channel by both ends; one end that contradicts itself is left out.
 
-    Where the ends give a channel two names both count: damage makes a name that nobody asks for.
+    Where the ends give a channel two names both count: a damaged name matches no request.
     """
     found: dict[int, tuple[str, ...]] = {}
     for one in (front, summary):
@@ -394,7 +395,7 @@ def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, .
 
 
 def _note(found: _Listing, kind: int, content: bytes) -> None:
-    """Take in a record.
+    """Add a record to the contents.
 
     Raises
     ------

@@ -29,7 +29,7 @@ class Topic:
     ----------
     name : str
     n_messages : int or None
-        None where the recording does not tell.
+        None where the recording does not state it.
     """
 
     name: str
@@ -69,7 +69,7 @@ def choose_topic(where: str, topics: list[Topic], wanted: str | None) -> Topic:
 
 
 class MessageSource(Closing):
-    """Images of one topic as frames; satisfies `FrameSource`.
+    """Source of the images of one topic; satisfies `FrameSource`.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class MessageSource(Closing):
 
     Notes
     -----
-    Times are those of the pictures where the messages tell them, else those of the log. Pictures of
+    Times are those of the pictures where the messages have them, else those of the log. Pictures of
     a video that are predicted from a lost one are not delivered (see `LiveDecoder`).
     """
 
@@ -136,7 +136,7 @@ class MessageSource(Closing):
                 if len(times) == 10:
                     break
         except SourceError:
-            # What comes before the damage counts; it is told when it is reached again.
+            # Messages before the damage count; the damage is reported when it is reached again.
             if size is None:
                 raise
         if size is None:
@@ -171,7 +171,7 @@ class MessageSource(Closing):
 
 
 class _Clock:
-    """Times of images since the first one; they never fall."""
+    """Clock of a topic: times since the first image, which never fall."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
@@ -190,7 +190,7 @@ class _Clock:
 
 
 class _Video:
-    """Decodes packets that are numbered by their messages."""
+    """Decoder of packets that are numbered by their messages."""
 
     def __init__(self, codec: str) -> None:
         context = cast("VideoCodecContext", av.CodecContext.create(codec, "r"))

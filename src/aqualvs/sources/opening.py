@@ -1,8 +1,7 @@
-"""From a path or an address to the source that reads it.
+"""Choice of the source or feed for a path or an address; `PacedFeed`, a recording as a live feed.
 
-What reads streams, cameras and recordings is imported where it is used: most dives are videos.
-
-A recording as a live feed.
+Modules that read streams, cameras and recordings are imported where they are used, because most
+dives are videos.
 """
 
 import math
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class PacedFeed:
-    """Frames of a file or folder, by their own clock or as fast as they are taken.
+    """Recording as a feed: its frames by their own clock, or as fast as they are taken.
 
     Parameters
     ----------
@@ -94,7 +93,7 @@ STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "rtsps", "srt", "tcp",
 """Addresses of streams; everything else is a path."""
 
 BLUEROV_PORT = 5600
-"""Where BlueOS and ArduSub send the main camera, and QGroundControl listens."""
+"""Port to which BlueOS and ArduSub send the main camera, and where QGroundControl listens."""
 
 
 def open_source(
@@ -230,7 +229,7 @@ def is_bag(path: Path) -> bool:
 
 
 def _check_address(where: str) -> None:
-    """Refuse what no stream can have for an address, which FFmpeg would try again and again."""
+    """Refuse impossible addresses, which FFmpeg would try again and again."""
     shown = where if where.isprintable() else repr(where)
     remedy = "write SCHEME://HOST:PORT, such as rtsp://192.168.2.10:554/video or udp://:5600"
     try:
@@ -242,7 +241,7 @@ def _check_address(where: str) -> None:
         raise SourceError(f"{shown}: no address (a space or control character in it); {remedy}")
     if not host and port is None:
         raise SourceError(f"{shown}: neither host nor port; {remedy}")
-    # Who listens at UDP port 0 gets a free one; nobody can be reached there.
+    # Listening at UDP port 0 takes a free port; sending to port 0 is impossible.
     if port == 0 and parts.scheme.lower() not in ("udp", "rtp"):
         raise SourceError(f"{shown}: port 0 cannot be reached; {remedy}")
 

@@ -1,8 +1,6 @@
-"""Live video that FFmpeg receives: RTSP, SRT, HTTP, TCP, cameras of this machine.
+"""Live video received by FFmpeg: RTSP, SRT, HTTP, TCP, and cameras of this machine (Video4Linux).
 
-A connection that FFmpeg holds, read by a thread of its own.
-
-A camera of this machine, by Video4Linux.
+A thread of its own reads each connection (`Connection`), because FFmpeg may block without end.
 """
 
 import queue
@@ -27,14 +25,14 @@ VideoPacket: TypeAlias = "Packet[VideoStream]"
 Opener: TypeAlias = Callable[[], InputContainer]
 
 _MAX_WAITING = 250
-"""Packets kept for a decoder that does not come; then the connection is given up."""
+"""Packets kept for a late decoder; beyond it the connection is given up."""
 
 
 class Connection:
-    """Opens a container and reads its first video in the background.
+    """Connection opened in the background, and the packets of its first video.
 
-    FFmpeg waits without end where a network is silent, and can't be woken. So nobody waits for
-    this thread: it ends by itself when FFmpeg's time runs out, and closes what it opened.
+    FFmpeg waits without end where a network is silent, and can't be woken. So the thread is not
+    joined: it ends by itself when FFmpeg's time runs out, and closes what it opened.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ class Connection:
             with self._opener() as container:
                 self._read(container)
         except Exception as fault:
-            # Whatever it is: the reader must be told, for nobody waits for this thread.
+            # Any exception: the reader must be notified, because nothing joins this thread.
             self.fault = fault
             self.reason = _words(fault)
         self._packets.put(None)
@@ -94,7 +92,7 @@ class Connection:
 
 
 def _words(fault: Exception) -> str:
-    """Return what went wrong in a few words."""
+    """Return the fault in a few words."""
     if isinstance(fault, av.error.ExitError):
         return "no answer in time"
     if isinstance(fault, OSError | av.error.FFmpegError) and fault.strerror:
@@ -108,15 +106,15 @@ _OPEN_S, _SILENT_S = 5.0, 2.0
 """Time to connect and find the first key frame; silence after which a connection is dead."""
 
 _RETRY_S = (0.1, 0.2, 0.5)
-"""Pauses before new tries, the last for ever: the vehicle may come back at any time."""
+"""Pauses before retries, the last one repeated: the vehicle may return at any time."""
 
 _PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
-"""The rate need not be known; the first pictures shall not wait until it is measured. FFmpeg's
-`nobuffer` is not set: it drops what was read meanwhile, often the only key frame for seconds."""
+"""The rate is not probed, so that the first pictures need not wait for it. FFmpeg's
+`nobuffer` is not set: it drops packets read meanwhile, often the only key frame for seconds."""
 
 
 class RemoteFeed:
-    """Frames from a container that FFmpeg opens, and opens again; satisfies `Feed`.
+    """Feed of a container that FFmpeg opens, and reopens; satisfies `Feed`.
 
     Parameters
     ----------
@@ -162,7 +160,7 @@ class RemoteFeed:
         return self._reception.health()
 
     def close(self) -> None:
-        """End the iteration; what FFmpeg still waits for ends by itself within seconds."""
+        """End the iteration; pending calls of FFmpeg end by themselves within seconds."""
         self._closed.set()
         self._reception.end("closed")
         if self._connection is not None:
@@ -203,7 +201,7 @@ _OPEN_S, _SILENT_S = 5.0, 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraOptions:
-    """What is asked of a camera; what is left out, the camera chooses.
+    """Options requested of a camera; the camera chooses those left out.
 
     Attributes
     ----------
@@ -233,7 +231,7 @@ class CameraOptions:
 
 
 class CameraFeed(RemoteFeed):
-    """Frames from a camera; opened again when it is unplugged and comes back.
+    """Feed of a camera; reopened when it is unplugged and returns.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Packets of the Real-time Transport Protocol (RFC 3550), put in order.
+"""RTP: packets in order (RFC 3550), and pictures from the payload of H.264 (RFC 6184).
 
-Pictures from the RTP payload of H.264 (RFC 6184), single units, STAP-A and FU-A.
+Of RFC 6184, single NAL units, STAP-A and FU-A are read.
 """
 
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from aqualvs.sources.h264 import DELIMITER, SEI, SPS, START_CODE
 from aqualvs.sources.live_frames import Unwrapper
 
 _MAX_STEP = 3000
-"""Packets that may be missing in a row; a greater step is a sender that begins anew."""
+"""Packets that may be missing in a row; a greater step is a restarted sender."""
 
 _RESTART_SILENCE_S = 0.1
-"""So long must the sender in use be silent before another takes its place."""
+"""Time for which the sender in use must be silent before another takes its place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Ordered(NamedTuple):
     after_loss : bool
         Packets right before it are missing.
     is_restart : bool
-        The first of another sender, or of one that has begun anew.
+        The first of another sender, or of a restarted one.
     """
 
     packet: RtpPacket
@@ -92,7 +92,7 @@ class Ordered(NamedTuple):
 
 
 class RtpOrder:
-    """Puts the packets of one sender in order, and tells where some are lost.
+    """Reordering buffer for the packets of one sender, which also detects losses.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class RtpOrder:
     Notes
     -----
     A stray packet, of another sender or with a damaged number, is ignored. Two in a row that fit
-    each other are a sender that begins anew; if it has another identity, the old one must be
+    each other are a restarted sender; if it has another identity, the old one must be
     silent, so that of two senders to one port the first is kept.
     """
 
@@ -137,7 +137,7 @@ class RtpOrder:
         if packet.sender != self._sender or abs(step) > _MAX_STEP:
             return self._consider(packet, arrival)
         if step < 0:
-            # Comes twice, or too late; after a silence, a sender that began anew close by.
+            # A duplicate, or too late; after a silence, a restarted sender with a close number.
             silent = arrival - self._heard >= _RESTART_SILENCE_S
             return self._consider(packet, arrival) if silent else []
         self._heard = arrival
@@ -211,7 +211,7 @@ TICKS_HZ = 90_000
 _STAP_A, _FU_A = 24, 28
 _SINGLE = range(1, 24)
 _UNUSED = frozenset({0, 2, 3, 4, 30, 31})
-"""Types that no H.264 encoder sends, but H.265 in RTP shows all the time."""
+"""Types that no H.264 encoder sends, but that H.265 in RTP often contains."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ class AccessUnit:
     after_loss : bool
         Packets before it, or of it, are lost.
     is_restart : bool
-        The first of a sender that begins anew.
+        The first of a restarted sender.
     """
 
     ticks: int
@@ -240,7 +240,7 @@ class AccessUnit:
 
 
 class H264Depacketizer:
-    """Builds pictures from packets in order.
+    """Depacketizer of H.264: builds pictures from packets in order.
 
     Attributes
     ----------
@@ -287,7 +287,7 @@ class H264Depacketizer:
         return done
 
     def _note(self, ordered: Ordered) -> None:
-        """Keep in mind what is missing before a packet."""
+        """Remember that packets are missing before a packet."""
         if ordered.is_restart:
             self._is_restart = self._gap_before = True
             self._unwrap = Unwrapper(32)
@@ -336,7 +336,7 @@ class H264Depacketizer:
     def _take_fragment(self, payload: bytes) -> None:
         indicator, header = payload[0], payload[1]
         if bool(header & 0x80) == bool(self._fragments):
-            self._spoil()  # Begins within another, or goes on with none.
+            self._spoil()  # Starts within another unit, or continues none.
         if header & 0x80:
             self._fragments = [bytes([indicator & 0xE0 | header & 31])]
         self._fragments.append(payload[2:])

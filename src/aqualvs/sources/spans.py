@@ -1,12 +1,10 @@
-"""Parts of a dive that can be decoded by themselves, and how they are found.
+"""Spans of a dive that can be decoded independently, and readers of their frames.
 
-A part of a video must begin at a picture from which decoding can start as if nothing had been
-before. In H.264 and HEVC that is an instantaneous decoding refresh (IDR): by the standards (ITU-T
-H.264, 7.4.1.2.4; H.265, 7.4.2.2) no later picture refers to one before it, and none of those that
-follow it in the file is shown before it. Key frames that promise less are no place to cut. A dive
-about which any doubt is left stays in one piece.
-
-The frames of a part of a dive, read by themselves.
+A span of a video must begin at a picture from which decoding can start without any earlier picture.
+In H.264 and HEVC that is an instantaneous decoding refresh (IDR): by the standards (ITU-T H.264,
+7.4.1.2.4; H.265, 7.4.2.2) no later picture refers to one before it, and none that follows it in the
+file is shown before it. Other key frames promise less; the video is not cut there. If any doubt is
+left, the dive stays in one span.
 """
 
 import itertools
@@ -31,16 +29,16 @@ from aqualvs.sources.base import planes_of
 from aqualvs.sources.h264 import UnitReader, unit_reader
 from aqualvs.sources.images import ImageSource, images_in
 
-# Codecs that predict no picture from another.
+# Codecs without prediction between pictures.
 _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
-# The container's promise is kept where the last picture comes no earlier than this before its end;
-# the serial reader is more patient.
+# Tolerance in the time of the last picture before the end that the container states; the serial
+# reader allows more.
 _EARLY_FRAMES, _EARLY_SHARE = 2.0, 0.01
 _PATIENCE_S = 10.0
 
 
 class SpanKind(StrEnum):
-    """How the frames of a part are read."""
+    """Method by which the frames of a span are read."""
 
     WHOLE = "whole"
     """All of them, as a run reads them."""
@@ -76,7 +74,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class VideoSpans:
-    """How a video may be cut.
+    """Spans into which a video may be cut.
 
     Attributes
     ----------
@@ -151,7 +149,7 @@ def joint_checksum(checksums: Sequence[int]) -> int:
 
 
 class _Packets:
-    """What is known of the packets so far; takes note of the first doubt about cutting them."""
+    """Packets read so far, and the first reason found not to cut the video."""
 
     def __init__(self, stream: VideoStream) -> None:
         self._stream = stream
@@ -171,7 +169,7 @@ class _Packets:
 
     @property
     def checksum(self) -> int:
-        """Of all packets."""
+        """Checksum of all packets."""
         return joint_checksum(self._sums)
 
     @property
@@ -208,7 +206,7 @@ class _Packets:
         return "" if self._cuts[:1] == [0] else "no key frame at the beginning"
 
     def spans(self, n_least: int) -> tuple[Span, ...]:
-        """Return the parts, each of which begins at a picture that needs none before it."""
+        """Return the spans, each of which begins at a picture that needs none before it."""
         starts = _far_enough(self._sound_cuts(), n_least)
         edges = [*starts, len(self._pts)]
         origin = min(self._pts)
@@ -253,7 +251,7 @@ class _Packets:
         if self._units is None:
             return packet.is_keyframe
         found = self._units(memoryview(packet))
-        # Parameter sets in the file's midst count from there on; a part must bring its own.
+        # Parameter sets within the file apply from there on; a span must contain its own.
         self._sets_in_band = self._sets_in_band or found.has_parameter_sets
         return found.is_refresh and (found.has_all_parameter_sets or not self._sets_in_band)
 
@@ -268,7 +266,7 @@ def _far_enough(cuts: Sequence[int], n_least: int) -> list[int]:
 
 
 def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
-    """Return in words that the file may hold less than it says; empty if all is there."""
+    """Return a note if the file may hold less than its container states; empty if not."""
     if stream.time_base is None:
         return "no clock"
     if stream.frames:
@@ -295,11 +293,11 @@ _SEEK_BEFORE_S = (0, 2, 20, 1_000_000)
 
 
 class UnlikeSurveyError(Exception):
-    """A part of a dive does not hold what it should; the dive must be measured in one piece."""
+    """Difference between a span and its description; the dive must be measured in one piece."""
 
 
 class VideoParts(Closing):
-    """Reads parts of a video, opened once for all of them; a context manager.
+    """Reader of spans of a video, opened once for all of them; a context manager.
 
     Parameters
     ----------
@@ -323,7 +321,7 @@ class VideoParts(Closing):
         Raises
         ------
         UnlikeSurveyError
-            If any picture is damaged or missing: only the whole video tells what becomes of those
+            If any picture is damaged or missing: the whole video decides what becomes of those
             that follow.
         """
         index, latest = span.first, span.origin_pts - 1
@@ -354,7 +352,7 @@ class VideoParts(Closing):
 
     def _stream(self, span: Span) -> VideoStream:
         if not span.first:
-            # Some containers cannot be wound back.
+            # Some containers cannot seek to the start.
             self.close()
         if self._container is None:
             self._container = av.open(str(self._path), timeout=_PATIENCE_S)

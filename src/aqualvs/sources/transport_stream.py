@@ -10,14 +10,14 @@ _CODECS = {0x01: "mpeg1video", 0x02: "mpeg2video", 0x10: "mpeg4", 0x1B: "h264", 
 """FFmpeg's names by stream type (table 2-34)."""
 
 _RESTART_TICKS = 10 * TICKS_HZ
-"""A step in time beyond this is a sender that begins anew."""
+"""A step in time beyond this is a restarted sender."""
 
 _MAX_BYTES = 16 << 20
-"""No picture is larger; what is has lost its end."""
+"""No picture is larger; larger data have lost their end."""
 
 
 class TransportStream:
-    """Builds the pictures of the first video from packets of 188 bytes.
+    """Demultiplexer of the first video of an MPEG-TS, from packets of 188 bytes.
 
     Attributes
     ----------

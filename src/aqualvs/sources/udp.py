@@ -1,8 +1,7 @@
 """Live video over UDP: RTP with H.264, MPEG-TS, or a bare H.264 byte stream.
 
-Session descriptions (RFC 8866) of RTP streams.
-
-From datagrams to frames, for each kind of content.
+`UdpFeed` listens on a port and picks the reader for the content: `RtpReader`, `TransportReader` or
+`BareReader`. `read_sdp` reads the session description (RFC 8866) of an RTP stream.
 """
 
 import base64
@@ -136,7 +135,7 @@ def _parameter_sets(part: str, payload_type: int) -> bytes:
 
 
 class RtpReader:
-    """Reads RTP with H.264.
+    """Reader of RTP with H.264.
 
     Parameters
     ----------
@@ -195,7 +194,7 @@ class RtpReader:
 
 
 class TransportReader:
-    """Reads MPEG-TS.
+    """Reader of MPEG-TS.
 
     Parameters
     ----------
@@ -227,13 +226,13 @@ class TransportReader:
             for picture in stream.push(content or b""):
                 if codec != stream.codec:
                     codec = stream.codec or ""
-                    # A loss of 16 packets, or as many times that, shows in no counter.
+                    # A loss of 16 packets, or a multiple of that, shows in no counter.
                     self._frames.connect(decoder_of(codec), 1 / TICKS_HZ, hears_losses=False)
                 yield from decoded(self._frames, picture)
 
 
 class BareReader:
-    """Reads H.264 without any container, cut into datagrams anywhere.
+    """Reader of H.264 without a container, cut into datagrams anywhere.
 
     Parameters
     ----------
@@ -318,11 +317,11 @@ def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
 
 
 _RETRY_S = 0.5
-"""Between two tries to listen."""
+"""Pause between two attempts to listen."""
 
 
 class UdpFeed:
-    """Listens on a UDP port and takes what comes; satisfies `Feed`.
+    """Feed from a UDP port, whatever kind of stream arrives; satisfies `Feed`.
 
     Parameters
     ----------
@@ -330,7 +329,7 @@ class UdpFeed:
         How health and messages call it.
     address : UdpAddress
     parameter_sets : bytes
-        SPS and PPS as a byte stream, where an SDP file tells them; else they come in the stream.
+        SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
     payload_type : int or None
         Of RTP; None takes every dynamic one (96 to 127).
 
@@ -396,7 +395,7 @@ class UdpFeed:
         return found
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
-        """Yield frames of whatever kind comes, which may change."""
+        """Yield frames of any kind of content, which may change."""
         readers: dict[str, Callable[[Inbox], Iterator[Frame]]] = {
             RTP: RtpReader(self._frames, self._parameter_sets, self._payload_type).frames,
             TS: TransportReader(self._frames).frames,

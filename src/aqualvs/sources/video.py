@@ -1,6 +1,6 @@
 """Frames from a video file or stream, decoded by FFmpeg through PyAV.
 
-Numbers of pictures, with gaps for lost ones.
+`Ledger` numbers the pictures by their packets, so that lost pictures leave a gap in the index.
 """
 
 import heapq
@@ -21,7 +21,7 @@ from aqualvs.sources.spans import promised_duration
 
 
 class Ledger:
-    """Numbers pictures by the packets that announced them, so that lost ones leave a gap.
+    """Numbers of pictures by the packets that announced them; lost ones leave a gap.
 
     Parameters
     ----------
@@ -102,15 +102,15 @@ class Ledger:
 
 
 _STALL_S = 10.0
-"""A stream that sends nothing for so long has ended."""
+"""A stream that sends nothing for this time has ended."""
 
 _HIDDEN_PACKETS = frozenset({"vp8"})
 """Codecs whose packets need not show a picture, so that packets cannot be counted as frames."""
 
 _LOSSY_CONTAINERS = frozenset({"mpegts", "rtsp"})
 """Containers in which a packet marked as damaged still holds most of its picture, which helps to
-predict the next ones. Elsewhere it is the torn end of a file; its error would take the sound
-pictures with it that the decoder still holds."""
+predict the next ones. Elsewhere it is the torn end of a file; its error would discard the intact
+pictures that the decoder still holds."""
 
 
 class VideoSource(Closing):
@@ -143,8 +143,8 @@ class VideoSource(Closing):
         self.name = str(where)
         self._container = _open(self.name)
         self._stream = self._video_stream()
-        # Threads that share a picture leave patched ones unmarked; threads with a picture each do
-        # not wait for each other's patches, so that what follows would be left to chance.
+        # Slice threads leave patched pictures unmarked; frame threads do not wait for each other's
+        # patches, so that the following pictures would depend on timing.
         self._stream.codec_context.thread_count = 1
         self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
         rate = self._stream.average_rate or self._stream.guessed_rate
@@ -174,7 +174,7 @@ class VideoSource(Closing):
         self._check_complete(n_delivered, last)
 
     def _pictures(self) -> Iterator[VideoFrame]:
-        """Decode what can be decoded, in order of presentation."""
+        """Decode all undamaged pictures, in order of presentation."""
         for packet in self._packets():
             self._ledger.expect(packet)
             if packet.is_corrupt and not self._damage_is_partial:

@@ -1,4 +1,4 @@
-"""What the vehicle logged of its own motion, next to a dive: depth, heading, attitude."""
+"""Logs of the vehicle's own motion during a dive: depth, heading, attitude."""
 
 from aqualvs.vehicle_logs.reading import read_vehicle_log
 from aqualvs.vehicle_logs.time_offset import (

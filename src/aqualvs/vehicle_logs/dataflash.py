@@ -1,20 +1,19 @@
-"""ArduPilot's dataflash logs (`.BIN`, and their text form `.log`), as the vehicle writes them.
+"""ArduPilot's dataflash logs, binary (`.BIN`) and text (`.log`): their records and their signals.
 
-Which record is read for what, and why:
+A dataflash log describes itself: `FMT` records give the number, length, NumPy-like format and
+columns of every other kind. Binary records start with 0xA3 0x95 and the number of their kind; they
+carry no checksum (https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html). Only
+the wanted kinds are decoded.
+
+Records read for each signal, with reasons:
 
 - attitude and heading: `ATT`, the attitude that the autopilot flies by.
-- depth: `CTUN.Alt`, the height that ArduSub flies by, from its filter, 0 at the surface. `POS`
-  follows home when someone moves it; the filter's own `XKF1.PD` counts from where it started.
-  `CTUN.BAlt` and `BARO.Alt` are the pressure sensor without filter; of several `BARO`, the one in
-  the water is not the first, which sits in the hull.
+- depth: `CTUN.Alt`, the filtered height that ArduSub flies by, 0 at the surface. `POS` follows home
+  when someone moves it; the filter's own `XKF1.PD` counts from where it started. `CTUN.BAlt` and
+  `BARO.Alt` are the pressure sensor without filter; of several `BARO`, the one in the water is not
+  the first, which sits in the hull.
 - velocity: `XKF1` (`NKF1` of older firmware), of the first core.
-- UTC: `GPS` (leap seconds of 2017 taken off), else `RTC`.
-
-Records of ArduPilot's dataflash logs, binary and text, without decoding those nobody asks for.
-
-Such a log describes itself: `FMT` records give every other kind's number, length, NumPy-like format
-and columns. Binary records start with 0xA3 0x95 and their number; they carry no checksum
-(https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html).
+- UTC: `GPS` (leap seconds of 2017 subtracted), else `RTC`.
 """
 
 import re
@@ -63,7 +62,7 @@ _NEIGHBOURS = 9
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """What an `FMT` record says of a kind of record.
+    """Format of one kind of record, as its `FMT` record describes it.
 
     Attributes
     ----------
@@ -137,7 +136,7 @@ def read_binary(data: bytes, wanted: Iterable[str]) -> Records:
 def _scan(
     data: bytes, names: frozenset[str], places: dict[str, list[int]], formats: dict[str, Format]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Walk over the records, note where the wanted ones are and what they look like."""
+    """Walk over the records; note the places and formats of the wanted ones."""
     lengths: dict[int, int] = {_FMT: _FMT_LENGTH}
     lists: dict[int, list[int]] = {}
     skipped: list[tuple[int, int]] = []
@@ -146,7 +145,7 @@ def _scan(
         kind = data[at + 2]
         length = lengths.get(kind, 0) if data[at] == 0xA3 and data[at + 1] == 0x95 else 0
         if not length:
-            # A record that lost bytes swallows the next ones, so the search begins within it.
+            # A record that lost bytes overlaps the next ones, so the search begins within it.
             found = _next_record(data, last + 1 if n_records else 0, lengths)
             begin = at if found is None or found >= at else last
             swallower = lists.get(data[last + 2]) if begin == last < at else None

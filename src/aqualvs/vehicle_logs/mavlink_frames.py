@@ -1,9 +1,8 @@
-"""MAVLink frames out of a telemetry log, without parsing those that nobody asks for.
+"""MAVLink frames from a telemetry log; only frames of the wanted messages are decoded.
 
 A telemetry log is a chain of records: the time of receipt (UTC, microseconds, big-endian, 8 bytes)
-and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The chain is followed
-from header to header; only frames of wanted messages are checked and decoded, all of one kind at
-once.
+and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The reader follows the
+chain from header to header, and checks and decodes wanted frames only, all of one kind at once.
 """
 
 import re
@@ -125,7 +124,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """What a telemetry log holds of the wanted messages.
+    """Wanted messages of a telemetry log.
 
     Attributes
     ----------
@@ -180,7 +179,7 @@ def _scan(
     while at + _SHORTEST <= size:
         end = _record_end(data, at)
         if end is None:
-            # A record that lost bytes swallows the next ones, so the search begins within it.
+            # A record that lost bytes overlaps the next ones, so the search begins within it.
             found = _next_record(data, last + 1 if n_frames else 0)
             begin = at if found is None or found >= at else last
             skipped.append((begin, (size if found is None else found) - begin))
@@ -238,7 +237,7 @@ def _decode(
     frame = at + _STAMP
     length = octets[frame + 1].astype(np.int64)
     size = message.dtype.itemsize
-    # MAVLink 2 cuts zeros off the end; they read as zeros again.
+    # MAVLink 2 truncates trailing zeros; they are restored as zeros.
     column = np.arange(size)
     inside = column < length[:, None]
     places = np.where(inside, frame[:, None] + header + column, 0)

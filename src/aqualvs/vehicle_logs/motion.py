@@ -1,6 +1,7 @@
-"""Angles over time as band-passed rates on an even grid, the form in which motions are compared.
+"""Angular motion as band-passed rates on an even grid, and the correlation of two such motions.
 
-How well two motions agree at every time offset, and at one offset in detail.
+`rates_of` computes the rates; `scores_of` scores the agreement at every time offset, `match_at`
+that at one offset, sample by sample.
 """
 
 import math
@@ -14,17 +15,17 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal
 
 STEP_S = 0.05
-"""Of the grid; what is faster than the smoothing below is noise, so finer would tell nothing."""
+"""Step of the grid. Motion faster than the smoothing below is noise: a finer step adds nothing."""
 SMOOTHING_S = 0.4
 """Standard deviation of the window over which a rate is taken. Posture's noise of 0.4 degrees at
 25 Hz leaves a rate of 0.1 degrees a second; a vehicle's own motion is slower than this window."""
 _TREND_S = 5.0
-"""What changes more slowly is left out: the net's own bearing along a cage, drift of a compass."""
+"""Slower changes are left out: the net's own bearing along a cage, drift of a compass."""
 _LEAST_COVER = 0.5
 """Share of the window that must hold values."""
 _CLIP_SIGMAS = 4.0
 _CLIP_RATE = math.radians(5.0)
-"""Rates beyond both are cut down to the larger one, lest one false reading decides."""
+"""Rates beyond both are clipped to the larger one, so that no single false reading decides."""
 _HAMPEL_SAMPLES = 11
 _HAMPEL_SIGMAS = 5.0
 _HAMPEL_ANGLE = math.radians(2.0)
@@ -41,7 +42,7 @@ class Rates:
     rate : array, shape (n,)
         Radians a second, extreme ones cut down; 0 where not valid.
     valid : bool array, shape (n,)
-        Where there are values enough to tell.
+        Where there are enough values.
     """
 
     start_s: float
@@ -87,7 +88,7 @@ def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
 
 
 def robust_sigma(values: FloatArray) -> float:
-    """Return the standard deviation that the median of the magnitudes stands for; 0 for none."""
+    """Return the standard deviation by the median of the magnitudes; 0 for none."""
     return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
@@ -101,7 +102,7 @@ def _slopes(values: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray
     window = np.exp(-0.5 * (lag / SMOOTHING_S) ** 2)
     centred = np.where(valid, values - values[valid].mean(), 0.0) if valid.any() else values
     count = valid.astype(float)
-    # Reversed kernels, since convolution turns them round.
+    # Reversed kernels, because convolution reverses them.
     s0, s2 = _convolve(count, window), _convolve(count, window * lag**2)
     s1, sx = _convolve(count, -window * lag), _convolve(centred, window)
     stx = _convolve(centred, -window * lag)
@@ -124,7 +125,7 @@ def _smooth(values: FloatArray, valid: BoolArray) -> FloatArray:
 
 
 def _convolve(values: FloatArray, window: FloatArray) -> FloatArray:
-    # A second to import, which only this needs.
+    # Imported here: it takes a second, and only this function needs it.
     from scipy.signal import oaconvolve
 
     whole: FloatArray = oaconvolve(values, window, mode="full")
@@ -227,7 +228,7 @@ def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
     n = np.maximum(count, 1.0)
     mean_a, mean_b = pairs(fa, fmb) / n, pairs(fma, fb) / n
     var_a, var_b = pairs(fa2, fmb) / n - mean_a**2, pairs(fma, fb2) / n - mean_b**2
-    # Relative to the whole, so that rounding of the transform cannot pass for motion.
+    # Relative to the sum, so that rounding errors of the transform do not count as motion.
     moving = (var_a > 1e-6 * np.mean(a**2)) & (var_b > 1e-6 * np.mean(b**2)) & (count > 0)
     spread = np.sqrt(np.where(moving, var_a * var_b, 1.0))
     rho = np.where(moving, (pairs(fa, fb) / n - mean_a * mean_b) / spread, 0.0)

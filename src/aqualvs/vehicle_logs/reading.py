@@ -1,11 +1,9 @@
-"""A vehicle's log as a table of comma-separated values.
+"""Vehicle logs of any format (`read_vehicle_log`), and the reader of CSV tables.
 
-Columns, in any order: `time_s` (seconds on any clock) or `time` (UTC, ISO 8601); `depth_m`,
-positive down; `heading_deg`, clockwise from north; and, if known, `roll_deg` and `pitch_deg`. One
-of depth and heading must be there. An empty cell is a value that was not logged. Other columns are
-ignored, unless they look like one of these in another unit.
-
-Reading a vehicle's log, whatever its format.
+Columns of a table, in any order: `time_s` (seconds on any clock) or `time` (UTC, ISO 8601);
+`depth_m`, positive down; `heading_deg`, clockwise from north; and optionally `roll_deg` and
+`pitch_deg`. At least one of depth and heading is required. An empty cell is a value that was not
+logged. Other columns are ignored, unless they look like one of these in another unit.
 """
 
 import csv
@@ -36,9 +34,9 @@ _COLUMNS = TIME_COLUMNS + VALUE_COLUMNS
 _STEMS = {name.rsplit("_", 1)[0]: name for name in VALUE_COLUMNS} | {"yaw": "heading_deg"}
 _UNITS = frozenset({"", "m", "cm", "mm", "ft", "deg", "rad", "degrees", "radians", "cdeg"})
 _LARGEST = {"depth_m": 12000.0, "heading_deg": 720.0, "roll_deg": 360.0, "pitch_deg": 180.0}
-# Waves and the sensor's zero put a vehicle this far above the surface, no further.
+# Greatest height above the surface, from waves and the sensor's zero.
 _ABOVE_SURFACE_M = -2.0
-# A computer whose clock the network sets is right to well below this.
+# Clocks set by the network are more accurate than this.
 _UTC_SIGMA_S = 2.0
 
 
@@ -62,7 +60,7 @@ def read_csv_log(path: Path) -> VehicleLog:
     names, ignored = _columns([cell.strip() for cell in rows[0][1]], path)
     notes = (f"columns not used: {', '.join(ignored)}",) if ignored else ()
     if len(rows) > 2 and len(rows[-1][1]) < len(names):
-        # A recording that was interrupted ends within a line.
+        # An interrupted recording ends within a line.
         notes = (*notes, f"line {rows[-1][0]}, the last, is cut short and left out")
         del rows[-1]
     table, start_utc_s = _table(names, rows[1:], path)
@@ -234,7 +232,7 @@ _OTHERS = {
 
 
 def read_vehicle_log(path: str | Path) -> VehicleLog:
-    """Read a vehicle's log; the format is told from the content, not from the name.
+    """Read a vehicle's log; the content determines the format, not the name.
 
     Parameters
     ----------
@@ -266,7 +264,7 @@ def read_vehicle_log(path: str | Path) -> VehicleLog:
 
 
 def _reader(head: bytes, path: Path) -> Callable[[Path], VehicleLog]:
-    """Return what reads such a file."""
+    """Return the function that reads a file with such content."""
     if looks_like_dataflash(head):
         return read_dataflash
     if looks_like_dataflash_text(head):

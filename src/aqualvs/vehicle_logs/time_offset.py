@@ -1,12 +1,12 @@
-"""The offset between a dive's clock and the vehicle's, found from the motion that both saw.
+"""Time offset between a dive's clock and the vehicle's, from the motion seen by both, or from UTC.
 
 The net stands still: when the vehicle turns right, the net's far normal turns left in the dome's
 frame, and when its nose rises, the normal falls. So posture yaw changes opposite to heading, and
-posture pitch opposite to the vehicle's pitch. Rates are compared, between about 0.03 and 0.5 Hz:
-the bearing of the net itself, which changes as the vehicle moves along a cage, and the compass's
-drift are slower.
+posture pitch opposite to the vehicle's pitch. `find_time_offset` compares rates between about 0.03
+and 0.5 Hz: the bearing of the net itself, which changes as the vehicle moves along a cage, and the
+compass's drift are slower.
 
-The offset that clocks give: the log's UTC against the time that a video's container states.
+`offset_from_clocks` compares the log's UTC with the time that a video's container states.
 """
 
 import datetime
@@ -34,12 +34,12 @@ from aqualvs.vehicle_logs.vehicle_log import Signal, VehicleLog
 _LEAST_OVERLAP_S = 30.0
 _LONGEST_S = 24 * 3600.0
 _LOBE_S = 1.0
-"""Within this of the best offset, another is no rival but the same peak."""
+"""Offsets within this of the best one belong to the same peak and are no rivals."""
 _N_RIVALS = 30
 _BLOCK_S = 3.0
-"""Longer than a motion lasts, so that blocks are independent witnesses."""
+"""Longer than a motion lasts, so that blocks are independent."""
 _LEAST_MARGIN = 2.5
-"""By how many standard deviations the best offset must explain the blocks better than any other."""
+"""Least number of standard deviations by which the best offset must exceed all others."""
 _START_SIGMAS = 4.0
 _ITERATIONS = 8
 _HUBER = 1.5
@@ -225,7 +225,7 @@ def _peaks(scores: Scores, allowed: BoolArray) -> list[float]:
     """Return the offsets of the best peaks, the highest first."""
     height = np.where(allowed, scores.score, 0.0)
     # Padded, since a peak may be the first or the last.
-    # A second to import, which only this needs.
+    # Imported here: it takes a second, and only this function needs it.
     from scipy.signal import find_peaks
 
     tops, _ = find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))
@@ -343,7 +343,7 @@ def _words(matches: list[Match], channels: tuple[Channel, ...], shared_s: float)
 
 
 def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
-    """Add what the clocks say."""
+    """Add a comparison with the offset by the clocks."""
     off = start.offset_s - found.offset_s
     doubt = math.hypot(found.sigma_s, start.sigma_s)
     verdict = "agree" if abs(off) <= _START_SIGMAS * doubt else "are not to be trusted"

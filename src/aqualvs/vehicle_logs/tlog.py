@@ -1,19 +1,17 @@
-"""MAVLink telemetry logs (`.tlog`), as ground stations write them.
+"""MAVLink telemetry logs (`.tlog`) of ground stations: signals, choice of the depth, and the clock.
 
-Which message is read for what, and why:
+Messages read for each signal, with reasons:
 
-- attitude and heading: `ATTITUDE`, which carries the autopilot's time and comes fastest. Where it
-  is missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then `VFR_HUD` (whole
-  ones).
+- attitude and heading: `ATTITUDE`, which carries the autopilot's time and comes at the highest
+  rate. Where it is missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then
+  `VFR_HUD` (whole degrees).
 - depth: `GLOBAL_POSITION_INT.relative_alt`, height above home, which ArduSub puts at the surface.
   `VFR_HUD.alt` is above mean sea level and 0 without a home; `AHRS2.altitude` comes from the spare
-  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, tells changes only: what the
-  pressure was at the surface, the log does not say.
+  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, shows changes only, because the
+  log does not contain the pressure at the surface. `choose_depth` takes the first that moves.
 - velocity: `LOCAL_POSITION_NED`, then `GLOBAL_POSITION_INT` in cm/s.
 
-Which of several depths in a log to believe.
-
-One clock for a telemetry log: the autopilot's, through reboots, with its place in UTC.
+`TelemetryClock` puts all messages on the autopilot's clock, through reboots, and places it in UTC.
 """
 
 import datetime
@@ -58,7 +56,7 @@ def choose_depth(
     candidates : sequence of Candidate
         The best first.
     pressure_depth : Signal or None
-        Depth that the outer pressure alone tells, up to a constant. An estimate that stands still
+        Depth by the outer pressure alone, up to a constant. An estimate that stands still
         while the pressure changes is the estimate of a filter without origin, not a depth.
     """
     dived = 0.0 if pressure_depth is None else _span(pressure_depth)
@@ -84,10 +82,10 @@ def _span(depth: Signal) -> float:
 _BOOT = "time_boot_ms"
 _REBOOT_S = 2.0
 _BLOCK_S = 30.0
-"""A tether delays some message by next to nothing in so long a time."""
+"""In this time, a tether delays at least one message by almost nothing."""
 _CLOCK_STEP_S = 1.0
 _UTC_SIGMA_S = 2.0
-"""A computer whose clock the network sets is right to well below this."""
+"""Clocks set by the network are more accurate than this."""
 _FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
 
 
@@ -98,7 +96,7 @@ class TelemetryClock:
     Attributes
     ----------
     at : array, shape (n,)
-        Places in the file of the messages that the clock rests on.
+        Places in the file of the messages that define the clock.
     log_s : array, shape (n,)
         Their log time.
     boot_at : array, shape (k,)

@@ -1,8 +1,8 @@
-"""What a vehicle wrote down of its own motion during a dive.
+"""A vehicle's log of its own motion: signals over time, and places on the net that were seen.
 
-One quantity over time, as a vehicle logged it.
-
-Where on the net the dive was looking: depth, heading and the net's bearing for dive times.
+- `VehicleLog`: all signals on one clock, and what is wrong with the file.
+- `Signal`: one quantity with its own time stamps, interpolated except across gaps.
+- `Places`: depth, heading and the net's bearing at dive times.
 """
 
 import math
@@ -27,7 +27,7 @@ _SHORTEST_GAP_S = 0.5
 
 
 class Interpolation(StrEnum):
-    """What a signal does between its samples."""
+    """Interpolation of a signal between its samples."""
 
     LINEAR = "linear"
     """Changes evenly."""
@@ -52,7 +52,7 @@ class Signal:
     interpolation : Interpolation
         How values between samples are found.
     max_gap_s : float
-        No value is told between samples that are further apart than this.
+        Values between samples that are further apart than this are not valid.
     """
 
     time_s: FloatArray
@@ -166,7 +166,7 @@ def bearing_of(angle: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """The vehicle at some times; NaN and False where the log does not tell.
+    """The vehicle at some times; NaN and False where the log has no value.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ class VehicleState:
     depth, heading, roll, pitch : array, shape (n,)
         Metres, positive down; radians, heading in [0, 2 pi).
     depth_valid, heading_valid, roll_valid, pitch_valid : bool array, shape (n,)
-        Where the log tells them.
+        Where the log has them.
     """
 
     time_s: FloatArray
@@ -219,7 +219,7 @@ class VehicleLog:
     sources : mapping of str to str
         Signal to what in the file it was read from, and why where there was a choice.
     notes : tuple of str
-        What is wrong with the file, one line each: cut short, corrupt stretches, clock steps.
+        What is wrong with the file, one line each: cut short, corrupt sections, clock steps.
     """
 
     name: str
@@ -260,7 +260,7 @@ class VehicleLog:
         )
 
     def at(self, time_s: ArrayLike) -> VehicleState:
-        """Return the vehicle's state at other times; nothing is told across gaps.
+        """Return the vehicle's state at other times; values in gaps are not valid.
 
         Parameters
         ----------
@@ -296,7 +296,7 @@ def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray
     return signal.at(times)
 
 
-# Straight up or down no bearing is left to tell.
+# A vertical normal has no bearing.
 _LEAST_HORIZONTAL = 0.05
 
 
@@ -319,7 +319,7 @@ class Places:
         Elevation of the far normal: 0 for a net that hangs plumb, positive where the net's top
         leans towards the vehicle, radians. Needs the vehicle's roll and pitch.
     depth_valid, heading_valid, bearing_valid, lean_valid : bool array, shape (n,)
-        Where they are told.
+        Where they are known.
     ned_from_dome : array, shape (n, 3, 3)
         Rotations from `dome` to `world` (north, east, down). The depth of a point in `dome` is
         `depth + (ned_from_dome @ p_in_dome)[2]`, but for the lever arm between the depth sensor
@@ -377,7 +377,7 @@ class VehiclePlaces:
         time_s : array, shape (n,)
             Dive time.
         yaw, pitch : array, shape (n,), optional
-            Posture to the net (paper, Eq. 24-26) at those times. Without yaw no bearing is told;
+            Posture to the net (paper, Eq. 24-26) at those times. Without yaw there is no bearing;
             without pitch the net counts as square to the dome's y axis in elevation.
         valid : bool array, shape (n,), optional
             Where the posture is valid; everywhere that it is finite, if left out.
@@ -386,7 +386,7 @@ class VehiclePlaces:
         -----
         The far normal is (tan yaw, 1, tan pitch) in `dome`, up to its length. Level, its bearing
         is heading + yaw: yaw is positive when the far normal points to the right, headings grow
-        clockwise. Roll and pitch of the vehicle are taken into account where the log tells them.
+        clockwise. Roll and pitch of the vehicle are taken into account where the log has them.
         """
         times = np.atleast_1d(np.asarray(time_s, float))
         state = self.log.at(times + self.offset_s)

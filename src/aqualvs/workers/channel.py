@@ -1,10 +1,8 @@
-"""How messages pass between the process that writes and those that measure.
+"""Messages between the writing process and the measuring processes: pipe and shared memory.
 
-Points are laid down in memory that both see, and the pipe between them only tells of it: a pipe
-holds less than the points of a few frames, so that both processes would be woken a dozen times for
-a block of them.
-
-What the processes of a crew send: blocks of measured frames, and how their parts ended.
+Messages are blocks of measured frames, and the `Ended` of each part. The points go into shared
+memory and the pipe only announces them: a pipe holds less than the points of a few frames, so that
+both processes would be woken a dozen times for each block.
 """
 
 import math
@@ -27,7 +25,7 @@ from aqualvs.workers.frame_results import Measured
 
 
 class Ended(Enum):
-    """How the measuring of a part ended."""
+    """Message that a part has ended, and its outcome."""
 
     WHOLE = auto()
     UNLIKE_SURVEY = auto()
@@ -40,7 +38,7 @@ _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fiel
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
 _ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
-# A line of the cache: no two columns share one.
+# Size of a cache line: no two columns share one.
 _ALIGNED = 64
 
 
@@ -128,7 +126,7 @@ def _places(n_points: int) -> list[tuple[int, int]]:
 _N_SLOTS = 3
 _SLOT_BYTES = 4 << 20
 _TAKEN = -1
-"""Said instead of a part's number: what was in a slot has been taken out of it."""
+"""Sent instead of a part's number: the data of a slot have been read."""
 
 
 class SharedMemory:
@@ -148,7 +146,7 @@ class SharedMemory:
     Raises
     ------
     OSError
-        If the memory is not to be had.
+        If the memory is not available.
     """
 
     def __init__(self, file: int) -> None:
@@ -220,7 +218,7 @@ class Sender:
             self._pipe.send((packed(message, own), own, n_bytes))
             return
         while self._n_free == 0:
-            # Only who has none is given a part: this can but be `_TAKEN`.
+            # A part is given only to a process without one, so this is always `_TAKEN`.
             self._pipe.recv()
             self._n_free += 1
         parcel = packed(message, self._memory.slots[self._next])

@@ -1,8 +1,9 @@
-"""From frames to what a run writes of them, a few frames at a time.
+"""Results of frames, a few frames at a time: measurement with and without the dome, in blocks.
 
-What ignoring the dome costs: the same stripe points, triangulated as if by a bare lens.
-
-Blocks of consecutive frames, and a thread that reads them ahead.
+- `Meter`: measures blocks of consecutive frames.
+- `BareLensComparison`: the posture from the same stripe points, triangulated as if by a bare lens:
+  the error of ignoring the dome.
+- `in_blocks`, `read_ahead`: blocks of frames, and a thread that reads them ahead.
 """
 
 import contextlib
@@ -26,13 +27,13 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of, reste
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.triangulate import Triangulator
 
-# Neighbouring points say the same; a few hundred are plenty for a comparison.
+# Neighbouring points are redundant; a few hundred are enough for a comparison.
 _EVERY = 4
 _MIN_POINTS = 6
 
 
 class BareLensComparison:
-    """Measures a scan's posture again with the rig's camera out of its dome.
+    """Measurement of a scan's posture with the rig's camera out of its dome.
 
     Detection, classification and the choice of the target are taken over from the scan, so that
     the difference is that of the ray model alone (paper, section 5.4).
@@ -175,7 +176,7 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
                 if given_up.is_set():
                     return
             put(_End())
-        except BaseException as fault:  # raised again where it is noticed
+        except BaseException as fault:  # raised again by the consumer
             put(_End(fault))
 
     thread = threading.Thread(target=fetch, name="frames", daemon=True)
@@ -191,14 +192,14 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
 
 
 class _End:
-    """Stands for the end of the items, and what brought it about."""
+    """Mark of the end of the items, with the exception that caused it."""
 
     def __init__(self, fault: BaseException | None = None) -> None:
         self.fault = fault
 
 
 class ScansFrames(Protocol):
-    """What a run needs of a scanner."""
+    """Interface of a scanner for a run."""
 
     def process(self, frame: Frame) -> Scan:
         """Return the scan of one frame."""
@@ -206,17 +207,17 @@ class ScansFrames(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was found in a frame.
+    """Result of one frame.
 
     Attributes
     ----------
     scan : Scan
     bare : Posture, Refusal or None
-        What ignoring the dome would make of it; None for a rig without a dome.
+        Result when the dome is ignored; None for a rig without a dome.
     frame : Frame or None
         None for a frame that was lost, or that another process has measured.
     is_lost : bool
-        Whether the scan stands for a frame that could not be decoded.
+        Whether the scan is that of a frame that could not be decoded.
     """
 
     scan: Scan
@@ -226,7 +227,7 @@ class Measured:
 
 
 class Meter:
-    """Measures frames, with the dome and without.
+    """Measurement of frames, with the dome and without.
 
     Parameters
     ----------
@@ -253,7 +254,7 @@ class Meter:
         ]
 
     def lost(self, scan: Scan) -> Measured:
-        """Complete the scan that stands for a lost frame."""
+        """Complete the scan of a lost frame."""
         return Measured(scan, self._bare(scan), is_lost=True)
 
     def _bare(self, scan: Scan) -> Posture | Refusal | None:
@@ -263,7 +264,7 @@ class Meter:
         scanner = self._scanner
         if not isinstance(scanner, Scanner):
             return [scanner.process(frame) for frame in frames]
-        # Step by step for all of them: code that has just run is still in the caches, where
+        # Step by step for all frames: code that has just run is still in the caches, from which
         # decoding and the other step would displace it.
         returns = [scanner.detect(frame) for frame in frames]
         return [
@@ -275,23 +276,23 @@ class Meter:
 def measured_blocks(
     blocks: Iterator[list[tuple[list[Scan], Frame]]], meter: Meter
 ) -> Iterator[list[Measured]]:
-    """Yield what is found in frames, and what stands for lost ones, in the order of the dive.
+    """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
     Parameters
     ----------
     blocks : iterator of list
-        Of frames with the scans that stand for the lost ones right before, see `with_losses`.
+        Of frames with the scans of the lost ones right before, see `with_losses`.
     meter : Meter
 
     Yields
     ------
     found : list of Measured
-        Of one block; what stands for lost frames before it comes by itself.
+        Of one block; scans of lost frames before it come by themselves.
     """
     for block in blocks:
         (before, _), *others = block
         if before:
-            # Before anything is recorded of the block's own frames.
+            # Before any result of the block's own frames is recorded.
             yield [meter.lost(scan) for scan in before]
         first, *more = meter.measure([frame for _, frame in block])
         found = [first]

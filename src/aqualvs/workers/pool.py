@@ -1,8 +1,7 @@
-"""Processes that measure a dive together, each some parts of it; what they find comes in order.
+"""A pool of processes that measure parts of a dive; results are yielded in the order of the dive.
 
-What the processes of a crew do: each measures parts of a dive by themselves.
-
-Which runs several processes can share, and how.
+`crew_work` decides whether and how processes can share a run; `Crew` begins them and collects their
+results; `serve` is the loop of each process.
 """
 
 import contextlib
@@ -43,7 +42,7 @@ from aqualvs.workers.start_method import context, deaf_to_interrupts, interrupts
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of a span that are wanted.
+    """Wanted frames of a span.
 
     Attributes
     ----------
@@ -59,7 +58,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrewWork:
-    """What a crew measures.
+    """Work of a pool: the dive, its parts, and what measures it.
 
     Attributes
     ----------
@@ -93,7 +92,7 @@ def serve(
     """
     for other in others:
         other.close()
-    # A terminal sends Ctrl-C to all processes; the one that has begun this one decides.
+    # A terminal sends Ctrl-C to all processes; the parent process decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
@@ -106,7 +105,7 @@ def serve(
                 for message in _messages(part, _frames(work, part, video), meter):
                     sender.send(message)
     except (EOFError, ConnectionError):
-        # The other end has gone; whatever is buffered for it goes too.
+        # The other end is closed; buffered data are discarded.
         os._exit(1)
 
 
@@ -114,7 +113,7 @@ def _messages(part: Part, frames: Iterator[Frame], meter: Meter) -> Iterator[Mes
     wanted = itertools.islice(
         frames,
         part.first - part.span.first,
-        # To its very end, where the reader compares the span with what was promised.
+        # To its end, where the reader compares the span with its description.
         None if part.stop == part.span.stop else part.stop - part.span.first,
     )
     try:
@@ -133,10 +132,10 @@ def _frames(work: CrewWork, part: Part, video: VideoParts) -> Iterator[Frame]:
 
 
 _LEAST_FRAMES = 100
-"""Fewer are measured before more processes are ready."""
+"""Least number of frames to share: fewer are measured before more processes are ready."""
 
 _PART_FRAMES = 32
-"""A part has at least so many, since the first frames of each cost more."""
+"""Least number of frames in a part, because the first frames of each cost more."""
 
 
 def crew_work(
@@ -176,7 +175,7 @@ def _spans(source: FrameSource) -> tuple[Span, ...]:
         try:
             return video_spans(path, _PART_FRAMES).spans
         except (av.error.FFmpegError, OSError):
-            # The serial reader says what is wrong with it.
+            # The serial reader reports the fault.
             return ()
     return ()
 
@@ -186,7 +185,7 @@ def _earlier(stop: int, wanted: int | None) -> int:
 
 
 _MOST_WAITING = 100
-"""Blocks for each process that wait for those of parts before; then only these are taken in."""
+"""Blocks for each process that may wait for earlier parts; beyond it, only those are read."""
 
 _PATIENCE_S = 2.0
 
@@ -202,7 +201,7 @@ class _Hand:
 
 
 class Crew(Closing):
-    """Processes that measure the parts of a dive; a context manager that ends them.
+    """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
     Parameters
     ----------
@@ -228,9 +227,9 @@ class Crew(Closing):
         self._n_processes = min(n_processes, len(work.parts))
 
     def blocks(self) -> Iterator[list[Measured]]:
-        """Yield what is found, in the order of the dive.
+        """Yield the results, in the order of the dive.
 
-        It ends before its time where a part is not what it was taken for, or a process has died:
+        It ends early where a part differs from its description, or a process has died:
         `is_done` is False then, and the rest is to be measured by other means, from `next_frame`.
         """
         try:
@@ -289,7 +288,7 @@ class Crew(Closing):
         how, memory = context(), SharedMemory.new()
         mine, theirs = how.Pipe()
         is_copy = how.get_start_method() == "fork"
-        # A copy has these too; they count as closed when no process has them any more.
+        # Copies of this process inherit these; a pipe is closed when no process has it open.
         mines = [*(hand.pipe for hand in self._hands), mine] if is_copy else []
         process = how.Process(target=serve, args=(self._work, theirs, memory, mines), daemon=True)
         with interrupts_blocked() if is_copy else deaf_to_interrupts():

@@ -1,6 +1,7 @@
 """A recording as the source of a run: its stripes are measured again, bit for bit.
 
-What reads recordings is imported where it is used: every run reads this module, few replay one.
+Modules that read recordings are imported where they are used, because every run imports this module
+and few replay a recording.
 """
 
 from collections.abc import Iterator, Set
@@ -38,7 +39,7 @@ class ReplayedFrame(Frame):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayRequest:
-    """What to make of a recording.
+    """Request for a replay: what differs from the recorded run.
 
     Attributes
     ----------
@@ -49,7 +50,7 @@ class ReplayRequest:
     no_dome : bool
     scanner : ScannerOptions
     chosen : set of str or None
-        Fields of `scanner` that count; the recording's own stand for the others. None: all.
+        Fields of `scanner` that count; otherwise the recording's own apply. None: all.
     index_target : Path or None
     pictures : bool
         Whether pictures are wanted even if stripes are not looked for again.
@@ -105,7 +106,7 @@ class Replay(Closing):
         self._black: ImagePlane = np.zeros((height, width), np.uint8)
 
     def __iter__(self) -> Iterator[ReplayedFrame]:
-        """Yield what was recorded, frame by frame.
+        """Yield the recorded frames.
 
         Raises
         ------
@@ -129,7 +130,7 @@ class Replay(Closing):
         return self.measured(frame)[1]
 
     def measured(self, frame: Frame) -> tuple[Rig, Scan, dict[SearchAxis, Returns]]:
-        """Return the scan of a frame of this source, and what it was made with and of."""
+        """Return the scan of a frame of this source, with its rig and stripes."""
         recorded = frame.recorded if isinstance(frame, ReplayedFrame) else None
         if recorded is None:
             raise ValueError("a replay measures its own frames only")

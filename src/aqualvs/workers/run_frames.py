@@ -1,6 +1,6 @@
-"""What a run finds in the frames of a dive, by one process or by several.
+"""Results for the frames of a run, measured by one process or by several.
 
-The frames of a run: those of its window, and scans that stand for lost ones.
+Frames are those of the run's window; scans with a refusal stand for lost frames (`with_losses`).
 """
 
 import itertools
@@ -56,13 +56,13 @@ def ready(frames: Iterator[Frame], source: FrameSource, window: FrameWindow) -> 
 def with_losses(
     frames: Iterator[Frame], first: int | None, n_water: float
 ) -> Iterator[tuple[list[Scan], Frame]]:
-    """Yield each frame with the scans that stand for the lost frames right before it.
+    """Yield each frame with the scans of the lost frames right before it.
 
     Frames are counted from `first` on; None takes none of them for lost.
     """
     last_index, last_time_s = 0, 0.0
     for frame in frames:
-        # Between two frames that came, the clock is taken to run evenly.
+        # Times of lost frames are interpolated linearly.
         step = (frame.time_s - last_time_s) / max(1, frame.index - last_index)
         lost = range(frame.index if first is None else first, frame.index)
         yield [_lost(i, last_time_s + (i - last_index) * step, n_water) for i in lost], frame
@@ -76,7 +76,7 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
 
 
 class RunMeasuring(Closing):
-    """Measures the frames of a dive; a context manager, within which processes are at work.
+    """Measurement of a dive's frames; a context manager, within which processes are at work.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class RunMeasuring(Closing):
     def blocks(
         self, scanner: ScansFrames, *, one_by_one: bool
     ) -> Generator[list[Measured], None, None]:
-        """Yield what is found, in the order of the dive; to be closed before the source is.
+        """Yield the results, in the order of the dive; to be closed before the source is.
 
         Parameters
         ----------
@@ -127,10 +127,10 @@ class RunMeasuring(Closing):
             yield from self._shared
             if self._crew.is_done:
                 return
-            # The whole video tells what becomes of damage; what came before it stands.
+            # The effect of damage depends on the whole video; earlier results stay valid.
             self._window = replace(self._window, first=self._crew.next_frame)
             self._frames = window_of(self._source, self._window)
-        # A recording tells of lost frames itself; what it lacks was skipped on purpose.
+        # A recording contains its lost frames; frames that it lacks were skipped on purpose.
         first = None if isinstance(self._source, Replay) else self._window.first
         pairs = with_losses(self._frames, first, self._rig.n_water)
         ahead = _is_at_hand(self._source) and not one_by_one

@@ -1,4 +1,4 @@
-"""How processes that measure begin; light to import."""
+"""Start methods of the measuring processes; light to import."""
 
 import contextlib
 import multiprocessing
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 FOR_BATCHES = ("distributed.nanny", "aqualvs.batch.scheduler")
-"""What the processes of a batch import first."""
+"""Modules that the processes of a batch import first."""
 
 
 def prepare(modules: tuple[str, ...]) -> None:
@@ -30,10 +30,10 @@ def prepare(modules: tuple[str, ...]) -> None:
 
 
 def context() -> "ForkContext | ForkServerContext | SpawnContext":
-    """Return how processes begin: where it can be, as copies of this one with all it has imported.
+    """Return the start method: if possible, copies of this process with all its imports.
 
-    It cannot where this process has threads, of libraries too: a copy would have their locks, and
-    not the threads that open them.
+    Copies are impossible where this process has threads, those of libraries included: a copy would
+    have their locks, but not the threads that release them.
     """
     if not has_server():
         return multiprocessing.get_context("spawn")
@@ -67,7 +67,7 @@ def has_server() -> bool:
 
 @contextlib.contextmanager
 def deaf_to_interrupts() -> Iterator[None]:
-    """Let no thread or process that is begun here, or by one of these, hear Ctrl-C.
+    """Ignore Ctrl-C in all threads and processes started here, and in theirs.
 
     A terminal sends it to all processes; this one decides what becomes of the others.
     """
@@ -76,7 +76,7 @@ def deaf_to_interrupts() -> Iterator[None]:
         return
     from multiprocessing import resource_tracker
 
-    # Begun later, it would have the thread that begins it hear again.
+    # Started later, it would unblock the signal in the starting thread.
     resource_tracker.ensure_running()
     with interrupts_blocked():
         yield
@@ -84,7 +84,7 @@ def deaf_to_interrupts() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Have Ctrl-C wait; a copy of this process that is begun here never hears it."""
+    """Block Ctrl-C; copies of this process that are started here never receive it."""
     heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -1,6 +1,7 @@
-"""Following the water's index during a run, by a target on the vehicle (paper, 2.2).
+"""Tracking of the water's refractive index during a run, by a target on the vehicle (paper, 2.2).
 
-What calibrates is imported where it is used: every run reads this module, few follow the water.
+Calibration modules are imported where they are used, because every run imports this module and few
+track the water.
 """
 
 from pathlib import Path
@@ -20,15 +21,15 @@ if TYPE_CHECKING:
 
 # Reading the target's markers takes longer than measuring a frame; the index hardly changes.
 _FIRST_FRAMES, _EVERY_S = 5, 0.4
-# A change of the index that matters less than this to the range (0.003 %) is not worth new plans.
+# Smaller changes of the index change the range by less than 0.003 % and need no new scanner.
 _WORTH = 2e-4
 _LEAST_SIGMA_TO_FOLLOW = 4e-3
-# How well users can measure where the plate is; its index is followed, not its place.
+# Accuracy of a user's measurement of the plate's place; only the index is tracked.
 _PLACE_MM, _TURN_DEG = 0.2, 0.1
 
 
 class WaterFollowingScanner:
-    """A scanner that measures each frame in the water that the index target tells.
+    """Scanner that measures each frame in the water as tracked by the index target.
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ class WaterFollowingScanner:
         self._last: IndexReading | None = None
 
     def process(self, frame: Frame) -> Scan:
-        """Measure a frame in the water as it is known now."""
+        """Measure a frame in the water as presently known."""
         if self.is_due(frame):
             self.look(frame)
         return self.scanner.process(frame)
@@ -81,7 +82,7 @@ class WaterFollowingScanner:
         return float("nan") if self._last is None else self._last.sigma
 
     def lines(self) -> list[str]:
-        """Return what the run's summary says of the water."""
+        """Return the lines of the run's summary about the water."""
         last = self._last
         if last is None:
             return [

@@ -1,8 +1,8 @@
-"""Who may see the pilot's page, and who may command from it.
+"""Access to the pilot's page: rules for viewing and commanding, limits, and checked commands.
 
-What the page may ask for: messages checked by type and size, and what they do.
-
-Limits on connections and on wrong tokens.
+Messages of a page are checked by type and size (`parse_message`) and carried out (`Controls`).
+`ConnectionLimits` bounds the connections that wait for a greeting; `TokenGate` checks one token at
+a time.
 """
 
 import asyncio
@@ -53,7 +53,7 @@ class RecordCommand(_Message):
 
 
 class SetpointCommand(_Message):
-    """Set what is to be held; without a range it is taken back."""
+    """Command that sets what to hold; without a range, the setpoint is taken back."""
 
     kind: Literal["setpoint"]
     range_m: float | None
@@ -77,7 +77,7 @@ def parse_message(text: str) -> Message:
 
 
 class RecordButton(Protocol):
-    """What the page needs of a recorder."""
+    """Interface of a recorder for the page."""
 
     def start(self) -> None:
         """Begin a recording; does nothing while one is under way."""
@@ -90,7 +90,7 @@ class RecordButton(Protocol):
 
 
 class NoRecorder:
-    """Stands where nothing can be recorded."""
+    """Record button where nothing can be recorded."""
 
     def start(self) -> None:
         """Refuse."""
@@ -105,7 +105,7 @@ class NoRecorder:
 
 
 class Controls:
-    """What the page can move.
+    """Controls of the page: setpoint and recorder.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Controls:
         self.setpoint, self.recorder = setpoint, recorder
 
     def carry_out(self, command: Command) -> None:
-        """Do what a page with the right to command asks for.
+        """Carry out a command of a page that has the right to command.
 
         Raises
         ------
@@ -144,7 +144,7 @@ _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """The rules: this machine may watch, whoever has the token may watch and command.
+    """Access rules: this machine may watch; with the token, any client may watch and command.
 
     Attributes
     ----------
@@ -168,11 +168,11 @@ class Access:
             return False
 
     def may_command(self, token: str) -> bool:
-        """Return whether somebody with this token may command."""
+        """Return whether this token gives the right to command."""
         return secrets.compare_digest(token.encode(), self.token.encode())
 
     def may_watch(self, token: str) -> bool:
-        """Return whether somebody with this token may see the data."""
+        """Return whether this token gives the right to see the data."""
         return self.is_local or self.may_command(token)
 
     def is_own_page(self, origin: str | None, host: str) -> bool:
@@ -197,7 +197,7 @@ def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     Parameters
     ----------
     hosts, origins : sequence of str
-        All values of these headers; a program may send none, nobody may send two.
+        All values of these headers; a program may send none, and no client two.
     """
     if len(hosts) > 1 or len(origins) > 1:
         return False
@@ -210,7 +210,7 @@ def _is_host(text: str) -> bool:
     if found is None or int(found[1] or 0) > _MAX_PORT:
         return False
     try:
-        # The brackets of what is no IPv6 address raise here.
+        # Brackets without an IPv6 address raise here.
         return urlsplit(f"//{text}").hostname is not None
     except ValueError:
         return False
@@ -228,7 +228,7 @@ def make_access(host: str, token: str | None) -> Access:
 
 
 def token_fault(token: str | None) -> str:
-    """Return what is wrong with a token that a user chose; "" if nothing is."""
+    """Return the fault of a token that a user chose; "" if there is none."""
     if token is None or len(token) >= _LEAST_TOKEN:
         return ""
     return f"--token: {len(token)} characters; choose at least {_LEAST_TOKEN}, or leave it out"
@@ -327,7 +327,7 @@ class TokenGate:
         if right:
             self._next()
         else:
-            # The next turn waits even if this caller is cancelled: hanging up saves no time.
+            # The next turn waits even if this caller is cancelled: disconnecting saves no time.
             asyncio.get_running_loop().call_later(self.WRONG_S, self._next)
             await asyncio.sleep(self.WRONG_S)
         return right

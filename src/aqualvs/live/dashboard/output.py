@@ -1,8 +1,7 @@
-"""The pilot's page as an output of a live run.
+"""The pilot's page as an output of a live run, and the start of its server.
 
-The camera's picture for the page: small, and cheap to make.
-
-From an address to the pilot's page, ready to be opened.
+The camera's picture is reduced for the page (`page_picture`), so that it is small and cheap to
+make.
 """
 
 import time
@@ -51,12 +50,12 @@ def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
     return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# More than a pilot sees; the rest of the machine's time belongs to the measurement.
+# More than a pilot perceives; the remaining time of the machine is for the measurement.
 _STATE_EVERY_S, _PICTURE_EVERY_S = 0.04, 0.08
 
 
 class Dashboard:
-    """Sends samples to the pages that are open; costs next to nothing while there is none.
+    """Output to the open pages; costs next to nothing while there is none.
 
     Parameters
     ----------
@@ -74,7 +73,7 @@ class Dashboard:
         self._state_s = self._picture_s = 0.0
 
     def send(self, sample: LiveSample) -> None:
-        """Send a sample, and now and then its picture behind the number of its frame."""
+        """Send a sample, and at intervals its picture behind the number of its frame."""
         now_s = time.monotonic()
         if not self._server.hub.n_watchers or now_s - self._state_s < 0.5 * _STATE_EVERY_S:
             return
@@ -117,7 +116,7 @@ class SwitchButton:
         self._switch.stop()
 
     def facts(self) -> Mapping[str, Any]:
-        """Return whether a recording is on, and its file or what is wrong."""
+        """Return whether a recording is on, and its file or its fault."""
         path, health = self._switch.path, self._switch.health()
         words = health.detail if health.state is State.FAULT else path.name if path else ""
         return {"on": path is not None, "words": words}
@@ -132,7 +131,7 @@ def start_dashboard(
     recorder: RecorderSwitch | None,
     tell: Callable[[str], object],
 ) -> Dashboard:
-    """Serve the page and tell its address; without a recorder, its button refuses.
+    """Serve the page and print its address; without a recorder, its button refuses.
 
     Raises
     ------

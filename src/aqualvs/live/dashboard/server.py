@@ -1,8 +1,6 @@
-"""The page's web server, in a thread of its own.
+"""The web server of the pilot's page, in a thread of its own, and the state that it sends as JSON.
 
-From a sample to what the page shows, as JSON.
-
-Hands the latest state and picture to every page that is open; slow pages skip some.
+`Hub` hands the latest state and picture to every open page; slow pages skip some.
 """
 
 import asyncio
@@ -80,7 +78,7 @@ def page_state(sample: LiveSample, setpoint: Setpoint | None, recording: Mapping
 
 
 def rig_state(rig: Rig, *, may_command: bool) -> str:
-    """Return the message that begins a connection: what does not change."""
+    """Return the first message of a connection: the data that do not change."""
     near, far = rig.working_range
     found = {
         "kind": "rig",
@@ -150,7 +148,7 @@ def _part(part: PartHealth) -> dict[str, Any]:
 
 
 def _without_nan(value: Any) -> Any:
-    """Return the same with null for what is no number: JSON has no other word for it."""
+    """Return the same with null in place of NaN, which JSON does not have."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -160,7 +158,7 @@ def _without_nan(value: Any) -> Any:
     return value
 
 
-# Pictures on their way to a page that has not yet shown them: one being drawn, one being sent.
+# Pictures sent to a page and not yet shown: one being drawn, one in transit.
 _ON_THE_WAY = 2
 
 
@@ -185,7 +183,7 @@ class Watcher:
     _news: asyncio.Event = field(default_factory=asyncio.Event)
 
     def put(self, state: str, picture: bytes | None) -> None:
-        """Leave the latest; what has not been sent is replaced."""
+        """Replace the waiting state and picture by the latest."""
         self._state = state
         self._picture = picture if picture is not None else self._picture
         self._news.set()
@@ -215,7 +213,7 @@ class Hub:
     MAX_WATCHERS = 8
 
     def __init__(self) -> None:
-        # In the order in which they came.
+        # In the order of their arrival.
         self._watchers: dict[Watcher, None] = {}
 
     @property
@@ -262,16 +260,16 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
 }
-# A page that has connected greets within the first of these times.
+# The first is the time limit for the greeting of a connected page.
 _HELLO_S, _START_S, _STOP_S = 5.0, 10.0, 3.0
-# How often it is checked that whoever waits for the check of a token is still there.
+# Period of checks that a client whose token waits to be checked is still connected.
 _ALIVE_S = 0.5
 _REFUSED = 1008
 _log = logging.getLogger(__name__)
 
 
 class DashboardServer:
-    """Serves page and data until it is closed.
+    """Server of page and data until it is closed.
 
     Parameters
     ----------
@@ -365,7 +363,7 @@ class DashboardServer:
             if watcher is not None:
                 await self._attend(socket, watcher, peer)
         except (WebSocketDisconnect, RuntimeError, OSError):
-            # The page has gone; that is its right.
+            # The page has closed, which is normal.
             return
 
     async def _welcome(self, socket: WebSocket, peer: str) -> Watcher | None:
@@ -406,7 +404,7 @@ class DashboardServer:
         return "" if self.hub.join(watcher) else "too many pages are open"
 
     async def _attend(self, socket: WebSocket, watcher: Watcher, peer: str) -> None:
-        """Send what is new and listen, until the page goes."""
+        """Send news and receive messages until the page closes."""
         beside = [
             asyncio.create_task(_send_news(socket, watcher)),
             asyncio.create_task(_make_room(socket, watcher, peer)),
@@ -481,7 +479,7 @@ def _refusing_malformed(app: ASGIApp) -> ASGIApp:
 
 
 async def _blueos(_request: Request) -> Response:
-    """Tell BlueOS, which looks for it at every port, what is served here."""
+    """Answer BlueOS, which asks every port for the service behind it."""
     return JSONResponse(
         {
             "name": "aqualvs",

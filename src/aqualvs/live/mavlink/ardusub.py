@@ -1,20 +1,19 @@
-"""ArduSub by MAVLink: what it tells of itself, and our efforts to it.
+"""Link to a vehicle with ArduSub by MAVLink: its state, its pilot's sticks, and our efforts.
 
-Never arms or disarms, never changes the mode, never presses a button: what goes out is
-`MANUAL_CONTROL` with no button pressed, or a speed in GUIDED, and nothing else.
+The link never arms or disarms, never changes the mode and never presses a button: it sends only
+`MANUAL_CONTROL` without buttons, or a speed in GUIDED.
 
-Whether the pilot moves his sticks, as far as an onboard computer can see it.
-
-Two ways, for no one of them works everywhere:
+`PilotSticks` detects movements of the pilot's sticks, as far as an onboard computer can see them,
+from two messages, because neither arrives everywhere:
 
 - `MANUAL_CONTROL` of the ground station, where the router passes it on. The message's `target` is
   no target field to MAVLink's routing tables, so mavlink-router and ArduPilot's own routing treat
   it as broadcast.
-- `RC_CHANNELS` of the vehicle: what all senders together made of the stick channels. Ours are among
-  them, scaled by a pilot gain that is not told; whatever lies outside of what we sent in the last
-  second is the pilot's.
+- `RC_CHANNELS` of the vehicle: the stick channels that result from all senders together. Ours are
+  among them, scaled by a pilot gain that is not reported; values outside of what we sent in the
+  last second are the pilot's.
 
-Depth as ArduSub tells it, from the best message that there is.
+`DepthChoice` reads the depth from the best message available.
 """
 
 import contextlib
@@ -50,7 +49,7 @@ from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink,
 from aqualvs.vehicle_logs.tlog import SUB_MODES
 
 FRESH_S = 1.0
-"""An older message says nothing of now; ground stations send sticks 5 to 50 times a second."""
+"""Older messages are ignored; ground stations send sticks 5 to 50 times a second."""
 
 _INVALID = 32767
 # ArduSub turns full deflection at a pilot gain of 1 into 400 us about 1500 us (joystick.cpp).
@@ -61,7 +60,7 @@ _KEPT = 200
 
 
 class PilotSticks:
-    """Watches the pilot's sticks.
+    """Detector of movements of the pilot's sticks.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ class PilotSticks:
         self._sent: deque[tuple[int, Sticks]] = deque(maxlen=_KEPT)
 
     def note(self, sticks: Sticks) -> None:
-        """Remember what we sent ourselves, now."""
+        """Remember the sticks that we send now."""
         self._sent.append((time.monotonic_ns(), sticks))
 
     def moved(self) -> bool:
@@ -85,7 +84,7 @@ class PilotSticks:
         return self._joystick_moved() or self._channels_moved()
 
     def _joystick_moved(self) -> bool:
-        # One who holds his sticks still must not hide another who moves his.
+        # A sender whose sticks are centred must not hide another whose sticks move.
         return any(self._moves(found) for found in self._link.every("MANUAL_CONTROL"))
 
     def _moves(self, found: Received) -> bool:
@@ -109,12 +108,12 @@ class PilotSticks:
             return True
         if self._beyond(told, _YAW, [s.r for s in ours]):
             return True
-        # JS_THR_GAIN scales the vertical by up to 4: where we use that axis, it tells nothing.
+        # JS_THR_GAIN scales the vertical by up to 4: while we use that axis, it shows nothing.
         vertical_is_ours = any(s.z != MIDDLE for s in ours)
         return not vertical_is_ours and self._beyond(told, _VERTICAL, [])
 
     def _beyond(self, told: Any, channel: str, ours: list[int]) -> bool:
-        """Return whether a channel lies outside of what our own sticks can have made of it."""
+        """Return whether a channel is outside of the range that our own sticks explain."""
         pulse_us = getattr(told, channel)
         if not _LEAST_US <= pulse_us <= _MOST_US:
             return False
@@ -142,7 +141,7 @@ _STUCK_SHARE, _DIVED_M = 0.1, 0.5
 
 
 class DepthChoice:
-    """Reads the depth; remembers which estimates stood still.
+    """Reader of the depth; remembers which estimates stood still.
 
     Parameters
     ----------
@@ -157,7 +156,7 @@ class DepthChoice:
 
     def read(self) -> float | None:
         """Return the depth in metres, positive down; None if none is known."""
-        # Only its span counts: what the pressure was at the surface, nobody says.
+        # Only its span counts: the pressure at the surface is unknown.
         self._value(*_PRESSURE)
         found = {kind: self._value(kind, field, scale) for kind, field, scale in _CANDIDATES}
         for kind, depth in found.items():
@@ -192,10 +191,10 @@ _ARMED = 128
 _FRESH_S = 1.0
 # Two and a half of ArduSub's heartbeats.
 _BEATS_WITHIN_S = 2.5
-# Sticks that were in use so lately may still be in force when the link is closed.
+# Sticks used within this time may still be in force when the link is closed.
 _LATELY_S = 3.0
 _GOODBYES, _GOODBYE_EVERY_S = 3, 0.02
-# Depth hold alone: elsewhere the vehicle would sink or rise under a neutral stick, or goes its way.
+# Depth hold only: in other modes the vehicle sinks or rises at neutral sticks, or steers itself.
 _KEEPS_DEPTH: Final = {
     Command.STICKS: ("ALT_HOLD", "POSHOLD", "SURFTRAK"),
     Command.GUIDED: ("GUIDED",),
@@ -205,7 +204,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArduSubOptions:
-    """How ArduSub is steered, and who must be there.
+    """Options of steering ArduSub, and of the ground station that must be present.
 
     Attributes
     ----------
@@ -217,8 +216,8 @@ class ArduSubOptions:
         System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
         SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
     station_timeout_s : float or None
-        Without its heartbeat for so long, efforts are not ours to give: our own sticks would keep
-        ArduSub from noticing that its ground station is gone. None where nobody need be there.
+        Without its heartbeat for this time no efforts are sent: our own sticks would keep ArduSub
+        from noticing that its ground station is gone. None if no station is required.
     stick_dead_band : float
         Deflection of the pilot's sticks that counts as centred, as a share of the full one.
     speed : float
@@ -399,7 +398,7 @@ class ArduSubLink:
         return sent
 
     def _shape(self, beat: Received) -> None:
-        """Take out of the sticks what the vehicle, as it tells, makes of them."""
+        """Compensate the vehicle's reported conversion of the sticks."""
         if not isinstance(self._commander, StickCommander):
             return
         known: dict[str, float] = {}
@@ -411,7 +410,7 @@ class ArduSubLink:
             self._commander.keeps_place = keeps_place
 
     def _advise(self, parameters: dict[str, float]) -> None:
-        """Log once what the vehicle's settings mean, as soon as they are known or silent."""
+        """Log advice on the vehicle's settings once, when they are known or stay unanswered."""
         if self._advised or self.options.command is not Command.STICKS:
             return
         if not (StationRange(parameters).known or self._watch.was_patient):
@@ -441,7 +440,7 @@ class ArduSubLink:
         return Mode.OURS, name
 
     def _is_ignored(self, parameters: dict[str, float]) -> bool:
-        """Return whether the vehicle has told that it takes sticks of others only."""
+        """Return whether the vehicle has reported that it takes only others' sticks."""
         obeyed = StationRange(parameters)
         by_sticks = self.options.command is Command.STICKS
         return by_sticks and obeyed.known and self.options.ground_station not in obeyed
@@ -470,8 +469,8 @@ class ArduSubLink:
         """Return when the vehicle was heard last.
 
         Heartbeats come once a second, attitude ten times and more: between two heartbeats attitude
-        tells that the vehicle is there. Without heartbeats it does not: mode and arming are then
-        unknown.
+        tells that the vehicle is there. Without heartbeats it does not count: mode and arming are
+        then unknown.
         """
         heard_ns = beat.received_ns
         attitude = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)

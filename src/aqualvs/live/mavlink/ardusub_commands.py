@@ -1,10 +1,9 @@
-"""What ArduSub is told: efforts as stick positions, or as speeds over the ground in GUIDED.
+"""Commands to ArduSub: efforts as stick positions, or as speeds over the ground in GUIDED.
 
-Whether the vehicle does what our sticks say, as far as it tells.
-
-ArduSub drops sticks of others than its ground station without a word, and answers nothing to those
-that it takes. What it makes of them shows in `RC_CHANNELS`: 400 us times the pilot gain for a full
-stick (joystick.cpp). Where no channels are told, a yaw stick must turn it.
+`StickResponse` checks whether the vehicle follows our sticks. ArduSub silently ignores sticks of
+senders other than its ground station, and does not acknowledge those that it accepts. Their effect
+shows in `RC_CHANNELS`: 400 us times the pilot gain for a full stick (joystick.cpp). Where no
+channels are reported, a yaw stick must turn the vehicle.
 """
 
 import math
@@ -17,18 +16,18 @@ from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping
 from aqualvs.control.vehicle import Effort
 from aqualvs.live.mavlink.link import MavlinkLink
 
-# Sticks and answers are looked at for so long, and are so many at least: six messages of three
+# Length of the window of sticks and responses, and their least number: six messages of three
 # channels, or as many of the attitude.
 _WINDOW_S, _LEAST_PAIRS = 6.0, 18
-# Of the squares of all sticks together: six at a tenth say enough of channels.
+# Least sum of the squares of all sticks: six at a tenth are enough for channels.
 _LEAST_SQUARES = 6 * 0.1**2
 # The least pilot gain is 0.1, 40 us for a full stick; half of the messages may hold the pilot's
-# own sticks, so that a quarter of that is an answer still.
+# own sticks, so that a quarter of that still counts as a response.
 _LEAST_SLOPE_US = 10.0
-# Sticks to and fro may be faster than channels are told; the channels then move all the same.
+# Sticks may alternate faster than channels are reported; the channels then move all the same.
 _STILL_US = 3.0
-# Below that a stick may lie within the dead zone of the channel. A vehicle that turns by less for
-# a full stick does not turn by it.
+# Smaller sticks may lie within the dead zone of the channel. A vehicle that turns by less for a
+# full stick does not respond to it.
 _TURNING_STICK, _LEAST_TURN = 0.5, math.radians(2.0)
 _LONGEST_STICK_S = 0.3
 _CENTRE_US, _LEAST_US, _MOST_US = 1500, 800, 2200
@@ -36,7 +35,7 @@ _AXES = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
 
 
 class StickResponse:
-    """Compares our sticks with the channels and the turning that follow.
+    """Comparison of our sticks with the channels and the turning that follow.
 
     Parameters
     ----------
@@ -52,14 +51,14 @@ class StickResponse:
         self._turns = _Pairs()
 
     def note(self, sticks: Sticks) -> None:
-        """Remember what we send now."""
+        """Remember the sticks that we send now."""
         now_s = time.monotonic()
         if self._stick is None or now_s - self._stick[0] > _LONGEST_STICK_S:
             self._began_s = now_s
         self._stick = now_s, sticks
 
     def doubt(self) -> str:
-        """Return why the vehicle seems not to obey, empty if it does or nothing is known."""
+        """Return why the vehicle seems not to obey; empty if it does or nothing is known."""
         now_s, stick = time.monotonic(), self._stick
         if stick is None or now_s - stick[0] > _LONGEST_STICK_S:
             for pairs in (*self._channels.values(), self._turns):
@@ -77,12 +76,12 @@ class StickResponse:
         return "RC_CHANNELS is not told: whether our sticks are obeyed is not seen"
 
     def _take(self, now_s: float, sticks: Sticks) -> None:
-        """Pair what has come since the last look with our stick."""
+        """Pair the messages since the last call with our stick."""
         told = self._new("RC_CHANNELS")
         if told is not None:
             for channel, axis in _AXES:
                 share, pulse_us = getattr(sticks, axis) / FULL, getattr(told, channel)
-                # 0 and 65535 stand for a channel that nobody moves.
+                # 0 and 65535 mean an unused channel.
                 off_us = pulse_us - _CENTRE_US if _LEAST_US < pulse_us < _MOST_US else 0
                 self._channels[channel].add(now_s, share, float(off_us))
         told = self._new("ATTITUDE")
@@ -99,7 +98,7 @@ class StickResponse:
 
 
 class _Pairs:
-    """What a stick said and what the vehicle answered, over the last seconds."""
+    """Stick positions and the vehicle's responses to them, over the last seconds."""
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[float, float, float]] = deque()
@@ -137,7 +136,7 @@ _MAX_SEQ = 256
 
 
 class Command(StrEnum):
-    """How ArduSub is steered; the value is what a user writes."""
+    """Kind of command that steers ArduSub; the value is the user's word for it."""
 
     STICKS = "sticks"
     """`MANUAL_CONTROL`: what a pilot's joystick would send."""
@@ -154,10 +153,10 @@ class Packable(Protocol):
 
 
 class Commander(Protocol):
-    """Puts efforts into messages."""
+    """Interface of a converter from efforts to messages."""
 
     def message(self, effort: Effort) -> Packable:
-        """Return what to send for an effort of finite parts."""
+        """Return the message for an effort of finite parts."""
 
 
 def is_finite(effort: Effort) -> bool:
@@ -166,7 +165,7 @@ def is_finite(effort: Effort) -> bool:
 
 
 class StickCommander:
-    """Efforts as `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
+    """Converter to `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
 
     Parameters
     ----------
@@ -182,7 +181,7 @@ class StickCommander:
     Attributes
     ----------
     shaping : StickShaping
-        What the vehicle makes of sticks; ArduSub's default until it has told.
+        The vehicle's conversion of sticks; ArduSub's default until it has reported its own.
     keeps_place : bool
         Whether its mode is POSHOLD.
     """
@@ -204,7 +203,7 @@ class StickCommander:
 
 
 class GuidedCommander:
-    """Efforts as speeds in the body's axes, for a vehicle that knows where it is.
+    """Converter to speeds in the body's axes, for a vehicle that knows its position.
 
     Parameters
     ----------

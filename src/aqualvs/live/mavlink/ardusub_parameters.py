@@ -1,4 +1,4 @@
-"""What ArduSub is set to, what that means for us, and what to set instead.
+"""ArduSub's parameters: what their values mean for us, and advice on what to set instead.
 
 Names and meanings are those of ArduSub's `Parameters.cpp`, `GCS.cpp` (MAV_), and
 `AP_RangeFinder_Params.cpp` (RNGFND1_); the second name is that of releases before 4.7.
@@ -24,19 +24,19 @@ FOR_STICKS = (*STATION, STATION_HIGH, PILOT_INPUT, PILOT_TIMEOUT, SPEED_UP, SPEE
 FOR_DISTANCE = (RANGE_TYPE, RANGE_ORIENT, *(name for name, _ in (*RANGE_NEAR, *RANGE_FAR)))
 
 FULL_CLIMB_RATE = 0.5
-"""What a full stick asks for at a pilot gain of 1 in m/s, as the packaged gains take it."""
+"""Speed of a full stick at a pilot gain of 1 in m/s, as the packaged gains assume it."""
 
 _DISABLED, _DISARM = 0, 2
 _MAVLINK_RANGEFINDER, _FORWARD = 10, 0
-# A last effort that stands longer than this goes far.
+# A last effort that stays in force longer than this moves the vehicle far.
 _LONGEST_TIMEOUT_S = 1.0
-# The rate of descent closes its loop by the depth: half as fast or twice as fast still works.
+# The rate of descent is controlled by the depth: half or twice the rate still works.
 _CLIMB_RATE_RATIO = 2.0
 _ASK_EVERY_S, _ASK_SELDOM_S, _ROUNDS = 1.0, 30.0, 5
 
 
 class Weight(StrEnum):
-    """How much an advice matters."""
+    """Importance of an advice."""
 
     FINE = "fine"
     CARE = "care"
@@ -47,7 +47,7 @@ class Weight(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What a setting of the vehicle means.
+    """Advice on a setting of the vehicle.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class StationRange:
     Parameters
     ----------
     parameters : mapping
-        As the vehicle told them.
+        As the vehicle reported them.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
@@ -77,7 +77,7 @@ class StationRange:
 
     @property
     def known(self) -> bool:
-        """Whether the vehicle has told."""
+        """Whether the vehicle has reported them."""
         return self._least is not None
 
     def __contains__(self, system: int) -> bool:
@@ -94,7 +94,7 @@ class StationRange:
 
 
 class ParameterWatch:
-    """Asks the vehicle for parameters now and then until it has told them; never waits.
+    """Requests for the vehicle's parameters, repeated until it has answered; never waits.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class ParameterWatch:
         self._next_s, self._n_asked = float("-inf"), 0
 
     def read(self) -> dict[str, float]:
-        """Return what is known, and ask for the rest when it is time."""
+        """Return the known parameters, and request the others when it is time."""
         known = self._link.parameters()
         missing = [name for name in self._names if name not in known]
         now_s = time.monotonic()
@@ -126,7 +126,7 @@ class ParameterWatch:
 
 
 def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
-    """Say whether the vehicle obeys sticks that are sent in a ground station's name."""
+    """Advise whether the vehicle obeys sticks that are sent in a ground station's name."""
     obeyed = StationRange(parameters)
     if not obeyed.known:
         return Advice(
@@ -148,7 +148,7 @@ def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
 
 
 def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
-    """Say what the pilot-input fail-safe does when efforts end."""
+    """Advise on the effect of the pilot-input fail-safe when efforts end."""
     action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
     found = []
     if action is None:
@@ -196,7 +196,7 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
 def advise_on_speed(
     parameters: Mapping[str, float], full_climb_rate: float = FULL_CLIMB_RATE
 ) -> list[Advice]:
-    """Say what a full vertical stick asks for, beside what gains take for granted.
+    """Advise on the climb rate of a full vertical stick, compared with the gains' assumption.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def advise_on_speed(
 def advise_on_distance(
     parameters: Mapping[str, float], working_range: tuple[float, float] | None = None
 ) -> list[Advice]:
-    """Say what the vehicle makes of `DISTANCE_SENSOR`.
+    """Advise on the vehicle's use of `DISTANCE_SENSOR`.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def _limits_advice(
 def _first(
     parameters: Mapping[str, float], names: tuple[tuple[str, float], ...]
 ) -> tuple[str, float] | None:
-    """Return the first name that was told, and its value in metres."""
+    """Return the first name with a reported value, and the value in metres."""
     told = [(name, unit * parameters[name]) for name, unit in names if name in parameters]
     return told[0] if told else None
 

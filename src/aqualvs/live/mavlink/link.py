@@ -1,4 +1,4 @@
-"""One MAVLink connection, kept alive: shared by all that talk to the autopilot."""
+"""A persistent MAVLink connection, shared by everything that talks to the autopilot."""
 
 import contextlib
 import importlib
@@ -26,20 +26,20 @@ from aqualvs.sources.base import PartHealth, State
 MAV_COMP_ID_ONBOARD_COMPUTER = 191
 HEARTBEAT_EVERY_S = 1.0
 SILENT_AFTER_S = MOVES_AFTER_S
-"""A vehicle without a heartbeat for so long counts as gone."""
+"""A vehicle without a heartbeat for this time counts as gone."""
 
 _LOOK_EVERY_S = 0.1
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
-# A connection that lasts so long was a good one: the next attempt follows quickly again.
+# After a connection that lasted this long, the next attempt follows quickly again.
 _LASTING_S = 2.0
 # A peer that was heard and falls silent may have moved to another address.
 _REOPEN_AFTER_S = 10.0
 _REFUSED_FOR_S = 3.0
-# Of each kind of message the latest of so many senders is kept, besides the vehicle's.
+# Number of senders, besides the vehicle, whose latest message of each kind is kept.
 _MAX_SENDERS = 64
-# Datagrams taken in before the next look at what is to be sent.
+# Datagrams received before sending is checked again.
 _READ_AT_ONCE = 64
-# What a serial driver already holds delays a message by so much at most; beyond, it is dropped.
+# Greatest delay of a message by data in the serial driver's buffer; beyond it, it is dropped.
 _PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
 _ARDUPILOT, _NO_AUTOPILOT = 3, 8
 _AUTOPILOT_COMPONENT = 1
@@ -76,7 +76,7 @@ class Received:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkOptions:
-    """Who we are on a connection, and who may speak to us.
+    """Own identity on a connection, and the peers that are heard.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class LinkOptions:
 
 
 class MavlinkLink:
-    """Sends and receives MAVLink 2 as an onboard computer.
+    """MAVLink 2 connection of an onboard computer.
 
     The constructor returns at once. A thread opens the connection, sends a heartbeat every second,
     takes in what comes, and opens the connection again whenever it breaks, a little later each time
@@ -158,7 +158,7 @@ class MavlinkLink:
             self.dialect.MAV_STATE_ACTIVE,
             3,
         )
-        # Guards the port and the packer, and is only held for calls that never wait.
+        # Guards the port and the packer; held only for calls that never wait.
         self._sending = threading.Lock()
         self._port: Port | None = None
         self._broken: OSError | None = None
@@ -240,12 +240,12 @@ class MavlinkLink:
 
     @property
     def conflict(self) -> str:
-        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        """Contradiction between heartbeats of the vehicle; empty if there is none."""
         return self._peers.conflict
 
     @property
     def rival(self) -> str:
-        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        """Other address that speaks as the vehicle; empty if there is none."""
         return self._peers.rival
 
     def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
@@ -276,7 +276,7 @@ class MavlinkLink:
             again_s = min(time.monotonic() + _ASK_AGAIN_S, end_s)
             while time.monotonic() < again_s and not all(map(self._parameters.__contains__, asked)):
                 time.sleep(_ANSWER_POLL_S)
-            # Those that stay silent go to the end, so that the others are asked for.
+            # Unanswered parameters go to the end, so that the others are requested.
             rotated = [*missing[_ASKED_AT_ONCE:], *asked]
             missing = [name for name in rotated if name not in self._parameters]
         known = self.parameters()
@@ -290,7 +290,7 @@ class MavlinkLink:
             self.send(asked, to_vehicle=True)
 
     def parameters(self) -> dict[str, float]:
-        """Return the parameters that the autopilot has told, whoever asked for them."""
+        """Return the parameters that the autopilot has sent, also for other requesters."""
         with self._receiving:
             return dict(self._parameters)
 
@@ -443,7 +443,7 @@ class MavlinkLink:
         return parser
 
     def _read(self, port: Port) -> None:
-        """Take in what has come, but not so much that sending has to wait."""
+        """Read incoming data, but not for so long that sending has to wait."""
         for _ in range(_READ_AT_ONCE):
             data, peer = port.read()
             if not data:
@@ -456,7 +456,7 @@ class MavlinkLink:
                     self._keep(peer, message)
 
     def _keep(self, peer: Peer, message: Any) -> None:
-        """Keep a message as the latest of its kind and sender."""
+        """Store a message as the latest of its kind and sender."""
         kind, received_ns = message.get_type(), time.monotonic_ns()
         sender = (message.get_srcSystem(), message.get_srcComponent())
         with self._receiving:
@@ -478,7 +478,7 @@ def _check_id(name: str, value: int) -> None:
 
 
 def _dialect() -> Any:
-    """Import pymavlink's messages; version 2, whatever the environment says."""
+    """Import pymavlink's messages in version 2, regardless of the environment."""
     try:
         return importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
     except ImportError as fault:

@@ -1,13 +1,12 @@
-"""Who speaks on a MAVLink connection, and which of them is the vehicle.
+"""Senders on a MAVLink connection: identification of the vehicle, and message signing.
 
-Anybody in the network may send to an open port. So senders are kept apart by their address: each
-has a parser of its own, and each system id belongs to the address where it was heard first, until
-nothing has come from there for a while. Nobody else can speak as the vehicle, or receive what is
-meant for it.
+Anybody in the network may send to an open port. So `PeerTable` keeps senders apart by their
+address: each has a parser of its own, and each system id belongs to the address where it was heard
+first, until that address has been silent for a while. Nobody else can speak as the vehicle, or
+receive its messages.
 
-MAVLink 2 signing by pymavlink: who does not have the key is not heard.
-
-https://mavlink.io/en/guide/message_signing.html
+`Signer` signs messages by MAVLink 2 with pymavlink, and ignores senders without the key
+(https://mavlink.io/en/guide/message_signing.html).
 """
 
 import hashlib
@@ -65,7 +64,7 @@ def load_key(path: Path) -> bytes:
 
 
 class Signer:
-    """Signs what one connection sends, and checks what it receives.
+    """Signer of what one connection sends; checks the signatures of what it receives.
 
     Parameters
     ----------
@@ -80,7 +79,7 @@ class Signer:
         for state in (self._outgoing, self._incoming):
             state.secret_key, state.timestamp = key, _now()
         self._outgoing.sign_outgoing = True
-        # Given, and never true, so that pymavlink counts what it refuses.
+        # A callback that always returns False, so that pymavlink counts refused messages.
         self._incoming.allow_unsigned_callback = lambda *_: False
 
     @property
@@ -123,12 +122,12 @@ Peer: TypeAlias = tuple[object, ...]
 """Address of a sender, as the system writes it; empty where a connection has only one."""
 
 MOVES_AFTER_S = 5.0
-"""A system id that was silent for so long may be heard from another address."""
+"""A system id that was silent for this time may be heard from another address."""
 
-# Those that are sent to: heard within so many seconds, the vehicle and so many others at most.
+# Messages are sent to the vehicle and at most so many others, heard within so many seconds.
 _HEARD_S, _MAX_OTHERS = 10.0, 8
-# Two and a half heartbeats, and what a busy machine adds: what somebody said of the vehicle's mode
-# counts for so long.
+# Lifetime of a statement about the vehicle's mode: two and a half heartbeats, and the delay of a
+# busy machine.
 _SAYS_FOR_S = 3.0
 _MAX_CLAIMS = 32
 _NO_AUTOPILOT = 8
@@ -138,7 +137,7 @@ _MAGIC = (0xFD, 0xFE)
 
 @dataclass(frozen=True, slots=True)
 class _Claim:
-    """What a heartbeat says of the vehicle."""
+    """Statement of a heartbeat about the vehicle."""
 
     component: int
     kind: int
@@ -165,7 +164,7 @@ class _Home:
 
 @dataclass(slots=True)
 class _Contest:
-    """What heartbeats of the vehicle have said lately, and until when they contradict."""
+    """Recent statements of the vehicle's heartbeats, and the end of their contradiction."""
 
     now: dict[int, _Claim] = field(default_factory=dict)
     given_up_s: dict[_Claim, float] = field(default_factory=dict)
@@ -175,7 +174,7 @@ class _Contest:
 
 
 class PeerTable:
-    """Keeps the senders on a connection apart.
+    """Table of the senders on a connection, kept apart by address.
 
     Parameters
     ----------
@@ -210,14 +209,14 @@ class PeerTable:
 
     @property
     def conflict(self) -> str:
-        """How heartbeats of the vehicle contradict each other, in words; empty if they do not."""
+        """Contradiction between heartbeats of the vehicle; empty if there is none."""
         with self._lock:
             contest = self._contest
             return contest.words if time.monotonic() < contest.until_s else ""
 
     @property
     def rival(self) -> str:
-        """Where else somebody speaks as the vehicle, in words; empty if nobody does."""
+        """Other address that speaks as the vehicle; empty if there is none."""
         since_s = time.monotonic() - _SAYS_FOR_S
         with self._lock:
             rivals = self._contest.rivals
@@ -241,7 +240,7 @@ class PeerTable:
             self._senders.clear()
 
     def decode(self, peer: Peer, data: bytes, *, whole: bool) -> list[Any]:
-        """Return the messages that have come from an address; what is none is left out.
+        """Return the valid messages that have come from an address.
 
         Parameters
         ----------
@@ -304,7 +303,7 @@ class PeerTable:
             before = contest.now.get(claim.component)
             contest.now[claim.component] = claim
             if before is not None and before != claim:
-                # What comes back so soon was never given up: two speak from one address.
+                # A mode that returns so soon was not left: two systems speak from one address.
                 if now_s - contest.given_up_s.pop(claim, float("-inf")) < _SAYS_FOR_S:
                     self._contradicted(now_s, f"from {_shown(peer)}")
                 _put(contest.given_up_s, before, now_s)
@@ -320,7 +319,7 @@ class PeerTable:
         self._contest.words = f"heartbeats of sysid {self._system} {where} contradict each other"
 
     def _remember(self, peer: Peer, parser: Any) -> None:
-        """Keep the parser of an address, and send to it; strangers never displace anybody."""
+        """Store the parser of an address, and send to it; strangers never replace known senders."""
         now_s = time.monotonic()
         sender = self._senders.get(peer)
         if sender is not None:
@@ -337,7 +336,7 @@ class PeerTable:
 
 def _reset(parser: Any) -> None:
     """Let a parser begin a new message."""
-    # It works the length of a message out anew as soon as three bytes are there.
+    # The parser computes the length of a message again as soon as it has three bytes.
     parser.buf, parser.buf_index = bytearray(), 0
 
 

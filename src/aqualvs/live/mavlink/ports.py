@@ -1,8 +1,7 @@
-"""Ways to a MAVLink peer: UDP, TCP and serial ports that never wait.
+"""Addresses and ports of MAVLink peers: UDP, TCP and serial lines, all non-blocking.
 
-Where a MAVLink peer is, as pilots write it.
-
-A serial port by the system's own calls; POSIX only.
+Addresses have the forms that pymavlink and ground stations use (`parse_address`). The serial port
+uses system calls of POSIX only.
 """
 
 import errno
@@ -43,7 +42,7 @@ class NetAddress:
     Attributes
     ----------
     kind : str
-        `udpout` sends to the address; `udpin` listens there and answers whoever was heard;
+        `udpout` sends to the address; `udpin` listens there and answers all known senders;
         `udpbcast` sends to a broadcast address; `tcp` connects.
     host : str
         Name or number.
@@ -106,7 +105,7 @@ def parse_address(url: str) -> Address:
 
 
 class AllowedPeers:
-    """Addresses that are listened to.
+    """Addresses that are heard.
 
     Parameters
     ----------
@@ -170,26 +169,26 @@ def _serial_address(text: str, url: str) -> SerialAddress:
 _DATAGRAM = 65_535
 _CHUNK = 4096
 _CONNECT_S = 1.0
-# A stream that takes nothing for so long leads nowhere.
+# A stream that accepts no data for this time is broken.
 _STALLED_S = 5.0
 _SEND_BUFFER = 16_384
 _NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
 
 
 class Port(Protocol):
-    """An open way to a peer. Whatever shows that it is broken is raised as OSError."""
+    """Open connection to a peer; its faults are raised as OSError."""
 
     @property
     def many(self) -> bool:
-        """Whether anybody may send to it, and addresses keep senders apart."""
+        """Whether there may be several senders, kept apart by their addresses."""
 
     @property
     def whole(self) -> bool:
-        """Whether what is read is a datagram."""
+        """Whether each read returns a datagram."""
 
     @property
     def refused_s(self) -> float | None:
-        """When the peer's computer said that nobody listens (`time.monotonic`), if ever."""
+        """Time of the peer's refusal because its port is closed (`time.monotonic`), if any."""
 
     @property
     def unsent(self) -> bool:
@@ -197,28 +196,28 @@ class Port(Protocol):
 
     @property
     def lag_s(self) -> float:
-        """How long the driver is going to send what it holds already."""
+        """Time that the driver needs to send its buffered data."""
 
     def fileno(self) -> int:
         """Return the number to wait on."""
 
     def read(self) -> tuple[bytes, Peer]:
-        """Return what has come, empty if nothing, and from where."""
+        """Return the received data, possibly empty, and their sender."""
 
     def write(self, frames: bytes, peer: Peer, /) -> bool:
-        """Send all of it, or nothing if there is no room; return whether it went.
+        """Send all of it, or nothing if there is no room; return whether it was sent.
 
         Where there is only one peer, its address is left empty.
         """
 
     def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
-        """Send to everybody: to those heard, where the port has no address of its own."""
+        """Send to all known peers, where the port has no address of its own."""
 
     def flush(self) -> None:
-        """Send what waits, as far as there is room."""
+        """Send waiting data, as far as there is room."""
 
     def close(self) -> None:
-        """Free the port at once; what waits is lost."""
+        """Free the port at once; waiting data are lost."""
 
 
 def open_port(address: Address) -> Port:
@@ -264,7 +263,7 @@ def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tup
     """Return a socket that never waits, and the address as the system writes it."""
     flags = socket.AI_PASSIVE if passive else 0
     found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=flags)
-    # Autopilots and their routers listen to IPv4, also where the name has both.
+    # Autopilots and their routers listen on IPv4, also where the name has both kinds of address.
     family, kind, protocol, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     made = socket.socket(family, kind, protocol)
     made.setblocking(False)
@@ -272,7 +271,7 @@ def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tup
 
 
 class _UdpPort:
-    """What both directions of UDP share: a datagram goes at once or not at all."""
+    """Common base of UDP ports: a datagram goes at once or not at all."""
 
     unsent = False
     lag_s = 0.0
@@ -322,7 +321,7 @@ class _UdpPort:
 
 
 class _UdpSender(_UdpPort):
-    """Sends to one address, and hears that alone."""
+    """Port that sends to one address and hears only that."""
 
     many = False
 
@@ -330,7 +329,7 @@ class _UdpSender(_UdpPort):
         made, where = _open_udp(address, passive=False)
         super().__init__(made)
         try:
-            # Connected, so that the system tells when nobody listens, and lets nobody else in.
+            # Connected, so that the system reports a closed port and filters other senders.
             made.connect(where)
         except OSError:
             made.close()
@@ -347,7 +346,7 @@ class _UdpSender(_UdpPort):
 
 
 class _UdpBroadcaster(_UdpPort):
-    """Sends to a broadcast address; hears whoever answers."""
+    """Port that sends to a broadcast address and hears all that answer."""
 
     many = True
 
@@ -407,7 +406,7 @@ class _UdpListener(_UdpPort):
 
 
 class StreamPort:
-    """What TCP and serial share: a message may go in parts, and the rest goes before the next."""
+    """Common base of TCP and serial ports: the rest of a partly sent message goes first."""
 
     refused_s: float | None = None
     many = whole = False
@@ -423,11 +422,11 @@ class StreamPort:
 
     @property
     def lag_s(self) -> float:
-        """How long the driver is going to send what it holds already."""
+        """Time that the driver needs to send its buffered data."""
         return 0.0
 
     def read(self) -> tuple[bytes, Peer]:
-        """Return what has come, empty if nothing, and from where: from the only peer."""
+        """Return the received data, possibly empty, and their sender, the only peer."""
         try:
             data = self._take()
         except BlockingIOError:
@@ -437,11 +436,11 @@ class StreamPort:
         return data, ()
 
     def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
-        """Send to everybody: to the only peer."""
+        """Send to the only peer."""
         return self.write(frames, ())
 
     def write(self, frames: bytes, _peer: Peer, /) -> bool:
-        """Send all of it, or nothing if there is no room; return whether it went."""
+        """Send all of it, or nothing if there is no room; return whether it was sent."""
         self.flush()
         if self._rest:
             return False
@@ -450,7 +449,7 @@ class StreamPort:
         return True
 
     def flush(self) -> None:
-        """Send what waits, as far as there is room."""
+        """Send waiting data, as far as there is room."""
         if not self._rest:
             self._moved_s = time.monotonic()
             return
@@ -479,7 +478,7 @@ class _TcpPort(StreamPort):
         self._socket = socket.create_connection((address.host, address.port), _CONNECT_S)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # What waits longer than this holds is too old to be sent.
+        # Data beyond this buffer would be too old when sent.
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
 
     def fileno(self) -> int:
@@ -487,7 +486,7 @@ class _TcpPort(StreamPort):
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Free the port at once; what waits is lost."""
+        """Free the port at once; waiting data are lost."""
         self._socket.close()
 
     def _take(self) -> bytes:
@@ -500,7 +499,3 @@ class _TcpPort(StreamPort):
 def why(fault: Exception) -> str:
     """Return the cause of a fault in a few words."""
     return (fault.strerror if isinstance(fault, OSError) else None) or str(fault)
-
-
-_BITS_PER_BYTE = 10
-_COMMON = (9600, 38400, 57600, 115200, 230400, 460800, 921600, 1500000)

@@ -1,1 +1,1 @@
-"""Where a live run's answers go: autopilot, ROS, Foxglove, plain JSON."""
+"""Outputs of a live run: autopilot, ROS, Foxglove, plain JSON."""

@@ -1,4 +1,4 @@
-"""What every output of a live run offers."""
+"""Interface of all outputs of a live run."""
 
 from typing import Protocol
 
@@ -7,10 +7,10 @@ from aqualvs.sources.base import PartHealth
 
 
 class Output(Protocol):
-    """Takes samples; one small class for each kind of receiver.
+    """Interface of an output: a small class for each kind of receiver.
 
-    Made by its constructor without waiting for a peer; a peer that is not there, goes or returns is
-    no exception but told by `health`.
+    Made by its constructor without waiting for a peer; a peer that is absent, leaves or returns is
+    reported by `health` and raises no exception.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Output(Protocol):
 
     @property
     def name(self) -> str:
-        """How health and messages call it."""
+        """Name of the output in health reports and messages."""
 
     @property
     def inline(self) -> bool:

@@ -1,9 +1,8 @@
-"""To ROS 2 without ROS: a publisher by Cyclone DDS that its subscribers take for one of theirs.
+"""ROS 2 topics without ROS: a publisher by Cyclone DDS, compatible with subscribers of ROS 2.
 
-The ROS 2 messages that are published, as types of Cyclone DDS.
-
-Names of the types, names, order and types of their members are those that ROS 2 uses (plain CDR,
-all types final), so that its subscribers match and read them.
+The messages are types of Cyclone DDS. Names of the types, and names, order and types of their
+members are those that ROS 2 uses (plain CDR, all types final), so that its subscribers match and
+read them.
 """
 
 import functools
@@ -33,7 +32,7 @@ _POSE, _POSE_COV = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovarian
 _FIELD = "sensor_msgs/msg/PointField"
 _STATUS, _PAIR = "diagnostic_msgs/msg/DiagnosticStatus", "diagnostic_msgs/msg/KeyValue"
 
-# In an order in which every type comes after those that it is made of.
+# Ordered so that every type comes after its parts.
 _DEFINITIONS = {
     _TIME: "int32 sec, uint32 nanosec",
     _HEADER: f"{_TIME} stamp, string frame_id",
@@ -65,7 +64,7 @@ _HASHES = {
 
 
 def type_hash(topic: Topic) -> bytes:
-    """Return the user data by which ROS 2 since Iron tells the version of a topic's type.
+    """Return the user data that identify the version of a topic's type since ROS 2 Iron.
 
     Subscribers match without it, but warn (ROS REP-2016).
     """
@@ -138,7 +137,7 @@ def _serialize_cloud(
 
 
 _DEPTH = 5
-# A reader that cannot keep up holds a reliable writer for no longer.
+# Longest time that a slow reader blocks a reliable writer.
 _MAX_BLOCKING_NS = 50_000_000
 _MAX_DOMAIN = 232
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
@@ -150,7 +149,7 @@ _LOCALHOST = (
     "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
     '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
 )
-# By default every topic waits for a second, when it is closed, for subscribers that died.
+# By default every topic waits a second for dead subscribers when it is closed.
 _SHORT_FAREWELL = (
     "<CycloneDDS><Domain><Internal><WriterLingerDuration>100 ms</WriterLingerDuration>"
     "</Internal></Domain></CycloneDDS>"
@@ -159,14 +158,14 @@ _SHORT_FAREWELL = (
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """What Cyclone DDS needs to be kept alive while it publishes."""
+    """Objects of Cyclone DDS that must stay alive while it publishes."""
 
     domain: Any
     participant: Any
     writers: dict[Topic, Any]
 
     def wanted(self) -> frozenset[Topic]:
-        """Return the topics that somebody listens to."""
+        """Return the topics that have subscribers."""
         return frozenset(
             topic
             for topic, writer in self.writers.items()
@@ -175,7 +174,7 @@ class _Link:
 
 
 class DdsOutput:
-    """Publishes as ROS 2 does, whether ROS 2 is installed or not.
+    """Publisher of ROS 2 topics, whether ROS 2 is installed or not.
 
     Parameters
     ----------
@@ -217,7 +216,7 @@ class DdsOutput:
         self._health = PartHealth(self.name, State.WARN, "not connected yet")
 
     def send(self, sample: LiveSample) -> None:
-        """Publish what a sample has to say, on the topics that somebody listens to.
+        """Publish a sample on the topics that have subscribers.
 
         A network that is not there is looked for again after half a second, then less and less
         often, up to every eight seconds.
@@ -306,7 +305,7 @@ def domain_of_this_machine(environment: Mapping[str, str] = os.environ) -> int:
 
 
 def stays_on_this_machine(environment: Mapping[str, str] = os.environ) -> bool:
-    """Return whether ROS 2 is told not to use the network, and Cyclone DDS nothing else."""
+    """Return whether ROS 2 is configured for this machine only, and Cyclone DDS not at all."""
     local = (
         environment.get("ROS_LOCALHOST_ONLY", "") == "1"
         or environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
@@ -362,6 +361,6 @@ def _quality(topic: Topic, options: RosOptions, types: Ros2Types) -> Any:
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
     ]
     if types.range_has_variance:
-        # Releases before Iron know no hashes, and have another Range.
+        # Releases before Iron have no type hashes, and another Range.
         policies.append(Policy.Userdata(type_hash(topic)))
     return Qos(*policies)

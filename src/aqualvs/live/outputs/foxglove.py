@@ -1,9 +1,8 @@
 """Foxglove live: a WebSocket server that Foxglove connects to (extra `foxglove`).
 
-Topics and messages are those of a recording (`aqualvs.recording.encoding`), so that one
-layout shows both; frames and scene come in addition. Nothing is made that nobody watches.
-
-What Foxglove's 3D panel shows beside the points: frames, target plane, laser lines.
+Topics and messages are those of a recording (`aqualvs.recording.encoding`), so that one layout
+shows both. In addition there are coordinate frames and a scene for the 3D panel: target plane and
+laser lines beside the points. Messages that nobody watches are not made.
 """
 
 import math
@@ -49,7 +48,7 @@ VEHICLE = "vehicle"
 
 _VEHICLE_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _LIFETIME_S = 0.5
-# Sides of the square that stands for the target, as a share of its range.
+# Side of the square that represents the target, as a share of its range.
 _SIDE_SHARE = 1.0
 _GREEN, _BLUE = (0.1, 1.0, 0.3, 1.0), (0.2, 0.6, 1.0, 0.25)
 _LINE_PX = 2.0
@@ -103,7 +102,7 @@ def laser_lines(
     normal : array, shape (3,)
         Of the target.
     points : ScanPoints
-        Those that the posture rests on count.
+        Only the posture's inliers count.
     """
     found = []
     for i, laser in enumerate(lasers):
@@ -217,7 +216,7 @@ _SELDOM_HZ = 1.0
 
 
 class FoxgloveOutput:
-    """Serves posture, points, picture, scene and health to any number of viewers.
+    """Server of posture, points, picture, scene and health to any number of viewers.
 
     Parameters
     ----------
@@ -329,7 +328,7 @@ class FoxgloveOutput:
             self._server.stop()
 
     def _log_seldom(self, sample: LiveSample, at_ns: int) -> None:
-        """Send what changes seldom, also for those who have just come."""
+        """Send data that rarely change, also to new viewers."""
         rig, health, options = sample.rig, sample.health, self._scanner
         if self._transforms.has_sinks():
             self._transforms.log(transforms(rig, at_ns), log_time=at_ns)
@@ -343,14 +342,14 @@ class FoxgloveOutput:
     def _log(
         self, topic: Topic, at_ns: int, content: Callable[[], bytes], due: "_Rate | None" = None
     ) -> None:
-        """Send a message if somebody watches its topic and it is due."""
+        """Send a message if its topic has viewers and it is due."""
         channel = self._channels[topic]
         if channel.has_sinks() and (due is None or due.at(at_ns)):
             channel.log(content(), log_time=at_ns)
 
 
 class _Viewers:
-    """Counts who watches; called by the server's threads."""
+    """Counter of viewers; called by the server's threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -364,7 +363,7 @@ class _Viewers:
             return len(self._watched)
 
     def take_news(self) -> bool:
-        """Return whether somebody has asked for a topic since the last call."""
+        """Return whether a viewer has subscribed to a topic since the last call."""
         with self._lock:
             news, self._news = self._news, False
             return news
@@ -384,7 +383,7 @@ class _Viewers:
 
 
 class _Rate:
-    """Says when something may be sent again."""
+    """Rate limit of a message."""
 
     def __init__(self, hz: float) -> None:
         # A tenth of a period early rather than a whole frame late.
@@ -392,7 +391,7 @@ class _Rate:
         self._from_ns = 0
 
     def at(self, stamp_ns: int) -> bool:
-        """Return whether it is time, and begin to wait anew if so."""
+        """Return whether the message is due; if so, start the next period."""
         if self._every_ns is None or stamp_ns < self._from_ns:
             return False
         self._from_ns = stamp_ns + self._every_ns

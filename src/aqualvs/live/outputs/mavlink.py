@@ -1,4 +1,4 @@
-"""Posture to the autopilot and the pilot's station by MAVLink."""
+"""Posture to the autopilot and to the pilot's station by MAVLink."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import ScanPoints
 from aqualvs.sources.base import PartHealth
 
-# The scanner believes a range that is beyond the working range by one part in a hundred.
+# The scanner accepts ranges up to one percent beyond the working range.
 _RANGE_TOLERANCE = 0.01
 _MAX_CM = 65_535
 _UNKNOWN_VARIANCE = 255
@@ -38,11 +38,11 @@ posture."""
 
 FILTERED_NAMES = ("aqf_valid", "aqf_range", "aqf_pitch", "aqf_yaw", "aqf_speed")
 """The same from the time filter, while it is switched on: 1 or 0, mm, degrees, and the rate of the
-range in mm/s. NaN where the filter has nothing to say."""
+range in mm/s. NaN where the filter has no value."""
 
 
 class MavlinkOutput:
-    """Sends `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
+    """Output by `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class MavlinkOutput:
         self._was_filtered = False
 
     def send(self, sample: LiveSample) -> None:
-        """Send one sample; never waits, and what cannot be sent is dropped."""
+        """Send one sample without waiting; drop messages that cannot be sent."""
         time_boot_ms = boot_ms(sample.instants.arrived_ns)
         _fill_distance(self._distance, time_boot_ms, sample)
         numbers = _numbers(sample.scan.posture, sample.scan.n_water)
@@ -80,7 +80,7 @@ class MavlinkOutput:
         if self._was_filtered:
             filtered = _filtered_numbers(sample.filtered)
             messages = messages + _fill(self._filtered_values, time_boot_ms, filtered)
-        # The autopilot's distance goes first, and even where a slow line has no room for the rest.
+        # The autopilot's distance goes first, even if a slow line has no room for the rest.
         sent = self.link.send(self._distance, urgent=True)
         sent &= self.link.send(*messages)
         self._n_dropped += not sent

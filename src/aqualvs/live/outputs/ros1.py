@@ -1,10 +1,9 @@
-"""To ROS 1: posture, range, cloud and diagnostics as topics of a node.
+"""ROS 1 output: posture, range, cloud and diagnostics as topics of a node in plain Python.
 
-A ROS 1 node in plain Python: known to roscore, found by subscribers.
-
-`rospy` would tie us to the Python of a ROS release (3.8 on Noetic), waits for roscore without end
-when it starts, never comes back when roscore was restarted, and can be started once in a process.
-What a publisher needs of the protocol is little (http://wiki.ros.org/ROS/Slave_API, Master_API).
+The node registers with roscore and serves its subscribers itself. `rospy` would tie us to the
+Python of a ROS release (3.8 on Noetic), waits for roscore without end when it starts, never
+reconnects after roscore was restarted, and can be started once in a process. The protocol of a
+publisher is small (http://wiki.ros.org/ROS/Slave_API, Master_API).
 """
 
 import http.client
@@ -32,14 +31,14 @@ _ASK_EVERY_S = 2.0
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
 _MASTER_S = 2.0
 _PATIENCE_S = 3.0
-# No packet is ever sent there; the system is only asked which way it would go.
+# No packet is ever sent there; the system is only asked for the route.
 _FAR_AWAY = "198.51.100.1"
 _TROUBLE = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError)
 _log = logging.getLogger(__name__)
 
 
 class Ros1Node:
-    """Publishes topics; registers with roscore, whenever it is there.
+    """ROS 1 node that publishes topics; registers with roscore whenever that is there.
 
     Parameters
     ----------
@@ -83,12 +82,12 @@ class Ros1Node:
 
     @property
     def tcpros(self) -> list[Any]:
-        """How subscribers connect, in the protocol's words."""
+        """Address for subscribers, in the protocol's form."""
         return ["TCPROS", self._host, self.links.port]
 
     @property
     def trouble(self) -> str:
-        """Why nobody can find the node, in a few words; empty where roscore knows it."""
+        """Reason why roscore does not know the node; empty if it does."""
         return self._ended or self._trouble
 
     def leave(self, reason: str) -> None:
@@ -143,7 +142,7 @@ class Ros1Node:
 
 
 class _SlaveApi:
-    """What roscore and subscribers may ask of a node; each answer is (code, message, value)."""
+    """Slave API of the node for roscore and subscribers; answers are (code, message, value)."""
 
     def __init__(self, node: Ros1Node) -> None:
         self._node = node
@@ -188,7 +187,7 @@ class _QuietHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
 
 
 class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
-    """Answers calls, each in a thread that nobody waits for."""
+    """Server of calls, each in a daemon thread."""
 
     daemon_threads = True
     block_on_close = False
@@ -216,7 +215,7 @@ class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
 
 
 class _Transport(xmlrpc.client.Transport):
-    """Gives up on a roscore that does not answer."""
+    """Transport with a timeout, for a roscore that does not answer."""
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
@@ -291,7 +290,7 @@ _NODE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
 class Ros1Output:
-    """Publishes as a ROS 1 node, whether ROS is installed on this machine or not.
+    """Publisher of ROS 1 topics, whether ROS is installed on this machine or not.
 
     Parameters
     ----------
@@ -336,7 +335,7 @@ class Ros1Output:
 
     @property
     def uri(self) -> str:
-        """Where ROS calls the node."""
+        """Address of the node for calls by ROS."""
         return self._node.uri
 
     def send(self, sample: LiveSample) -> None:

@@ -1,13 +1,11 @@
-"""Connections of ROS 1 subscribers (TCPROS), all served by one thread.
+"""Messages of ROS 1 and connections to its subscribers (TCPROS), all served by one thread.
 
-A subscriber opens a connection for one topic, says who it is and what it expects in a header of
-`key=value` fields, gets one in return, and then messages, each behind its length
-(http://wiki.ros.org/ROS/TCPROS).
+A subscriber opens a connection for one topic, states its name and the type that it expects in a
+header of `key=value` fields, gets such a header in return, and then messages, each behind its
+length (http://wiki.ros.org/ROS/TCPROS).
 
-Messages as ROS 1 has them on the wire: definitions, checksums, bytes.
-
-Little endian and without padding; a string or list follows its length
-(http://wiki.ros.org/ROS/Connection%20Header and msg).
+Messages have definitions and checksums; their bytes are little-endian without padding, and a string
+or list follows its length (http://wiki.ros.org/ROS/Connection%20Header and msg).
 """
 
 import contextlib
@@ -220,7 +218,7 @@ _log = logging.getLogger(__name__)
 
 
 class _RefusedError(Exception):
-    """What a subscriber expects cannot be given; the message is sent to it."""
+    """Refusal of a subscriber's request; the message is sent to the subscriber."""
 
 
 class _Link:
@@ -257,7 +255,7 @@ class _Link:
 
 
 class Ros1Links:
-    """Serves subscribers of some topics.
+    """Server of the subscribers of some topics.
 
     Parameters
     ----------
@@ -326,7 +324,7 @@ class Ros1Links:
         self._thread.join(_PATIENCE_S)
 
     def _rouse(self) -> None:
-        # Where the pipe is full the thread is going to wake anyway.
+        # If the pipe is full, the thread will wake anyway.
         with contextlib.suppress(OSError):
             self._wake.send(b"!")
 
@@ -371,7 +369,7 @@ class Ros1Links:
         self._selector.register(connection, selectors.EVENT_READ, link)
 
     def _hear(self, link: _Link) -> None:
-        """Take what a subscriber says; after the handshake that is nothing but its farewell."""
+        """Read from a subscriber; after the handshake only the end of the connection comes."""
         if link not in self._links:
             return
         try:
@@ -395,7 +393,7 @@ class Ros1Links:
         except _RefusedError as refusal:
             _log.warning("subscriber at %s refused: %s", link.peer, refusal)
             link.waiting.append(_tcpros_header({"error": str(refusal)}))
-            # A few octets always fit; what the peer makes of them is its own affair.
+            # A few octets always fit; the peer may ignore them.
             self._serve(link)
             self._part(link)
             return

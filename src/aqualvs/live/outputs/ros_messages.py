@@ -1,8 +1,6 @@
-"""What ROS is told, before it takes the form of ROS 1, of ROS 2 or of DDS.
+"""ROS messages before encoding for ROS 1, ROS 2 or DDS: pose, range, cloud and diagnostics.
 
-Frames and signs: forward, left, up at the dome's centre.
-
-From the dome's axes to those of ROS and MAVLink, and the target's plane as a ROS pose.
+Vectors of the dome are converted to the axes of ROS and MAVLink, all at the dome's centre:
 
 =======  =======  =======  ====  ================================
 frame    x        y        z     used by
@@ -12,7 +10,8 @@ FLU      forward  left     up    ROS (REP-103), Foxglove
 FRD      forward  right    down  MAVLink
 =======  =======  =======  ====  ================================
 
-Health as ROS's diagnostics: one status for each part, with figures.
+Messages are in FLU. `plane_pose` gives the target's plane as a ROS pose. Health becomes ROS
+diagnostics, one status with figures for each part of the run.
 """
 
 import math
@@ -41,7 +40,7 @@ FLU_FROM_DOME.flags.writeable = False
 FRD_FROM_DOME.flags.writeable = False
 
 UNOBSERVABLE_VARIANCE = 1.0e4
-"""Variance, in m² and rad², of what a plane tells nothing about: 100 m, 100 rad."""
+"""Variance, in m² and rad², of what a plane leaves undetermined: 100 m, 100 rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +309,7 @@ POINT_FIELDS = (
     PointField("label", 21, _UINT8, "u1"),
     PointField("used", 22, _UINT8, "u1"),
 )
-"""What a point of the cloud consists of: metres, grey levels, indices, `Label` and 0 or 1."""
+"""Fields of a point of the cloud: metres, grey levels, indices, `Label` and 0 or 1."""
 
 POINT_TYPE = np.dtype(
     {
@@ -324,7 +323,7 @@ POINT_TYPE = np.dtype(
 
 
 class Topic(StrEnum):
-    """What is published; the value is the last part of its topic's name."""
+    """Published topic; the value is the last part of its name."""
 
     POSTURE = "posture"
     FILTERED = "posture_filtered"
@@ -413,7 +412,7 @@ Message: TypeAlias = PoseMessage | RangeMessage | CloudMessage | DiagnosticsMess
 
 
 class MessageMaker:
-    """Turns samples into messages, the diagnostics once in a while.
+    """Converter of samples to messages; diagnostics once per period.
 
     Parameters
     ----------
@@ -429,7 +428,7 @@ class MessageMaker:
     def messages(
         self, sample: LiveSample, wanted: Collection[Topic]
     ) -> Iterator[tuple[Topic, Message]]:
-        """Yield what there is to say about a sample, on the topics that somebody listens to.
+        """Yield the messages of a sample, on the topics that have subscribers.
 
         Without a posture there is no pose, and the range is not a number.
         """
@@ -467,7 +466,7 @@ class MessageMaker:
         near, far = rig.working_range
         value = posture.range if posture else _no_range(sample)
         if posture:
-            # What the scanner believes just outside must not be thrown away by the receiver.
+            # Ranges that the scanner accepts just outside must not be discarded by the receiver.
             near, far = min(near, value), max(far, value)
         return RangeMessage(
             stamp_ns=sample.utc_ns,
@@ -519,7 +518,7 @@ def _pose_message(
 
 
 def _no_range(sample: LiveSample) -> float:
-    """Return what REP-117 says where there is no range.
+    """Return the value of REP-117 for a missing range.
 
     Minus infinity for a target that is too near, infinity for one that is too far, else not a
     number: a picture without stripes is no promise that the way is free.

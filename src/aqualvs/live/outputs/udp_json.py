@@ -1,7 +1,4 @@
-"""Posture as one line of JSON in a datagram, for whatever can read that.
-
-A live sample as one line of JSON.
-"""
+"""Posture as one line of JSON in a UDP datagram."""
 
 import errno
 import json
@@ -23,7 +20,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
 
 FORMAT_VERSION = 1
-"""Rises when a key changes its meaning or goes; new keys may come at any time."""
+"""Increased when a key changes its meaning or is removed; keys may be added at any time."""
 
 Value: TypeAlias = str | int | float | bool | None
 
@@ -73,9 +70,9 @@ def json_line(sample: LiveSample) -> bytes:
 
 
 def json_fields(sample: LiveSample) -> dict[str, Value]:
-    """Return a sample as plain values: those of `posture.csv`, rounded alike, and what is live.
+    """Return a sample as plain values: the rounded ones of `posture.csv`, and the live ones.
 
-    None stands for what is not known, and for numbers that are not finite.
+    Unknown values and numbers that are not finite are None.
     """
     scan, posture = sample.scan, sample.scan.posture
     refusal = posture if isinstance(posture, Refusal) else None
@@ -155,7 +152,7 @@ def _delay_s(sample: LiveSample) -> Value:
 
 
 def _sigmas(cov: FloatArray) -> list[Value]:
-    """Return the standard deviations of range (m), pitch and yaw (deg); None for what is none."""
+    """Return the standard deviations of range (m), pitch and yaw (deg); None for missing ones."""
     variances = np.diagonal(cov)[:3].tolist()
     sigma = [math.sqrt(value) if value >= 0.0 else math.nan for value in variances]
     return [_short(value) for value in (sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2]))]
@@ -176,7 +173,7 @@ _REFUSED_FOR_S = 3.0
 
 
 class UdpJsonOutput:
-    """Sends every sample to every receiver.
+    """Output that sends every sample to every receiver.
 
     Parameters
     ----------
@@ -201,7 +198,7 @@ class UdpJsonOutput:
         self._closed = False
 
     def send(self, sample: LiveSample) -> None:
-        """Send one sample; never waits, and what cannot be sent is dropped."""
+        """Send one sample without waiting; drop it for receivers that cannot be reached."""
         if self._closed:
             return
         line = json_line(sample)
@@ -209,7 +206,7 @@ class UdpJsonOutput:
             receiver.send(line)
 
     def health(self) -> PartHealth:
-        """Return how many receivers are reached, and what keeps the others."""
+        """Return the number of reached receivers, and the faults of the others."""
         n_dropped = sum(receiver.n_dropped for receiver in self._receivers)
         if self._closed:
             return PartHealth(self.name, State.OFF, "closed", n_dropped)
@@ -246,7 +243,7 @@ class _Receiver:
             threading.Thread(target=self._resolve, name=f"find {self._host}", daemon=True).start()
 
     def fault(self) -> str:
-        """Return what keeps this receiver, empty if nothing does."""
+        """Return the fault of this receiver, empty if there is none."""
         if time.monotonic() - self._refused_s < _REFUSED_FOR_S:
             return f"nobody listens at {self._address}"
         return f"{self._address}: {self._trouble}" if self._trouble else ""
@@ -284,7 +281,7 @@ class _Receiver:
         return False
 
     def _open(self) -> bool:
-        """Open the socket if it is not; return whether it is."""
+        """Open the socket if necessary; return whether it is open."""
         if self._socket is not None:
             return True
         now = time.monotonic()
@@ -295,7 +292,7 @@ class _Receiver:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        # Connected, so that the system tells when nobody listens.
+        # Connected, so that the system reports a closed port.
         self._socket.connect(where)
         return True
 
