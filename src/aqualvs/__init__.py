@@ -4,10 +4,11 @@ The names below are the interface for programs; each is imported when it is firs
 `import aqualvs` itself costs nothing.
 """
 
-import importlib
 import os
-from typing import TYPE_CHECKING, Any
 
+# As of `typing`, whose import would take longer than all that a command does before it listens to
+# Ctrl-C.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from aqualvs.errors import AqualvsError
     from aqualvs.optics.rig import Rig
@@ -63,9 +64,11 @@ _MODULES = {
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(160_000_000))
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
     found = getattr(importlib.import_module(_MODULES[name]), name)
     # Kept, so that Python does not ask again.
     globals()[name] = found
