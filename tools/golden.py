@@ -27,7 +27,7 @@ from rig_from_sample_truth import rig_from_truth
 
 DEMO = Path(__file__).parents[1] / "src" / "aqualvs" / "data" / "demo"
 SAMPLE_DIVES = ("wall_range", "net_diamond", "net_clutter")
-# Rows of `posture.csv` that name the time a run took would differ from run to run.
+# Durations, dates and sizes in messages differ from run to run.
 _VOLATILE = re.compile(r"\d+(\.\d+)? s\b|\d{4}-\d\d-\d\dT[\d:]+Z?|\d+(\.\d+)? (GB|MB)")
 
 WRONG: Mapping[str, Sequence[str]] = {

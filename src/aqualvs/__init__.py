@@ -10,36 +10,23 @@ import os
 # Ctrl-C.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from aqualvs.errors import AqualvsError
-    from aqualvs.optics.rig import Rig
-    from aqualvs.optics.rigfile import load_rig, save_rig
-    from aqualvs.pipeline import RunResult, run
-    from aqualvs.results.net_survey import read_run
-    from aqualvs.results.run_request import RunRequest
-    from aqualvs.scanner import Scanner, ScannerOptions
-    from aqualvs.scanning.posture import Posture, Refusal
-    from aqualvs.scanning.scan import Frame, Scan
-    from aqualvs.sources import open_source
+    from aqualvs.errors import AqualvsError as AqualvsError
+    from aqualvs.optics.rig import Rig as Rig
+    from aqualvs.optics.rigfile import load_rig as load_rig
+    from aqualvs.optics.rigfile import save_rig as save_rig
+    from aqualvs.pipeline import RunResult as RunResult
+    from aqualvs.pipeline import run as run
+    from aqualvs.results.net_survey import read_run as read_run
+    from aqualvs.results.run_request import RunRequest as RunRequest
+    from aqualvs.scanner import Scanner as Scanner
+    from aqualvs.scanner import ScannerOptions as ScannerOptions
+    from aqualvs.scanning.posture import Posture as Posture
+    from aqualvs.scanning.posture import Refusal as Refusal
+    from aqualvs.scanning.scan import Frame as Frame
+    from aqualvs.scanning.scan import Scan as Scan
+    from aqualvs.sources import open_source as open_source
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "AqualvsError",
-    "Frame",
-    "Posture",
-    "Refusal",
-    "Rig",
-    "RunRequest",
-    "RunResult",
-    "Scan",
-    "Scanner",
-    "ScannerOptions",
-    "load_rig",
-    "open_source",
-    "read_run",
-    "run",
-    "save_rig",
-]
 
 _MODULES = {
     "AqualvsError": "aqualvs.errors",
@@ -58,6 +45,8 @@ _MODULES = {
     "run": "aqualvs.pipeline",
     "save_rig": "aqualvs.optics.rigfile",
 }
+
+__all__ = sorted(_MODULES)
 
 # Pixels of a picture that OpenCV decodes, read when it is imported: a file of a few kilobytes can
 # claim 60,000 x 60,000. The largest cameras have 150 million.

@@ -20,7 +20,7 @@ from aqualvs.sources import FrameSource, open_source
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import ScansFrames
 from aqualvs.workers.pool import CrewWork, crew_work
-from aqualvs.workers.replay import Replay, ReplayRequest, replay_of
+from aqualvs.workers.replay import Replay, replay_of
 from aqualvs.workers.run_frames import RunMeasuring
 from aqualvs.workers.water_index import WaterFollowingScanner
 
@@ -190,18 +190,7 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
 
 
 def _replay(request: RunRequest) -> Replay | None:
-    replay = replay_of(
-        request.source,
-        ReplayRequest(
-            rig=request.rig,
-            water=request.water,
-            no_dome=request.no_dome,
-            scanner=request.scanner,
-            chosen=request.chosen,
-            index_target=request.index_target,
-            pictures=request.overlay,
-        ),
-    )
+    replay = replay_of(request)
     if replay is not None and request.fps is not None:
         raise OptionError(f"--fps: {request.source} has its own clock; leave the frame rate out")
     return replay

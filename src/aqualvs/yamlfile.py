@@ -15,12 +15,29 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 import yaml
 
-from aqualvs.errors import AqualvsError
+from aqualvs.errors import AqualvsError, OutputError
 from aqualvs.special_files import refuse_special
 
 _HEADER = "# A rig of aqualvs: lengths in mm, angles in degrees, frame 'dome' (docs/rig.md).\n"
 # Lists stay on one line, regardless of their digits.
 _WIDTH = 1000
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        raise OutputError(
+            f"{path}: cannot be written ({fault.strerror}); choose another place"
+        ) from None
 
 
 class TidyDumper(yaml.SafeDumper):

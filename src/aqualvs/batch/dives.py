@@ -301,7 +301,7 @@ def find_dives(
         If a dive is given twice with different rigs, water or names, or a list cannot be read.
     """
     found: dict[Path, Dive] = {}
-    for listed in _dives_listed(wanted, out):
+    for listed in _found_dives(wanted, out):
         source = listed.source.resolve()
         dive = Dive(
             source=source,
@@ -316,7 +316,7 @@ def find_dives(
     return list(found.values())
 
 
-def _dives_listed(wanted: Iterable[str], out: Path | None) -> Iterator[ListedDive]:
+def _found_dives(wanted: Iterable[str], out: Path | None) -> Iterator[ListedDive]:
     for text in wanted:
         for path in _expanded(text):
             if path.suffix.lower() in LIST_SUFFIXES and path.is_file():

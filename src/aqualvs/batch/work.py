@@ -27,7 +27,7 @@ from aqualvs.sources.images import ImageSource, images_in
 from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
 from aqualvs.sources.video import VideoSource
 from aqualvs.workers.frame_results import ScansFrames
-from aqualvs.workers.replay import Replay, ReplayRequest, replay_of
+from aqualvs.workers.replay import Replay, replay_of
 
 PIECE_FRAMES = 1500
 """Frames that a piece has at least: a minute of video, seconds of work."""
@@ -101,18 +101,7 @@ def open_dive(request: RunRequest) -> OpenDive:
     AqualvsError
         If one of them cannot be used, or they do not belong together.
     """
-    replay = replay_of(
-        request.source,
-        ReplayRequest(
-            rig=request.rig,
-            water=request.water,
-            no_dome=request.no_dome,
-            scanner=request.scanner,
-            chosen=request.chosen,
-            index_target=request.index_target,
-            pictures=False,
-        ),
-    )
+    replay = replay_of(request)
     if replay is not None:
         return OpenDive(replay, replay.rig, replace(request, scanner=replay.options), replay)
     rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)

@@ -4,9 +4,8 @@ import csv
 import io
 import math
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from aqualvs.closing import Closing
 from aqualvs.control.autopilot import Decision
 from aqualvs.control.missions import bearing_of
 from aqualvs.control.vehicle import VehicleState
@@ -43,7 +42,7 @@ FOLLOW_COLUMNS = (
 are empty."""
 
 
-class FollowLog:
+class FollowLog(Closing):
     """Writer of the log, row by row.
 
     Parameters
@@ -102,19 +101,6 @@ class FollowLog:
             f"{self._path}: cannot be written ({fault.strerror}); make room, or "
             "choose another place"
         )
-
-    def __enter__(self) -> Self:
-        """Return the log."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the file."""
-        self.close()
 
 
 def follow_row(

@@ -24,8 +24,8 @@ from aqualvs.control.gains import (
     VehicleFacts,
     YawGains,
 )
-from aqualvs.errors import OptionError, OutputError
-from aqualvs.yamlfile import parse_yaml, read_yaml
+from aqualvs.errors import OptionError
+from aqualvs.yamlfile import parse_yaml, read_yaml, write_text
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -85,23 +85,6 @@ def parse_settings(
         return kind.model_validate(dict(content))
     except ValidationError as error:
         raise OptionError(f"{name}: {_first_fault(error, kind)}") from None
-
-
-def write_settings(path: Path, text: str) -> None:
-    """Write a file.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        raise OutputError(
-            f"{path}: cannot be written ({fault.strerror}); choose another place"
-        ) from None
 
 
 def _first_fault(error: ValidationError, kind: type[Part]) -> str:
@@ -270,7 +253,7 @@ def save_gains(gains: ControlGains, path: Path) -> None:
     OutputError
         If it cannot be written.
     """
-    write_settings(path, gains_text(gains))
+    write_text(path, gains_text(gains))
 
 
 def gains_text(gains: ControlGains) -> str:

@@ -338,7 +338,7 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
         "sentences": "\n".join(_paragraph(line) for line in lines),
         "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
         "holes": _holes(result),
-        "dates": _page_dates(result),
+        "dates": _table_of_dates(result),
         "dives": _dives(result, origins),
         "footer": escape(f"Written {now()} by aqualvs {__version__}."),
     }
@@ -419,7 +419,7 @@ def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
     )
 
 
-def _page_dates(result: Comparison) -> str:
+def _table_of_dates(result: Comparison) -> str:
     wall = result.wall
     on_wall: dict[object, Growth | None] = {}
     if wall is not None:

@@ -375,12 +375,12 @@ def net_facts(wall: NetWall, area: float, n_frames: int, n_net_frames: int) -> d
         "area_m2": round(area, 3),
         "way_m": round(_way(wall), 3),
         "mesh": shapes.most_common(1)[0][0] if shapes else None,
-        "bar_mm": _words_rounded(_mean(stretches, _bar_mm), 2),
-        "twine_mm": _words_rounded(_mean(stretches, _twine_mm), 2),
-        "solidity": _words_rounded(solidity, 4),
-        "fouling": _words_rounded(fouling, 4),
+        "bar_mm": _rounded_number(_mean(stretches, _bar_mm), 2),
+        "twine_mm": _rounded_number(_mean(stretches, _twine_mm), 2),
+        "solidity": _rounded_number(solidity, 4),
+        "fouling": _rounded_number(fouling, 4),
         "track_slip_m": round(wall.places.slip, 2),
-        "largest_hole_mm": _words_rounded(
+        "largest_hole_mm": _rounded_number(
             max((1e3 * h.diameter for h in wall.holes), default=None), 1
         ),
     }
@@ -481,5 +481,5 @@ def _twine_mm(stretch: NetStretch) -> float | None:
     return None if stretch.twine is None else 1e3 * stretch.twine.thickness
 
 
-def _words_rounded(value: float | None, digits: int) -> float | None:
+def _rounded_number(value: float | None, digits: int) -> float | None:
     return None if value is None else round(float(value), digits)

@@ -4,7 +4,7 @@ Modules that read recordings are imported where they are used, because every run
 and few replay a recording.
 """
 
-from collections.abc import Iterator, Set
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ import numpy as np
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.optics.rig import Rig
-from aqualvs.results.run_request import Water, in_water, prepared_rig
+from aqualvs.results.run_request import RunRequest, Water, in_water, prepared_rig
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
@@ -37,41 +37,15 @@ class ReplayedFrame(Frame):
     recorded: "RecordedFrame | None" = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReplayRequest:
-    """Request for a replay: what differs from the recorded run.
-
-    Attributes
-    ----------
-    rig : Path or None
-        Another rig to measure with.
-    water : Water
-        Another water.
-    no_dome : bool
-    scanner : ScannerOptions
-    chosen : set of str or None
-        Fields of `scanner` that count; otherwise the recording's own apply. None: all.
-    index_target : Path or None
-    pictures : bool
-        Whether pictures are wanted even if stripes are not looked for again.
-    """
-
-    rig: Path | None
-    water: Water
-    no_dome: bool
-    scanner: ScannerOptions
-    chosen: Set[str] | None
-    index_target: Path | None
-    pictures: bool
-
-
 class Replay(Closing):
     """A recording that is measured again; both `FrameSource` and scanner of a run.
 
     Parameters
     ----------
     path : Path
-    request : ReplayRequest
+    request : RunRequest
+        Rig, water and the `chosen` options stand for the recorded ones; an overlay needs pictures
+        even if stripes are not looked for again.
 
     Attributes
     ----------
@@ -89,7 +63,7 @@ class Replay(Closing):
         request needs.
     """
 
-    def __init__(self, path: Path, request: ReplayRequest) -> None:
+    def __init__(self, path: Path, request: RunRequest) -> None:
         from aqualvs.recording import DiveRecording
 
         self._recording = recording = DiveRecording(path)
@@ -100,7 +74,7 @@ class Replay(Closing):
         self.n_frames = recording.n_frames
         self._follows = request.rig is None and request.water == Water()
         self._detects = _detects(recording, request, self.options)
-        self._pictures = self._detects or request.pictures
+        self._pictures = self._detects or request.overlay
         self._scanner = Scanner(self.rig, self.options)
         width, height = self.size_px
         self._black: ImagePlane = np.zeros((height, width), np.uint8)
@@ -149,15 +123,15 @@ class Replay(Closing):
         return self._scanner
 
 
-def replay_of(source: str, request: ReplayRequest) -> Replay | None:
-    """Return the replay of a source, None where it is no recording.
+def replay_of(request: RunRequest) -> Replay | None:
+    """Return the replay of a request's source, None where it is no recording.
 
     Raises
     ------
     AqualvsError
         As `Replay`.
     """
-    path = Path(source)
+    path = Path(request.source)
     if path.suffix.lower() != ".mcap":
         return None
     from aqualvs.recording import is_recording
@@ -165,20 +139,20 @@ def replay_of(source: str, request: ReplayRequest) -> Replay | None:
     return Replay(path, request) if is_recording(path) else None
 
 
-def _options(recording: "DiveRecording", request: ReplayRequest) -> ScannerOptions:
+def _options(recording: "DiveRecording", request: RunRequest) -> ScannerOptions:
     if request.chosen is None or recording.options is None:
         return request.scanner
     own = {name: getattr(request.scanner, name) for name in request.chosen}
     return replace(recording.options, **own)
 
 
-def _rig(recording: "DiveRecording", request: ReplayRequest) -> Rig:
+def _rig(recording: "DiveRecording", request: RunRequest) -> Rig:
     if request.rig is not None:
         return prepared_rig(request.rig, request.water, no_dome=request.no_dome)
     return in_water(recording.need_rig(), request.water, no_dome=request.no_dome)
 
 
-def _detects(recording: "DiveRecording", request: ReplayRequest, options: ScannerOptions) -> bool:
+def _detects(recording: "DiveRecording", request: RunRequest, options: ScannerOptions) -> bool:
     """Return whether stripes must be looked for again, in the recorded pictures."""
     if recording.options is not None and options.detector != recording.options.detector:
         wanted = "--detector: this detector needs the pictures, which"

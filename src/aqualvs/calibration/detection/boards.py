@@ -511,9 +511,7 @@ def _grow(image: GreyImage, board: Board, seeds: Seeds) -> Grid:
     known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
     while True:
         expected = predict(pixels, known)
-        new = (
-            ~known & expected.valid & (tries < _MAX_TRIES) & _charuco_inside(expected.pixels, image)
-        )
+        new = ~known & expected.valid & (tries < _MAX_TRIES) & _inside(expected.pixels, image)
         if not np.any(new):
             break
         tries[new] += 1
@@ -561,9 +559,3 @@ def _refine(
         margin=board.margin_share,
         bits_from=board.margin_share + cell,
     )
-
-
-def _charuco_inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
-    height, width = image.shape
-    inside: BoolArray = np.all((pixels >= 0.0) & (pixels <= (width - 1, height - 1)), axis=-1)
-    return inside

@@ -386,7 +386,7 @@ def _result(
     return DomeCalibration(
         rig=rig,
         uncertainty=RigUncertainty(names, covariance[np.ix_(columns, columns)]),
-        media=_dome_media(problem, solution, sets, covariance),
+        media=_solved_media(problem, solution, sets, covariance),
         views=_view_fits(problem, solution, covariance),
         left_out=problem.left_out,
         noise_px=noise_px(solution),
@@ -397,7 +397,7 @@ def _result(
     )
 
 
-def _dome_media(
+def _solved_media(
     problem: DomeProblem,
     solution: Solution[BundleState],
     sets: Sequence[BoardSet],

@@ -164,9 +164,9 @@ def _length_px(points: FloatArray, along: FloatArray) -> float:
 
 # Limits within which two surfaces are the same: sine between normals, distance in metres.
 _SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
-_CANDIDATES_N_FITS = 5
+_N_PLANE_FITS = 5
 # Largest tangent of the angle between a point's stripe and the plane's, in the image.
-_CANDIDATES_ALIGNED = 0.35
+_ALIGNED_WITH_PLANE = 0.35
 # Number of pairs beyond which they are sampled; number of planes tried at a time.
 _MOST_PLANES, _AT_ONCE = 6000, 500
 # Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
@@ -269,7 +269,7 @@ class _Hypotheses:
 
     @classmethod
     def of(cls, pooled: PooledStripes, table: LineTable, tolerance_px: float) -> "_Hypotheses":
-        pairs = _candidates_pairs(pooled, table)
+        pairs = _pairs_of_lines(pooled, table)
         n_expected = len(pairs) * _meeting_rate(table, pairs, tolerance_px)
         normals, offsets = _planes_of_pairs(table, pairs)
         meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
@@ -383,7 +383,7 @@ def _collected(
             break
         alive[best] = False
         start = Plane(planes.normals[best], float(planes.offsets[best]))
-        candidate = _candidates_fitted(pooled, lines, table, free, start, accidents, tolerance_px)
+        candidate = _fitted_candidate(pooled, lines, table, free, start, accidents, tolerance_px)
         if candidate is None:
             continue
         if candidate.log_false_alarms > 0.0:
@@ -422,7 +422,7 @@ def _log_false_alarms(table: LineTable, nearness: FloatArray, accidents: _Accide
     return alarms + np.where(k == 0, np.log(np.maximum(meeting, _NEAREST)), 0.0)
 
 
-def _candidates_fitted(
+def _fitted_candidate(
     pooled: PooledStripes,
     lines: Sequence[StripeLine],
     table: LineTable,
@@ -433,7 +433,7 @@ def _candidates_fitted(
 ) -> PlaneCandidate | None:
     """Fit a plane to the points of the free lines near it, and evaluate its evidence anew."""
     worst, mine = np.zeros((1, len(lines))), np.zeros(0, np.int64)
-    for _ in range(_CANDIDATES_N_FITS):
+    for _ in range(_N_PLANE_FITS):
         worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
         mine = np.flatnonzero(free & (worst[0] <= tolerance_px))
         if not _on_two_surfaces(pooled, table.patch[mine]):
@@ -450,7 +450,7 @@ def _candidates_fitted(
     return PlaneCandidate(plane, mine, float(alarms[0]), residual)
 
 
-def _candidates_pairs(pooled: PooledStripes, table: LineTable) -> IntArray:
+def _pairs_of_lines(pooled: PooledStripes, table: LineTable) -> IntArray:
     """Return pairs of lines (P, 2) that lie on different surfaces."""
     different = ~_same_surfaces(pooled.patch_planes)
     i, j = np.triu_indices(len(table.patch), 1)
@@ -550,5 +550,5 @@ def plane_residuals_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatA
     slant = np.abs(placed.by_along @ normals.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         residuals: FloatArray = (placed.points_in_dome @ normals.T - offsets) / gain
-        residuals[~(slant <= _CANDIDATES_ALIGNED * gain)] = np.inf
+        residuals[~(slant <= _ALIGNED_WITH_PLANE * gain)] = np.inf
     return residuals

@@ -24,10 +24,10 @@ from aqualvs.calibration.targets.targets import (
     aruco_dictionary,
     dictionary_id,
 )
-from aqualvs.errors import CalibrationError, OutputError
+from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text
+from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text, write_text
 
 # Keys of free text, often written without quotes but with colons, which YAML would reject.
 _FREE_TEXT = re.compile(
@@ -53,23 +53,6 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
 def _quoted(match: re.Match[str]) -> str:
     text = match["text"].replace("'", "''")
     return f"{match[1]}: '{text}'"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        raise OutputError(
-            f"{path}: cannot be written ({fault.strerror}); choose another place"
-        ) from None
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
