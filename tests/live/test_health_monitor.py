@@ -1,7 +1,9 @@
 """Pictures that stand still while time runs on: when they are noticed, and what is none of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -28,8 +30,47 @@ def hovering(n: int, seed: int = 1) -> Iterator[ImagePlane]:
         yield noisy(cv2.warpAffine(luma, move, luma.shape[::-1]), rng)
 
 
-def watched(pictures: Iterator[ImagePlane] | list[ImagePlane], fps: float = FPS) -> list[float]:
-    watch = FrozenPicture()
+def swinging(n: int, amplitude_px: float, period_s: float) -> list[ImagePlane]:
+    """A vehicle that swings along the diagonal, and turns round again and again."""
+    rng, luma = np.random.default_rng(7), np.ascontiguousarray(demo_frames(1)[0].luma)
+    pictures = []
+    for i in range(n):
+        by = amplitude_px * np.sin(2.0 * np.pi * i / (period_s * FPS))
+        move = np.float32([[1, 0, by], [0, 1, 0.7 * by]])
+        pictures.append(noisy(cv2.warpAffine(luma, move, luma.shape[::-1]), rng))
+    return pictures
+
+
+def coded(pictures: Sequence[ImagePlane], bit_rate: int) -> list[ImagePlane]:
+    """What comes out of H.264 without delay, with a key frame each second."""
+    encoder, decoder = av.CodecContext.create("libx264", "w"), av.CodecContext.create("h264", "r")
+    height, width = pictures[0].shape
+    encoder.width, encoder.height, encoder.pix_fmt = width, height, "yuv420p"
+    encoder.framerate, encoder.time_base = Fraction(25), Fraction(1, 25)
+    encoder.bit_rate = bit_rate
+    rate = f"vbv-maxrate={bit_rate // 1000}:vbv-bufsize={bit_rate // 1000}"
+    encoder.options = {
+        "preset": "veryfast",
+        "tune": "zerolatency",
+        "x264-params": f"keyint=25:min-keyint=25:scenecut=0:{rate}",
+    }
+    packets = []
+    for i, luma in enumerate(pictures):
+        planes = np.vstack([luma, np.full((height // 2, width), 128, np.uint8)])
+        frame = av.VideoFrame.from_ndarray(planes, "yuv420p")
+        frame.pts = i
+        packets += encoder.encode(frame)
+    packets += encoder.encode(None)
+    found = [frame for packet in (*packets, None) for frame in decoder.decode(packet)]
+    return [np.ascontiguousarray(frame.to_ndarray()[:height]) for frame in found]
+
+
+def watched(
+    pictures: Iterator[ImagePlane] | list[ImagePlane],
+    fps: float = FPS,
+    options: FrozenOptions | None = None,
+) -> list[float]:
+    watch = FrozenPicture(options)
     return [watch.update(i / fps, one) for i, one in enumerate(pictures)]
 
 
@@ -71,6 +112,44 @@ def test_what_an_encoder_improves_in_a_still_is_no_motion() -> None:
     found = watched(live + still)
     assert not any(found[:60])
     assert all(found[60 + 12 :])
+
+
+@pytest.mark.parametrize("moving", [47, 58])
+def test_a_still_of_few_bits_is_noticed_within_half_a_second(moving: int) -> None:
+    """At 0.3 Mbit/s its changes alone tell it after more than a second."""
+    live = swinging(moving, 6.0, 4.0)
+    pictures = coded(live + live[-1:] * 20, 300_000)
+    found = watched(pictures)
+    assert not any(found[:moving])
+    first = next(i for i, still_s in enumerate(found) if still_s > 0.0)
+    assert first + 1 - moving <= 0.5 * FPS
+    assert all(found[first:])
+    slow = watched(pictures, options=FrozenOptions(motion=1e6))
+    assert not any(slow[: moving + 15])
+
+
+def test_a_vehicle_that_turns_round_is_live() -> None:
+    for period_s in (2.0, 3.0):
+        assert not any(watched(coded(swinging(120, 4.0, period_s), 300_000)))
+
+
+def test_a_camera_that_is_put_to_rest_is_live_again_by_its_noise() -> None:
+    live = swinging(60, 6.0, 4.0)
+    rng = np.random.default_rng(8)
+    still = cv2.GaussianBlur(live[-1], (0, 0), 2.0)
+    found = watched(live + [noisy(still, rng) for _ in range(80)])
+    assert not any(found[:60])
+    assert any(found[60:75])
+    # The stop is withdrawn after two seconds, and the rest is none.
+    assert not any(found[60 + 13 + 51 :])
+
+
+def test_text_in_the_picture_does_not_stand_for_it() -> None:
+    pictures = swinging(100, 4.0, 3.0)
+    for luma in pictures:
+        for row in range(40, 200, 40):
+            cv2.putText(luma, "DEPTH 12.3 HDG 270", (8, row), 0, 1.0, 255, 2)
+    assert not any(watched(coded(pictures, 1_000_000)))
 
 
 def test_another_size_and_a_stream_that_was_away_begin_anew() -> None:

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.sources import bags, open_feed, open_source
+from aqualvs.sources import bags, message_source, open_feed, open_source
 from aqualvs.sources.image_messages import ImageMessage, planes_of_message, protobuf_fields
 from aqualvs.sources.mcap_file import decompressed
 from shell_cases import luma_level, picture
@@ -490,3 +490,30 @@ def test_a_chunk_larger_than_it_claims_is_damaged(codec):
         decompressed(codec, packed, 1_000)
     with pytest.raises(ValueError, match="1099511627776"):
         decompressed(codec, packed, 1 << 40)
+
+
+def test_empty_messages_of_ros_2_are_left_out(tmp_path):
+    """The package that decodes them raises an exception of its own."""
+    text = "uint8[] data"
+    topic = ("/camera", "sensor_msgs/msg/CompressedImage", ("ros2msg", text.encode()), "cdr")
+    path = write_mcap(tmp_path / "empty.mcap", [(*topic, [b""] * 5)])
+    with pytest.raises(SourceError, match="no image can be decoded"):
+        open_source(path)
+
+
+def test_messages_without_any_picture_are_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(message_source, "_MAX_UNREADABLE", 30)
+    name, *rest, messages = compressed_image(12)
+    damaged = write_mcap(tmp_path / "gap.mcap", [(name, *rest, [*messages, *[b""] * 60])])
+    with open_source(damaged) as source, pytest.raises(SourceError, match="31 messages in a row"):
+        list(source)
+    gap = write_mcap(tmp_path / "gap.mcap", [(name, *rest, [*messages, *[b""] * 30, *messages])])
+    with open_source(gap) as source:
+        assert len(list(source)) == 24
+
+
+def test_a_chunk_of_too_many_records_is_damaged(tmp_path, monkeypatch):
+    path = write_mcap(tmp_path / "many.mcap", [compressed_image(6)])
+    monkeypatch.setattr(bags, "_MAX_RECORDS", 5)
+    with pytest.raises(SourceError, match="damaged"):
+        open_source(path)

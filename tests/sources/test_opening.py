@@ -134,9 +134,10 @@ def test_a_session_of_a_group_or_of_another_codec(tmp_path):
     assert type(open_feed(sdp_file(tmp_path, codec="H265"))) is RemoteFeed
 
 
-def test_a_session_without_video_is_refused(tmp_path):
+@pytest.mark.parametrize("media", ["audio 5000 RTP/AVP 97", f"video {'9' * 5000} RTP/AVP 96"])
+def test_a_session_without_video_is_refused(tmp_path, media):
     path = tmp_path / "sound.sdp"
-    path.write_text("v=0\nm=audio 5000 RTP/AVP 97\n")
+    path.write_text(f"v=0\nm={media}\n")
     with pytest.raises(SourceError, match="announces no video"):
         open_feed(path)
     with pytest.raises(SourceError, match="cannot be read"):

@@ -11,13 +11,16 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError, RigError
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import Instants
 from aqualvs.scanning.agreement import AgreementState, LaserAgreement
@@ -35,6 +38,19 @@ _N_KEPT, _N_KNOWN = 250, 25
 _USUAL = 0.05
 # A stream that returns after this time counts as a new one, in seconds.
 _GAP_S = 2.0
+# Width to which a picture is reduced for its motion, and the side of a patch there, in pixels.
+_REDUCED_PX, _PATCH = 360, 16
+# Share of the patches that are compared: those with the strongest edges. The quantile of their
+# displacements leaves room for text that is drawn into the picture, whose edges never move.
+_STRONG, _PATCH_QUANTILE = 0.15, 0.8
+# Keeps patches without edges at rest, in squared grey levels per pixel.
+_FLAT = 1e-3
+# The motion before a stop is that over this time before it, in spans. Where its trend foretells
+# less than this share of it, the vehicle may have turned round.
+_BEFORE = (1.15, 2.2)
+_N_BEFORE = 3
+_FORETOLD = 0.3
+_EPS_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,12 +70,26 @@ class FrozenOptions:
     share : float
         Between these two: as share of the change that this stream shows at its quietest (5 % of
         its last pictures change less).
+    motion : float
+        Motion within `span_s`, in pixels of a picture that is reduced to a width of about 360,
+        from which on a sudden stop is one of the picture and not of the vehicle.
+    stop : float
+        The picture has stopped where its motion is less than this share of that before.
+    stopped_s : float
+        For so long, in seconds: a vehicle that turns round stops for a moment.
+    confirmed_s : float
+        Within this time, in seconds, the changes of a stopped picture must fall below the limits
+        above, or it counts as live again.
     """
 
     span_s: float = 0.24
     greatest: float = 0.8
     least: float = 0.1
     share: float = 0.65
+    motion: float = 0.15
+    stop: float = 0.2
+    stopped_s: float = 0.16
+    confirmed_s: float = 2.0
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
@@ -69,19 +99,64 @@ class FrozenOptions:
         OptionError
             Naming the value.
         """
-        for name in ("span_s", "greatest", "least", "share"):
-            value = getattr(self, name)
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
             if not (value > 0.0 and math.isfinite(value)):
                 raise OptionError(f"frozen pictures, {name} {value:g}: must be positive")
+
+
+class _Patches(NamedTuple):
+    """Patches of a reduced picture with the strongest edges.
+
+    Attributes
+    ----------
+    at : int array, shape (N,)
+        Numbers of the patches.
+    edges : array, shape (N, pixels)
+        Derivative across the main direction of the edges of the patch.
+    pixels : array, shape (N, pixels)
+        Grey levels.
+    """
+
+    at: IntArray
+    edges: NDArray[np.float32]
+    pixels: NDArray[np.float32]
+
+
+class _Kept(NamedTuple):
+    """What is kept of a picture to compare later ones with."""
+
+    time_s: float
+    shape: tuple[int, int]
+    cells: FloatArray
+    patches: _Patches
+
+
+class _Trend(NamedTuple):
+    """Motion over some time: its median, and a line through it."""
+
+    pace: float
+    middle_s: float
+    level: float
+    slope: float
+
+    def at(self, time_s: float) -> float:
+        """Return what the line foretells."""
+        return self.level + self.slope * (time_s - self.middle_s)
 
 
 class FrozenPicture:
     """Detector of frozen pictures: compares each with one a quarter of a second older.
 
-    The statistic is the 99 % quantile, over cells of 8 x 8 pixels in a quarter of the rows, of how
-    much a cell's mean luma has changed. Means separate motion, and noise of the sensor, from the
-    encoder's changes of a still: it adds detail to the cells and leaves their means. A stripe that
-    moves by a thirtieth of a pixel changes its cells by half a grey level.
+    Two statistics tell. The *change* is the 99 % quantile, over cells of 8 x 8 pixels in a quarter
+    of the rows, of how much a cell's mean luma has changed. Means separate motion, and noise of the
+    sensor, from the encoder's changes of a still: it adds detail to the cells and leaves their
+    means. A stripe that moves by a thirtieth of a pixel changes its cells by half a grey level.
+
+    At low bit rates the encoder takes a second and more to improve a still. The *motion* tells
+    earlier: the 80 % quantile of the displacements of patches across their edges. What an encoder
+    improves moves no edge. A vehicle slows down little by little; a picture whose motion ends at
+    once has stopped itself.
 
     Parameters
     ----------
@@ -91,7 +166,9 @@ class FrozenPicture:
     Attributes
     ----------
     change : float
-        The statistic of the last picture, in grey levels; NaN where there was nothing to compare.
+        Of the last picture, in grey levels; NaN where there was nothing to compare.
+    motion : float
+        Of the last picture, in pixels of the reduced one; NaN likewise.
     """
 
     def __init__(self, options: FrozenOptions | None = None) -> None:
@@ -108,34 +185,46 @@ class FrozenPicture:
             By the stream's clock.
         luma : uint8 array, shape (height, width)
         """
-        cells = _cell_means(luma)
-        if self._kept and not self._continues(time_s, cells):
+        cells, reduced = _cell_means(luma), _reduced(luma)
+        height, width = luma.shape
+        if self._kept and not self._continues(time_s, (height, width)):
             self._begin()
-        while len(self._kept) > 1 and time_s - self._kept[1][0] >= self._span_s:
+        while len(self._kept) > 1 and time_s - self._kept[1].time_s >= self._span_s:
             self._kept.popleft()
-        self._change_since(time_s, cells)
-        self._kept.append((time_s, cells))
+        self._compare(time_s, cells, reduced)
+        self._kept.append(_Kept(time_s, (height, width), cells, _strong_patches(reduced)))
         self._judge(time_s)
         return 0.0 if math.isnan(self._since_s) else time_s - self._since_s
 
     def _begin(self) -> None:
-        self._kept: deque[tuple[float, FloatArray]] = deque()
-        self._span_s = self.options.span_s - 1e-6
-        self.change = math.nan
-        self._since_s = self._moved_s = math.nan
+        self._kept: deque[_Kept] = deque()
+        self._span_s = self.options.span_s - _EPS_S
+        self._motions: deque[tuple[float, float]] = deque()
+        self.change = self.motion = math.nan
+        self._go_on()
 
-    def _continues(self, time_s: float, cells: FloatArray) -> bool:
-        last_s, last = self._kept[-1]
-        return last_s <= time_s <= last_s + _GAP_S and last.shape == cells.shape
+    def _go_on(self) -> None:
+        """Take the picture for a live one."""
+        self._since_s = self._moved_s = self._stopped_s = self._doubted_s = math.nan
+        self._pace, self._rests = math.nan, False
 
-    def _change_since(self, time_s: float, cells: FloatArray) -> None:
+    def _continues(self, time_s: float, shape: tuple[int, int]) -> bool:
+        last = self._kept[-1]
+        return last.time_s <= time_s <= last.time_s + _GAP_S and last.shape == shape
+
+    def _compare(self, time_s: float, cells: FloatArray, reduced: NDArray[np.float32]) -> None:
         """Compare with the oldest picture kept, if it is old enough."""
-        self.change = math.nan
-        if not (self._kept and time_s - self._kept[0][0] >= self._span_s) or not cells.size:
+        self.change = self.motion = math.nan
+        if not (self._kept and time_s - self._kept[0].time_s >= self._span_s) or not cells.size:
             return
-        changes = np.abs(cells - self._kept[0][1]).ravel()
-        rank = min(int(_QUANTILE * changes.size), changes.size - 1)
-        self.change = float(np.partition(changes, rank)[rank])
+        before = self._kept[0]
+        self.change = _upper(np.abs(cells - before.cells).ravel(), _QUANTILE)
+        if before.patches.at.size:
+            displacements = np.abs(_displacements(before.patches, reduced))
+            self.motion = _upper(displacements, _PATCH_QUANTILE)
+            self._motions.append((time_s, self.motion))
+        while self._motions and time_s - self._motions[0][0] > 2.0 * _BEFORE[1] * self._span_s:
+            self._motions.popleft()
 
     def _limit(self) -> float:
         """Return the change below which a picture stands still."""
@@ -145,23 +234,113 @@ class FrozenPicture:
         quiet = float(np.quantile(np.array(self._usual), _USUAL))
         return min(max(options.share * quiet, options.least), options.greatest)
 
+    def _has_stopped(self, time_s: float) -> bool:
+        """Return whether a motion has ended at once."""
+        options = self.options
+        if not self._rests:
+            self._trend = _trend(self._motions, time_s, self._span_s)
+            self._pace = self._trend.pace
+        self._rests = self._pace >= options.motion and self.motion < options.stop * self._pace
+        # A vehicle that slows down comes to rest as its motion before it foretells.
+        if not (self._rests and abs(self._trend.at(time_s)) > _FORETOLD * self._pace):
+            self._stopped_s = math.nan
+            return False
+        if math.isnan(self._stopped_s):
+            self._stopped_s = time_s
+        return time_s - self._stopped_s >= options.stopped_s - _EPS_S
+
     def _judge(self, time_s: float) -> None:
         if math.isnan(self.change):
             return
         still = self.change < self._limit()
-        if math.isnan(self._since_s):
-            if still:
-                self._since_s, self._moved_s = self._kept[0][0], math.nan
-            else:
-                self._usual.append(self.change)
-            return
+        if not math.isnan(self._since_s):
+            self._doubt(time_s, still=still)
+        elif still | self._has_stopped(time_s):
+            self._since_s = self._kept[0].time_s
+            self._stopped_s = math.nan
+            self._doubted_s = math.nan if still else time_s
+        else:
+            self._usual.append(self.change)
+
+    def _doubt(self, time_s: float, *, still: bool) -> None:
+        """Look for signs of life in a frozen picture."""
         if still:
+            self._doubted_s = math.nan
+        # A key frame moves the edges of a still a little; a live picture moves by more.
+        if still or self.motion < min(0.5 * self._pace, self.options.motion):
             self._moved_s = math.nan
         elif math.isnan(self._moved_s):
             self._moved_s = time_s
-        elif time_s - self._moved_s > self.options.span_s:
-            # A key frame changes a still once, so it affects the comparison for one span.
-            self._since_s = self._moved_s = math.nan
+        # A key frame changes a still once, so it affects the comparison for one span.
+        moves = time_s - self._moved_s > self.options.span_s
+        if moves or time_s - self._doubted_s > self.options.confirmed_s:
+            self._go_on()
+
+
+def _trend(motions: Iterable[tuple[float, float]], time_s: float, span_s: float) -> _Trend:
+    """Return how fast the picture moved before the comparison of a time reaches back to it."""
+    first, last = (time_s - many * span_s for many in reversed(_BEFORE))
+    before = np.array([one for one in motions if first <= one[0] <= last])
+    if len(before) < _N_BEFORE:
+        return _Trend(math.nan, time_s, math.nan, math.nan)
+    times, values = before.T
+    middle_s = float(times.mean())
+    away = times - middle_s
+    slope = float(away @ values / (away @ away))
+    return _Trend(float(np.median(values)), middle_s, float(values.mean()), slope)
+
+
+def _upper(values: FloatArray | NDArray[np.float32], quantile: float) -> float:
+    rank = min(int(quantile * values.size), values.size - 1)
+    return float(np.partition(values, rank)[rank])
+
+
+def _reduced(luma: ImagePlane) -> NDArray[np.float32]:
+    """Return the picture reduced to whole patches, about `_REDUCED_PX` wide."""
+    height, width = luma.shape
+    factor = max(round(width / _REDUCED_PX), 1)
+    rows, columns = (side // factor // _PATCH * _PATCH for side in (height, width))
+    if not (rows and columns):
+        return np.zeros((0, 0), np.float32)
+    part = luma[: rows * factor, : columns * factor]
+    small = cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32)
+
+
+def _patches_at(image: NDArray[np.float32], at: IntArray) -> NDArray[np.float32]:
+    """Return the pixels of some patches, shape (N, pixels)."""
+    rows, columns = image.shape[0] // _PATCH, image.shape[1] // _PATCH
+    row, column = np.divmod(at, columns)
+    found = image.reshape(rows, _PATCH, columns, _PATCH)[row, :, column]
+    return found.reshape(-1, _PATCH**2)
+
+
+def _strong_patches(reduced: NDArray[np.float32]) -> _Patches:
+    """Return the patches of a picture with the strongest edges."""
+    if not reduced.size:
+        return _Patches(np.empty(0, np.int64), reduced, reduced)
+    along_x = cv2.Sobel(reduced, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    along_y = cv2.Sobel(reduced, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
+    rows, columns = reduced.shape[0] // _PATCH, reduced.shape[1] // _PATCH
+    xx, xy, yy = (
+        cv2.resize(a * b, (columns, rows), interpolation=cv2.INTER_AREA).ravel()
+        for a, b in ((along_x, along_x), (along_x, along_y), (along_y, along_y))
+    )
+    # The greater eigenvalue of the structure tensor, and the direction across the edges.
+    strength = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+    n = max(int(_STRONG * strength.size), 1)
+    at = np.argpartition(strength, -n)[-n:]
+    angle = 0.5 * np.arctan2(2.0 * xy[at], xx[at] - yy[at])[:, None]
+    edges = np.cos(angle) * _patches_at(along_x, at) + np.sin(angle) * _patches_at(along_y, at)
+    return _Patches(at, edges, _patches_at(reduced, at))
+
+
+def _displacements(before: _Patches, reduced: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return by how much patches have moved across their edges, in pixels; least squares."""
+    changes = _patches_at(reduced, before.at) - before.pixels
+    squares = np.einsum("ij,ij->i", before.edges, before.edges)
+    moved = np.einsum("ij,ij->i", before.edges, changes)
+    return np.asarray(-moved / (squares + _FLAT * _PATCH**2))
 
 
 def _cell_means(luma: ImagePlane) -> FloatArray:

@@ -477,7 +477,7 @@ def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) ->
 def _count(points: Path) -> _Counts:
     """Count net and other reflections, batch by batch, so that memory stays flat."""
     totals: dict[int, list[int]] = {}
-    with parquet.ParquetFile(points) as file:
+    with parquet.ParquetFile(points.absolute()) as file:
         for batch in file.iter_batches(batch_size=_BATCH, columns=["frame", "laser", "label"]):
             key = batch["frame"].to_numpy().astype(np.int64) * _LASERS + batch["laser"].to_numpy()
             is_net = _is_net(batch["label"])
@@ -548,7 +548,7 @@ def _read(
     near, far = working_range_m(run["rig"]) or (0.0, np.inf)
     every_pixel = _every_pixel(run)
     table = parquet.read_table(
-        points,
+        points.absolute(),
         columns=list(_PIXEL_COLUMNS if every_pixel else _COLUMNS),
         filters=[("frame", "==", chosen[0]), ("laser", "==", chosen[1])],
     )

@@ -231,7 +231,7 @@ def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
     """Yield batches as arrays by column, labels as numbers."""
     path, journal = run_dir / "points.parquet", run_dir / "points.arrows"
     if path.exists() or not journal.exists():
-        with parquet.ParquetFile(path, pre_buffer=False) as file:
+        with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
             names = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.schema_arrow.names]
             # One batch at a time, on one thread, keeps memory flat however long the dive.
             batches = file.iter_batches(batch_size=_BATCH, columns=names, use_threads=False)

@@ -365,7 +365,7 @@ def _arrow_batches(path: Path) -> Iterator[Any]:
     if path.name == JOURNAL:
         yield from read_journal(path)
         return
-    with parquet.ParquetFile(path, pre_buffer=False) as file:
+    with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
         # One batch at a time, on one thread, keeps memory flat however long the dive; the empty
         # one before them shows the columns of a file without rows.
         yield pa.RecordBatch.from_pylist([], schema=file.schema_arrow)

@@ -230,7 +230,8 @@ class PointsExport:
             self._ply.write(_ply_header(0))
             self._table_file = stack.enter_context(
                 parquet.ParquetWriter(
-                    self._drafts[0],
+                    # Absolute: Arrow takes a name with a colon for an address.
+                    self._drafts[0].absolute(),
                     schema,
                     compression="lz4",
                     use_dictionary=[name for name in _NAMES if name in schema.names],

@@ -8,6 +8,8 @@ Both give a `MessageSource` for one topic.
 import contextlib
 import errno
 import functools
+import importlib
+import itertools
 import shutil
 import struct
 import tempfile
@@ -25,12 +27,16 @@ from aqualvs.sources.image_messages import (
     image_of_ros,
     kind_of_schema,
 )
-from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, decompressed
+from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, Op, decompressed
 from aqualvs.sources.message_source import MAX_BYTES, Logged, MessageSource, Topic, choose_topic
 from aqualvs.special_files import refuse_special
 
 # Disk space to keep free where bags compressed as whole files are unpacked.
 _FREE_BYTES = 1 << 30
+# Records of a chunk. A chunk of some megabytes, as recorders make them, holds 100,000 empty ones.
+_MAX_RECORDS = 1 << 20
+_INSTALL = "pip install 'aqualvs[bags]'"
+_Reader: TypeAlias = Callable[[bytes], ImageMessage]
 _REMEDY = "check it with ros2 bag info or rosbag reindex"
 
 
@@ -55,12 +61,7 @@ def open_bag(path: Path, topic: str | None = None) -> MessageSource:
     OptionError
         If the topic is missing or wrong, or a package is missing.
     """
-    try:
-        import rosbags.highlevel  # noqa: F401
-    except ImportError:
-        raise OptionError(
-            f"{path}: ROS bags need a package; type pip install 'aqualvs[bags]'"
-        ) from None
+    _require("rosbags.highlevel", path, "ROS bags")
     folder = path.parent if path.suffix.lower() == ".db3" else path
     if folder != path and not (folder / "metadata.yaml").is_file():
         raise SourceError(
@@ -69,12 +70,27 @@ def open_bag(path: Path, topic: str | None = None) -> MessageSource:
         )
     for one in folder.iterdir() if folder.is_dir() else ():
         refuse_special(one)
-    chosen = choose_topic(str(path), _image_topics(folder), topic)
+    return _source(path, topic, _image_topics(folder), functools.partial(_bag_messages, folder))
 
-    def messages() -> Iterator[Logged]:
-        return _messages(folder, chosen.name)
 
-    return MessageSource(f"{path}#{chosen.name}", messages, chosen.n_messages)
+def _require(module: str, path: Path, what: str) -> None:
+    """Refuse to read a file whose package is missing."""
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        raise OptionError(f"{path}: {what} need a package; type {_INSTALL}") from None
+
+
+def _source(
+    path: Path,
+    wanted: str | None,
+    topics: list[Topic],
+    messages: Callable[[str], Iterator[Logged]],
+) -> MessageSource:
+    """Return the images of the topic wanted, or of the only one."""
+    chosen = choose_topic(str(path), topics, wanted)
+    read = functools.partial(messages, chosen.name)
+    return MessageSource(f"{path}#{chosen.name}", read, chosen.n_messages)
 
 
 def _image_topics(path: Path) -> list[Topic]:
@@ -86,20 +102,26 @@ def _image_topics(path: Path) -> list[Topic]:
     return [Topic(name, n) for name, n in counts.items()]
 
 
-def _messages(path: Path, topic: str) -> Iterator[Logged]:
+def _bag_messages(path: Path, topic: str) -> Iterator[Logged]:
     with _opened(path) as reader:
         wanted = [c for c in reader.connections if c.topic == topic]
         try:
             for connection, log_ns, content in reader.messages(connections=wanted):
-                yield log_ns, _image(reader, content, connection.msgtype)
+                read = functools.partial(_ros_image, reader, connection.msgtype)
+                yield log_ns, _image(read, content)
         # Damaged files raise anything in the package, from AssertionError to ZstdError.
         except Exception as fault:
             raise SourceError(f"{path}: the bag breaks off ({_words(fault)})") from fault
 
 
-def _image(reader: Any, content: bytes, kind: str) -> ImageMessage | None:
+def _ros_image(reader: Any, kind: str, content: bytes) -> ImageMessage:
+    return image_of_ros(reader.deserialize(content, kind))
+
+
+def _image(read: _Reader, content: bytes) -> ImageMessage | None:
+    """Return the image in a message; None for a damaged one, whatever the packages raise for it."""
     try:
-        return image_of_ros(reader.deserialize(content, kind))
+        return read(content)
     except Exception:
         return None
 
@@ -176,11 +198,6 @@ def _words(fault: Exception) -> str:
     return f"{type(fault).__name__}: {fault}".splitlines()[0][:120]
 
 
-_Reader: TypeAlias = Callable[[bytes], ImageMessage]
-
-_INSTALL = "pip install 'aqualvs[bags]'"
-
-
 def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     """Open the images of an MCAP file.
 
@@ -201,16 +218,8 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     OptionError
         If the topic is missing or wrong, or a package is missing.
     """
-    try:
-        import mcap.reader  # noqa: F401
-    except ImportError:
-        raise OptionError(f"{path}: MCAP files need a package; type {_INSTALL}") from None
-    chosen = choose_topic(str(path), _mcap_image_topics(path), topic)
-
-    def messages() -> Iterator[Logged]:
-        return _mcap_messages(path, chosen.name)
-
-    return MessageSource(f"{path}#{chosen.name}", messages, chosen.n_messages)
+    _require("mcap.reader", path, "MCAP files")
+    return _source(path, topic, _mcap_image_topics(path), functools.partial(_mcap_messages, path))
 
 
 def _mcap_image_topics(path: Path) -> list[Topic]:
@@ -231,9 +240,10 @@ def _listed(path: Path, stream: "_Bounded") -> list[Topic]:
     """Find the topics of a file without index by reading it to its end, or as far as it goes."""
     found: dict[str, Topic] = {}
     try:
-        for schema, channel, _ in _read(path, stream, None):
-            if schema is not None and kind_of_schema(schema.name):
-                found[channel.topic] = Topic(channel.topic, None)
+        with _told(path):
+            for schema, channel, _ in _by_order(stream, None, only_channels=True):
+                if schema is not None and kind_of_schema(schema.name):
+                    found[channel.topic] = Topic(channel.topic, None)
     except SourceError:
         if not found:
             raise
@@ -248,20 +258,24 @@ def _mcap_messages(path: Path, topic: str) -> Iterator[Logged]:
                 continue
             if schema.id not in readers:
                 readers[schema.id] = _reader(path, schema, channel.message_encoding)
-            try:
-                yield message.log_time, readers[schema.id](message.data)
-            except (ValueError, struct.error, IndexError, AssertionError):
-                yield message.log_time, None
+            yield message.log_time, _image(readers[schema.id], message.data)
 
 
-def _read(path: Path, stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield schemas, channels and messages; says in one line where the file breaks off."""
+def _read(path: Path, stream: "_Bounded", topic: str) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield schemas, channels and messages of a topic."""
     summary = _summary(stream)
-    try:
+    with _told(path):
         if summary is not None and summary.chunk_indexes:
             yield from _by_index(stream, summary, topic)
         else:
             yield from _by_order(stream, topic)
+
+
+@contextlib.contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say in one line where a file breaks off."""
+    try:
+        yield
     except _mcap_faults() as fault:
         raise SourceError(
             f"{path}: no MCAP file, damaged, or cut short ({type(fault).__name__}); "
@@ -269,12 +283,12 @@ def _read(path: Path, stream: "_Bounded", topic: str | None) -> Iterator[tuple[A
         ) from fault
 
 
-def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[tuple[Any, ...]]:
+def _by_index(stream: "_Bounded", summary: Any, topic: str) -> Iterator[tuple[Any, ...]]:
     """Yield the messages in the chunks of a topic, in the order of their times."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk, Message
 
-    wanted = {n for n, one in summary.channels.items() if topic is None or one.topic == topic}
+    wanted = {n for n, one in summary.channels.items() if one.topic == topic}
     for index in sorted(summary.chunk_indexes, key=lambda one: int(one.message_start_time)):
         listed = index.message_index_offsets
         if listed and wanted.isdisjoint(listed):
@@ -287,34 +301,56 @@ def _by_index(stream: "_Bounded", summary: Any, topic: str | None) -> Iterator[t
             yield summary.schemas.get(channel.schema_id), channel, message
 
 
-def _by_order(stream: "_Bounded", topic: str | None) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield the messages of a file without index, from its beginning on."""
+def _by_order(
+    stream: "_Bounded", topic: str | None, *, only_channels: bool = False
+) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield the messages of a file without index, from its beginning on, or its channels only."""
     from mcap.records import Channel, Chunk, Message, Schema
     from mcap.stream_reader import StreamReader
 
     schemas, channels = {}, {}
     stream.seek(0)
     for record in StreamReader(cast("IO[bytes]", stream), emit_chunks=True).records:
-        for one in _records_of(record) if isinstance(record, Chunk) else [record]:
+        whole = isinstance(record, Chunk)
+        for one in _records_of(record, messages=not only_channels) if whole else [record]:
             if isinstance(one, Schema):
                 schemas[one.id] = one
             elif isinstance(one, Channel):
                 channels[one.id] = one
-            elif isinstance(one, Message):
+                if only_channels:
+                    yield schemas.get(one.schema_id), one, None
+            elif isinstance(one, Message) and not only_channels:
                 channel = channels[one.channel_id]
                 if topic is None or channel.topic == topic:
                     yield schemas.get(channel.schema_id), channel, one
 
 
-def _records_of(chunk: Any) -> list[Any]:
-    """Return the records in a chunk; the package would take any amount of memory for them."""
+def _records_of(chunk: Any, *, messages: bool = True) -> list[Any]:
+    """Return the records in a chunk, or those that are no messages.
+
+    The package would take any amount of memory for them.
+    """
     from mcap.stream_reader import breakup_chunk
 
-    # Records of the smallest messages take ten times the memory of their bytes.
     if max(chunk.uncompressed_size, len(chunk.data)) > MAX_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+    places = list(itertools.islice(_record_places(raw), _MAX_RECORDS + 1))
+    # As objects, the smallest records take ten times the memory of their bytes.
+    if len(places) > _MAX_RECORDS:
+        raise ValueError(f"a chunk of more than {_MAX_RECORDS} records")
+    if not messages:
+        raw = b"".join(raw[a:b] for a, b in places if raw[a] != Op.MESSAGE)
     return list(breakup_chunk(replace(chunk, compression="", data=raw)))
+
+
+def _record_places(raw: bytes) -> Iterator[tuple[int, int]]:
+    """Yield where the records of a chunk begin and end."""
+    at = 0
+    while at + HEAD_BYTES <= len(raw):
+        end = at + HEAD_BYTES + int.from_bytes(raw[at + 1 : at + HEAD_BYTES], "little")
+        yield at, end
+        at = end
 
 
 def _summary(stream: "_Bounded") -> Any:
@@ -378,10 +414,9 @@ def _reader(path: Path, schema: Any, encoding: str) -> _Reader:
 
 
 def _ros_reader(path: Path, schema: Any, encoding: str) -> _Reader:
-    try:
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    except ImportError:
-        raise OptionError(f"{path}: ROS messages need a package; type {_INSTALL}") from None
+    _require("rosbags.typesys", path, "ROS messages")
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
     name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/")
     text = schema.data.decode("utf-8", "replace")
     store = get_typestore(Stores.EMPTY)

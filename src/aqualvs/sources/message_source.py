@@ -17,6 +17,9 @@ from aqualvs.sources.live_frames import LiveDecoder
 MAX_BYTES = 1 << 27
 """Size of a chunk or message when unpacked; an RGB picture of 40 megapixels takes 120 MB."""
 
+_MAX_UNREADABLE = 20_000
+"""Messages in a row without a picture after which a recording is given up: 13 minutes at 25 Hz."""
+
 Logged: TypeAlias = tuple[int, ImageMessage | None]
 """Time of the log in nanoseconds, and the image; None for a message that cannot be read."""
 
@@ -145,20 +148,19 @@ class MessageSource(Closing):
         return size, (last - first) / (ended - began) if ended > began else None
 
     def _frames(self) -> Iterator[Frame]:
-        video: _Video | None = None
-        clock = _Clock()
+        decoder = _Decoder(self._planes)
+        clock, shown = _Clock(), -1
         for index, (log_ns, message) in enumerate(self._messages()):
-            if message is None:
-                continue
-            clock.note(index, message.stamp_ns or log_ns)
-            if message.codec is None:
-                planes = self._planes(message)
-                if planes is not None:
-                    yield Frame(index, clock.time(index), *planes)
-                continue
-            video = video or _Video(message.codec)
-            for at, planes in video.decode(index, message.data):
-                yield Frame(at, clock.time(at), *planes)
+            if message is not None:
+                clock.note(index, message.stamp_ns or log_ns)
+                for at, planes in decoder.decode(index, message):
+                    shown = index
+                    yield Frame(at, clock.time(at), *planes)
+            if index - shown > _MAX_UNREADABLE:
+                raise SourceError(
+                    f"{self.name}: {index - shown} messages in a row hold no image that can be "
+                    "read; cut the recording before them, or record it again"
+                )
 
     def _planes(self, message: ImageMessage) -> Planes | None:
         raw = message.size_px is not None
@@ -189,15 +191,23 @@ class _Clock:
         return self._times.get(index, self._last)
 
 
-class _Video:
-    """Decoder of packets that are numbered by their messages."""
+class _Decoder:
+    """Decoder of pictures, and of the packets of a video, which are numbered by their messages."""
 
-    def __init__(self, codec: str) -> None:
-        context = cast("VideoCodecContext", av.CodecContext.create(codec, "r"))
-        self._decoder = LiveDecoder(context, hears_losses=False)
+    def __init__(self, planes_of_picture: Callable[[ImageMessage], Planes | None]) -> None:
+        self._planes_of_picture = planes_of_picture
+        self._video: LiveDecoder | None = None
 
-    def decode(self, index: int, data: bytes) -> Iterator[tuple[int, Planes]]:
-        packet = packet_with(data)
+    def decode(self, index: int, message: ImageMessage) -> Iterator[tuple[int, Planes]]:
+        if message.codec is None:
+            planes = self._planes_of_picture(message)
+            if planes is not None:
+                yield index, planes
+            return
+        if self._video is None:
+            context = cast("VideoCodecContext", av.CodecContext.create(message.codec, "r"))
+            self._video = LiveDecoder(context, hears_losses=False)
+        packet = packet_with(message.data)
         packet.pts = index
-        for picture in self._decoder.decode(packet):
+        for picture in self._video.decode(packet):
             yield index if picture.pts is None else picture.pts, planes_of(picture)

@@ -93,7 +93,7 @@ def read_sdp(path: Path) -> SdpVideo:
         raise SourceError(f"{path}: cannot be read ({fault.strerror})") from fault
     session, *media = re.split(r"^(?=m=)", text, flags=re.MULTILINE)
     for part in media:
-        found = re.match(r"m=video (\d+)(?:/\d+)? RTP/AVPF? (\d+)", part)
+        found = re.match(r"m=video (\d{1,5})(?:/\d+)? RTP/AVPF? (\d{1,3})\b", part)
         if found:
             port, payload_type = int(found[1]), int(found[2])
             return SdpVideo(
@@ -112,7 +112,7 @@ def _group(part: str) -> str:
     found = re.search(r"^c=IN IP[46] ([^/\s]+)", part, re.MULTILINE)
     host = found[1] if found else ""
     first = host.partition(".")[0]
-    is_group = host.lower().startswith("ff") or (first.isdecimal() and 224 <= int(first) <= 239)
+    is_group = host.lower().startswith("ff") or bool(re.fullmatch("22[4-9]|23[0-9]", first))
     return host if is_group else ""
 
 
