@@ -44,7 +44,7 @@ def test_a_run_is_read_as_it_was_measured(tmp_path) -> None:
     with aqualvs.open_source(request.source) as source:
         measured = [scanner.process(frame) for frame, _ in zip(source, range(4), strict=False)]
     stored = list(aqualvs.read_run(str(request.out)))
-    assert result.tally.n_frames == len(stored) == 4
+    assert result.summary.n_frames == len(stored) == 4
     for one, other in zip(stored, measured, strict=True):
         assert isinstance(one.posture, aqualvs.Posture)
         # The table keeps micrometres.

@@ -76,7 +76,7 @@ def test_every_frame_is_measured_and_written(request_for, dive):
             # Lossy video keeps a flat grey to within a few levels; the scanner divides by 100.
             assert float(row["range_m"]) == pytest.approx(luma_level(i) / 100, abs=0.04)
     assert parquet.read_table(request.out / "points.parquet").num_rows == 8 * 60
-    assert result.tally.n_valid == 8 - sum(refused)
+    assert result.summary.n_valid == 8 - sum(refused)
 
 
 def test_the_run_file_tells_source_rig_and_options(request_for, dive):
@@ -107,7 +107,7 @@ def test_a_lost_frame_has_its_row(request_for, tmp_path):
         "corrupt_frame" if i in (0, 3, 4) else "" for i in range(8)
     ]
     assert [float(row["time_s"]) for row in found] == pytest.approx([i / 25 for i in range(8)])
-    assert result.tally.refused == {"corrupt_frame": 3}
+    assert result.summary.refused == {"corrupt_frame": 3}
     # The overlay keeps every frame's number; the lost ones are black.
     with open_source(request.out / "overlay.mp4") as source:
         levels = [float(frame.luma[250:300].mean()) for frame in source]

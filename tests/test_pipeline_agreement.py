@@ -1,5 +1,6 @@
 """Lasers that disagree: from the frames of a run to its last lines, `run.yaml` and the report."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,18 +12,18 @@ from aqualvs.errors import RigError
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rigfile import rig_to_mapping, save_rig
 from aqualvs.optics.solved import with_uncertainty
-from aqualvs.pipeline import agreement_of, run, summary_lines
+from aqualvs.pipeline import open_dive, run, summary_for, summary_lines
 from aqualvs.report.run_page import write_report
 from aqualvs.results.folder import RunOutputs, prepare_folder
 from aqualvs.results.run_request import RunRequest
-from aqualvs.results.summary import Tally
+from aqualvs.results.summary import RunSummary
+from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.simulation.scenarios import example_rig
 from report_cases import make_dive
 from shell_cases import write_video
 
 RIG = example_rig()
-RIG_FILE = Path("rig.yaml")
 
 
 def scans(degrees: float) -> list[Scan]:
@@ -31,37 +32,39 @@ def scans(degrees: float) -> list[Scan]:
     return [diver.scan(Target(0.4 + 0.02 * i, yaw_deg=float(i)), index=i) for i in range(18)]
 
 
-def watched(degrees: float) -> Tally:
-    tally = Tally(agreement=agreement_of(RIG, RIG_FILE))
+def watched(degrees: float) -> RunSummary:
+    summary = RunSummary(agreement=LaserAgreement(RIG))
     for scan in scans(degrees):
-        tally.add(scan)
-    return tally
+        summary.add(scan)
+    return summary
 
 
 def test_a_drifted_laser_gets_a_line_and_its_facts() -> None:
-    tally = watched(0.4)
-    assert tally.lines()[-1].startswith("laser 2 (left) is off by 0.4 deg (its stripe lies")
-    assert "recalibrate" in tally.lines()[-1]
-    found = tally.facts()["laser_agreement"]
+    summary = watched(0.4)
+    assert summary.lines()[-1].startswith("laser 2 (left) is off by 0.4 deg (its stripe lies")
+    assert "recalibrate" in summary.lines()[-1]
+    found = summary.facts()["laser_agreement"]
     assert found["state"] == "drifted"
     assert found["suspects"] == ["left"]
     assert found["angle_deg"] == pytest.approx(0.4, abs=0.02)
-    assert found["words"] == tally.lines()[-1]
+    assert found["words"] == summary.lines()[-1]
 
 
 def test_lasers_that_agree_are_not_spoken_of() -> None:
-    tally = watched(0.0)
-    assert not any("laser" in line for line in tally.lines())
-    assert tally.facts()["laser_agreement"] == {"state": "agree", "n_frames": 6}
-    assert "laser_agreement" not in Tally().facts()
+    summary = watched(0.0)
+    assert not any("laser" in line for line in summary.lines())
+    assert summary.facts()["laser_agreement"] == {"state": "agree", "n_frames": 6}
+    assert "laser_agreement" not in RunSummary().facts()
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.4])
 def test_the_run_file_and_the_report_tell(tmp_path: Path, degrees: float) -> None:
     folder = make_dive(tmp_path / "dive").folder
     (folder / "run.yaml").unlink()
-    with RunOutputs(folder, source={}, rig=rig_to_mapping(RIG), options={}) as outputs:
-        outputs.tally.agreement = agreement_of(RIG, RIG_FILE)
+    summary = RunSummary(agreement=LaserAgreement(RIG))
+    with RunOutputs(
+        folder, source={}, rig=rig_to_mapping(RIG), options={}, summary=summary
+    ) as outputs:
         for scan in scans(degrees):
             outputs.write(scan)
     content = yaml.safe_load((folder / "run.yaml").read_text())
@@ -107,16 +110,19 @@ def test_without_the_dome_the_lasers_are_not_blamed(tmp_path: Path) -> None:
     assert "laser_agreement" not in content["summary"]
 
 
-def test_one_laser_has_none_to_agree_with() -> None:
+def test_one_laser_has_none_to_agree_with(tmp_path: Path) -> None:
     one = Rig(**{name: getattr(RIG, name) for name in RIG.__slots__} | {"lasers": RIG.lasers[:1]})
-    assert agreement_of(one, RIG_FILE) is None
+    with open_dive(request(tmp_path)) as dive:
+        assert summary_for(replace(dive, rig=one)).agreement is None
+        assert summary_for(dive).agreement is not None
 
 
 def test_a_malformed_rig_is_named(tmp_path: Path) -> None:
     rig = with_uncertainty(RIG, RigUncertainty.independent({"fx": 1.0}))
     rig.solved_from["uncertainty"]["sigma"] = ["wide"]
-    with pytest.raises(RigError, match=r"^rig\.yaml: solved_from\.uncertainty\.sigma\[0\]"):
-        agreement_of(rig, RIG_FILE)
+    message = r"rig\.yaml: solved_from\.uncertainty\.sigma\[0\]"
+    with open_dive(request(tmp_path)) as dive, pytest.raises(RigError, match=message):
+        summary_for(replace(dive, rig=rig))
 
 
 def test_a_long_rig_stays_short_in_the_run_file(tmp_path: Path) -> None:

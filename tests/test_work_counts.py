@@ -110,7 +110,7 @@ def measure(out: Path, stop: int) -> None:
         report=False,
         frames=FrameWindow(0, stop),
     )
-    assert run(request).tally.n_frames == stop
+    assert run(request).summary.n_frames == stop
 
 
 def test_calls_of_a_scan(scanner: Scanner, frames: list[Frame]) -> None:

@@ -76,7 +76,7 @@ def rows(out):
 
 def test_a_recorded_run_replays_bit_for_bit(whole, tmp_path):
     result = again(whole / "dive.mcap", tmp_path / "out")
-    assert result.tally.n_frames == 150
+    assert result.summary.n_frames == 150
     assert same_results(whole, tmp_path / "out")
     said = yaml.safe_load((tmp_path / "out" / "run.yaml").read_text())
     assert said["options"]["rig_file"] is None

@@ -159,5 +159,5 @@ def test_without_any_rig_the_given_one_is_used(samples, tmp_path):
     save_rig(samples[0].rig, tmp_path / "rig.yaml")
     result = run(replace(request, rig=tmp_path / "rig.yaml"))
     assert "parts are damaged" in str(result.fault)
-    assert 0 < result.tally.n_frames < 12
-    assert result.tally.n_valid == result.tally.n_frames
+    assert 0 < result.summary.n_frames < 12
+    assert result.summary.n_valid == result.summary.n_frames

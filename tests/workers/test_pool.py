@@ -84,14 +84,14 @@ def assert_same(source, folder, crews, **more):
 def test_two_processes_find_what_one_finds(tmp_path, dive, crews):
     result = assert_same(dive, tmp_path, crews)
     assert crews[0].is_done
-    assert result.tally.n_frames == N
-    assert result.tally.n_valid > N - 4
+    assert result.summary.n_frames == N
+    assert result.summary.n_valid > N - 4
 
 
 def test_so_they_do_in_a_window_that_cuts_through_parts(tmp_path, dive, crews):
     result = assert_same(dive, tmp_path, crews, frames=FrameWindow(4, 15))
     assert crews[0].is_done
-    assert result.tally.n_frames == 11
+    assert result.summary.n_frames == 11
 
 
 def test_so_they_do_in_a_folder_of_images(tmp_path, dive, crews):
@@ -111,7 +111,7 @@ def test_from_damage_on_one_process_goes_on(tmp_path, dive, crews):
     result = assert_same(damaged, tmp_path, crews)
     assert not crews[0].is_done
     assert 12 <= crews[0].next_frame <= 15
-    assert result.tally.refused["corrupt_frame"] >= 1
+    assert result.summary.refused["corrupt_frame"] >= 1
 
 
 def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, crews, monkeypatch):
@@ -128,7 +128,7 @@ def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, crews, monke
 
     monkeypatch.setattr(Crew, "_of_part", one_dies)
     shared, result = results(dive, tmp_path / "shared", 2)
-    assert result.tally.n_frames == N
+    assert result.summary.n_frames == N
     assert whole == shared
     assert GROUP <= crews[0].next_frame <= N
 
