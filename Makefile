@@ -7,7 +7,7 @@ STAMP := $(VENV)/.ready
 CODE := src tests tools benchmarks ros2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test fuzz kills lint format bench docs clean
+.PHONY: help setup demo test coverage fuzz kills lint format bench docs clean
 
 help: ## List the tasks
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,6 +29,18 @@ test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one
 	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
 	  --durations=30 --durations-min=5 \
 	  $(if $(PART),$(FILES))
+
+# Coverage slows Python down: tests that count calls and compare speeds would measure it. Of a test
+# that fails, the lines count that it ran; `make test` tells of it.
+COUNTED := work_counts speed_ratios start
+coverage: $(STAMP) ## Measure which lines the tests run, by package; fails below 80 %
+	rm -rf out/coverage && mkdir -p out/coverage
+	-$(BIN)/python -m coverage run -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile \
+	  --no-loadscope-reorder --quiet \
+	  $(foreach name,$(COUNTED),--ignore=tests/test_$(name).py)
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage json --quiet -o out/coverage/lines.json
+	$(BIN)/python tools/coverage_by_package.py out/coverage/lines.json
 
 fuzz: $(STAMP) ## Try 2,000 malformed files and options (SEED=1 CASES=2000); lists what is not refused
 	PYTHONPATH=tests/helpers:. $(BIN)/python tests/helpers/fuzz_cases.py --seed $(or $(SEED),1) --cases $(or $(CASES),2000)

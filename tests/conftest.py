@@ -1,5 +1,6 @@
 """Shared fixtures."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -12,6 +13,8 @@ LONG = ("recovery", "cli", "docs")
 
 # As the command line does it, and before any test imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Imports and thousands of tests leave nothing to free: searching them is a third of collecting.
+gc.disable()
 
 
 @pytest.fixture(scope="session")
@@ -28,3 +31,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first: of several processes, none is left with one at the end."""
     long = [ROOT / "tests" / name for name in LONG]
     items.sort(key=lambda item: not any(item.path.is_relative_to(folder) for folder in long))
+
+
+def pytest_collection_finish() -> None:
+    """Free memory as usual from here, without searching what was collected again and again."""
+    gc.freeze()
+    gc.enable()

@@ -12,7 +12,8 @@ from aqualvs.scanner import Scanner
 from aqualvs.simulation.scenarios import Difficulty, example_rig
 from aqualvs.sources import open_source
 from net_cases import NetCamera
-from net_dives import Dive, passed_holes, random_dive, scans_of, true_solidity
+from net_dives import Dive, passed_holes, random_dive, true_solidity
+from quick_pictures import quick_scans
 from rig_from_sample_truth import load_truth
 
 RIG = example_rig()
@@ -26,7 +27,7 @@ def rendered(seed: int, difficulty: Difficulty) -> tuple[Dive, NetStretch]:
     """A third of a second along a net, from pictures."""
     dive = random_dive(np.random.default_rng([31, seed]), difficulty, seconds=0.32)
     condition = NetCondition(RIG)
-    return dive, condition.add_all(scans_of(dive, RIG, seed=seed))[0]
+    return dive, condition.add_all(quick_scans(dive, RIG, seed=seed))[0]
 
 
 def test_the_rendered_nets_differ() -> None:
@@ -73,7 +74,7 @@ def test_a_rendered_hole_is_found_and_nothing_else() -> None:
     rng = np.random.default_rng([32, 0])
     dive = random_dive(rng, "usual", seconds=1.6, fps=15.0, speed=(0.15, 0.2), hole_bars=(4.0, 5.0))
     condition = NetCondition(RIG)
-    condition.add_all(scans_of(dive, RIG))
+    condition.add_all(quick_scans(dive, RIG))
     ((middle, radius),) = passed_holes(dive, RIG)
     (hole,) = condition.holes
     place = dive.velocity * hole.time_s + hole.from_foot

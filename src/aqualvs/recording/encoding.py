@@ -26,11 +26,10 @@ from aqualvs.optics.dome import Dome
 from aqualvs.optics.rig import Laser, Rig, Window
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.paper.detector import ThresholdOptions
+from aqualvs.scanning.detection import DETECTORS, detector_word
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
-from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.target import TargetKind
 from aqualvs.sources.base import bgr_of
 from aqualvs.yamlfile import parse_yaml, rig_text
@@ -158,8 +157,7 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
 def options_text(options: ScannerOptions) -> str:
     """Return the scanner's options as JSON."""
     found = asdict(options)
-    threshold = isinstance(options.detector, ThresholdOptions)
-    found["detector"]["kind"] = "threshold" if threshold else "ridge"
+    found["detector"]["kind"] = detector_word(options.detector)
     return json.dumps(found)
 
 
@@ -173,7 +171,7 @@ def options_from_text(text: str) -> ScannerOptions:
     """
     found = json.loads(text)
     detector = dict(found["detector"])
-    kind = {"ridge": StripeOptions, "threshold": ThresholdOptions}[detector.pop("kind")]
+    kind = DETECTORS[detector.pop("kind")]
     # Recordings of 0.1.0 contain the option of a colour gate, since replaced by likelihoods.
     detector.pop("min_green_fall", None)
     mesh = found["mesh_filter"]

@@ -24,9 +24,8 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.results.files import replace_text
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.paper.detector import ThresholdOptions
+from aqualvs.scanning.detection import DETECTORS, detector_word
 from aqualvs.scanning.posture_estimator import FitMethod
-from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.sources import FrameSource
 from aqualvs.yamlfile import TidyDumper, read_yaml
 
@@ -288,7 +287,7 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
     facts = target_facts(target)
     return ScannerOptions(
         target=facts.kind,
-        detector=ThresholdOptions() if detector == "threshold" else StripeOptions(),
+        detector=DETECTORS[detector](),
         mesh_filter=facts.mesh_filter if mesh_filter == "paper" else None,
         fit=FitMethod(fit),
     )
@@ -297,8 +296,7 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
 def scanner_facts(options: ScannerOptions) -> dict[str, Any]:
     """Return the scanner's options as `run.yaml` holds them."""
     found: dict[str, Any] = asdict(options)
-    threshold = isinstance(options.detector, ThresholdOptions)
-    found["detector"] = {"kind": "threshold" if threshold else "ridge", **found["detector"]}
+    found["detector"] = {"kind": detector_word(options.detector), **found["detector"]}
     found["target"] = options.target.value
     found["fit"] = options.fit.value
     return found

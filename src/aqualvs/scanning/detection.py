@@ -127,6 +127,11 @@ def _pair_pixels(row: U8Array, mean: U8Array) -> None:
 
 
 DetectorOptions = StripeOptions | ThresholdOptions
+DETECTORS: dict[str, type[DetectorOptions]] = {
+    "ridge": StripeOptions,
+    "threshold": ThresholdOptions,
+}
+"""Options of every detector, by its word on the command line and in files."""
 
 # One search line of this many is sampled first. Low peaks are used up to this many times the number
 # that the lasers can make.
@@ -137,6 +142,11 @@ _CACHE_LINE = 8  # numbers of 64 bits
 # An overexposed line is no wider than this share of the picture.
 _WIDEST_WHITE = 0.02
 _NO_CHROMA = np.empty((0, 0), np.uint8)
+
+
+def detector_word(options: DetectorOptions) -> str:
+    """Return the word for the detector with these options."""
+    return next(word for word, kind in DETECTORS.items() if isinstance(options, kind))
 
 
 class FrameDetector:
