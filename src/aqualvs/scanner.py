@@ -167,9 +167,17 @@ class Scanner:
             if tested.verdict is Verdict.RIVAL and tested.other is not None:
                 surfaces = self._with_rival(surfaces, target, tested.other, chunks)
                 target = choose_target(surfaces, self.options.target, self.rig.working_range)
+        before = None
+        if target is not None and self.options.target is TargetKind.AUTO:
+            before = self._assignment.overlooked(readings, chunks, chunk_index, surfaces, target)
+            if before is not None and before.is_mesh:
+                target = before
+                surfaces = [before if one.members is before.members else one for one in surfaces]
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _no_target(readings, surfaces, self.options.target)
+        elif before is not None and not before.is_mesh:
+            found = _ambiguous(readings, target.plane, before.plane)
         elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
             found = _by_chance(readings)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
