@@ -213,10 +213,20 @@ def doubted(posture: Posture, other: Posture, share: float) -> Posture:
     share : float
         Share of the light that supports the other one.
     """
-    apart = np.array(
+    apart = _apart(posture, other)
+    return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
+
+
+def disagreement(posture: Posture, other: Posture) -> float:
+    """Return the squared Mahalanobis distance of a posture from another, by the other's sigmas."""
+    apart = _apart(posture, other)
+    return float(apart @ np.linalg.solve(other.covariance, apart))
+
+
+def _apart(posture: Posture, other: Posture) -> FloatArray:
+    return np.array(
         [other.range - posture.range, other.pitch - posture.pitch, other.yaw - posture.yaw]
     )
-    return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
 
 
 # Duty of a mesh at most: a typical lit stretch over the sum of it and a typical gap. The gaps of a
