@@ -563,20 +563,23 @@ class PostureMeter:
         if strands >= _WHOLE_SHARE or (best is None and not few):
             return None
         light = light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near)
-        mean = self._mean(readings, seen, plane)
-        if few:
-            mean = self._settled(readings, whole, seen, mean)
-        if mean is None or best is None or (few and light < _FOLDED_LIGHT):
+        if not few:
+            return best and self._widened(best, seen, plane, light)
+        mean = self._settled(readings, whole, seen, self._mean(readings, seen, plane))
+        if mean is None or best is None or light < _FOLDED_LIGHT:
             return mean
         one, other = best.posture, mean.posture
-        if not (isinstance(one, Posture) and isinstance(other, Posture)):
+        if not (one and other):
             return None
-        apart = disagreement(one, other)
-        if few and apart > _CONTRADICTS:
-            return mean
-        # Only what the scatter about the mean plane does not explain speaks against the surface.
-        excess = max(1.0 - _EXPECTED / max(apart, _EXPECTED), 0.0)
-        return _doubted(best, mean, (1.0 - light) * excess)
+        contradicts = disagreement(one, other) > _CONTRADICTS
+        return mean if contradicts else _disputed(best, other, light)
+
+    def _widened(self, best: Measurement, seen: "_Seen", plane: Plane, light: float) -> Measurement:
+        """Widen a posture by the mean plane of the light near it; `light` is its own share."""
+        fit = fit_mean(seen.pieces.points, plane)
+        if fit is None:
+            return best
+        return _disputed(best, posture_of(fit, 0.0, 0, self._axis_in_dome), light)
 
     def _beside(
         self, readings: Readings, whole: BoolArray, off: FloatArray, plane: Plane
@@ -738,7 +741,7 @@ class PostureMeter:
         )
         posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
         if on_twine:
-            posture = _with_twine_error(posture, fit, pieces.sensitivity)
+            _add_twine_error(posture, fit, pieces.sensitivity)
         return Measurement(posture, rests_on, weights=weights)
 
 
@@ -755,12 +758,21 @@ def _plane_of(fit: PlaneFit) -> Plane:
     return Plane(fit.m * distance, distance)
 
 
-def _with_twine_error(posture: Posture, fit: PlaneFit, sensitivity: FloatArray) -> Posture:
-    """Return a posture with the error of the range that the light on all strands shares."""
+def _add_twine_error(posture: Posture, fit: PlaneFit, sensitivity: FloatArray) -> None:
+    """Widen the range of a posture, in place, by the error that the light on all strands shares."""
     share = float(np.abs(sensitivity @ fit.m) @ fit.weights / fit.weights.sum())
-    covariance = posture.covariance.copy()
-    covariance[0, 0] += (_TWINE_PX * share * posture.range) ** 2
-    return replace(posture, covariance=covariance)
+    posture.covariance[0, 0] += (_TWINE_PX * share * posture.range) ** 2
+
+
+def _disputed(found: Measurement, other: Posture, light: float) -> Measurement:
+    """Widen a posture by another one's difference that the other's scatter does not explain."""
+    if isinstance(found.posture, Refusal):
+        return found
+    apart = disagreement(found.posture, other)
+    if apart <= _EXPECTED:
+        return found
+    excess = 1.0 - _EXPECTED / apart
+    return replace(found, posture=doubted(found.posture, other, (1.0 - light) * excess))
 
 
 def _doubted(found: Measurement, other: Measurement, share: float) -> Measurement:
