@@ -12,6 +12,8 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning import posture_estimator
+from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.paper.detector import ThresholdOptions
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
@@ -19,6 +21,8 @@ from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
+from scanning_cases import returns_of
+from scanning_cases import strands as broken
 from windowed_cases import windowed
 
 Lit: TypeAlias = Callable[[FloatArray], BoolArray]
@@ -376,3 +380,24 @@ def test_without_its_dome_the_camera_reads_another_posture() -> None:
     frame = frame_of(light_on(rig, [(target, everywhere)], ALL))
     found = Scanner(rig, camera=rig.bare_camera()).process(frame).posture
     assert not found or abs(found.range / 0.9 - 1.0) > 0.03 or abs(np.rad2deg(found.pitch)) > 3.0
+
+
+def test_an_error_that_all_strands_share_is_in_the_sigma_of_the_range(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, variances = example_rig(), []
+    returns = returns_of(rig, [(plane(0.5), broken)], 0.05)
+    for twine_px in (posture_estimator._TWINE_PX, 0.0):
+        monkeypatch.setattr(posture_estimator, "_TWINE_PX", twine_px)
+        found = Scanner(rig).measure(0, 0.0, returns).posture
+        assert isinstance(found, Posture)
+        variances.append(found.covariance[0, 0])
+    # How far the stripes move in the picture as the target moves away.
+    near, far = (returns_of(rig, [(plane(one), everywhere)]) for one in (0.5, 0.501))
+    one, other = (part[SearchAxis.ALONG_Y] for part in (near, far))
+    moved = np.interp(other.line, one.line, one.position) - other.position
+    px_per_m = float(np.median(np.abs(moved))) / 0.001
+    shared = np.sqrt(variances[0] - variances[1])
+    assert shared == pytest.approx(0.11 / px_per_m, rel=0.25)
+    # A shift of 0.1 px, as measured on rendered nets, is within one sigma.
+    assert np.sqrt(variances[0]) > 0.1 / px_per_m

@@ -159,17 +159,19 @@ class Scanner:
             self.rig.focal_px,
         )
         surfaces = read_as_wanted(surfaces, self.options.target)
-        target = choose_target(surfaces, self.options.target, self.rig.working_range)
+        surfaces, target, doubtful = self._chosen(readings, chunks, chunk_index, surfaces)
         tested = UNTESTED
         if target is not None:
             # The same peaks, read as other lasers', may give a plane that is as good or better.
             tested = self._assignment.test(readings, chunks, chunk_index, target)
             if tested.verdict is Verdict.RIVAL and tested.other is not None:
                 surfaces = self._with_rival(surfaces, target, tested.other, chunks)
-                target = choose_target(surfaces, self.options.target, self.rig.working_range)
+                surfaces, target, doubtful = self._chosen(readings, chunks, chunk_index, surfaces)
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _no_target(readings, surfaces, self.options.target)
+        elif doubtful is not None:
+            found = _ambiguous(readings, target.plane, doubtful.plane)
         elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
             found = _by_chance(readings)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
@@ -185,6 +187,20 @@ class Scanner:
             readings, chunk_index, surfaces, target, found, self.rig.working_range
         )
         return found, points, listed
+
+    def _chosen(
+        self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surfaces: list[Surface]
+    ) -> tuple[list[Surface], Surface | None, Surface | None]:
+        """Return the surfaces, the target, and a surface before it that may be the net instead."""
+        kind = self.options.target
+        target = choose_target(surfaces, kind, self.rig.working_range)
+        if target is None or kind is not TargetKind.AUTO:
+            return surfaces, target, None
+        before = self._assignment.overlooked(readings, chunks, chunk_index, surfaces, target)
+        if before is None or not before.is_mesh:
+            return surfaces, target, before
+        surfaces = [before if one.members is before.members else one for one in surfaces]
+        return surfaces, before, None
 
     def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
         """Return the posture with its covariance by the rig's uncertainty."""

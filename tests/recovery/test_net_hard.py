@@ -102,12 +102,20 @@ def test_folds_change_no_posture_and_are_net() -> None:
 
 
 @pytest.mark.parametrize(
-    "direction",
-    [0.2, pytest.param(0.6, marks=pytest.mark.xfail(reason="refused as collinear"))],
+    ("direction", "height", "width", "bar"),
+    [
+        (0.2, 0.03, 0.06, 0.022),
+        # One flank's points lie nearly on a line.
+        (0.6, 0.03, 0.06, 0.022),
+        # One laser alone shows a flank.
+        (0.8, 0.024, 0.045, 0.025),
+    ],
 )
-def test_a_net_that_is_all_folds_is_measured_by_all_of_its_light(direction: float) -> None:
-    folds = (Fold(direction=direction, place=0.0, height=-0.03, width=0.06, period=0.12),)
-    shot = shoot(replace(NET, folds=folds), walls=())
+def test_a_net_that_is_all_folds_is_measured_by_all_of_its_light(
+    direction: float, height: float, width: float, bar: float
+) -> None:
+    fold = Fold(direction=direction, place=0.0, height=-height, width=width, period=2.0 * width)
+    shot = shoot(replace(NET, bar=bar, folds=(fold,)), walls=())
     seen = visible_fit(shot.lit, Kind.NET)
     assert seen is not None
     n = seen[0].normal

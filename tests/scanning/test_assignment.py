@@ -16,7 +16,7 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.surfaces import surface_on
+from aqualvs.scanning.surfaces import Surface, surface_on
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
@@ -234,6 +234,60 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     other = surface_on(near, chunks, len(rig.lasers), 850.0)
     assert scanner.measure(0, 0.0, returns).posture
     monkeypatch.setattr(assignment.AssignmentTest, "outweighed", lambda *_: other)
+    refused = scanner.measure(0, 0.0, returns).posture
+    assert isinstance(refused, Refusal)
+    assert refused.reason is Reason.AMBIGUOUS
+
+
+def slanted_strands(points: FloatArray) -> BoolArray:
+    """Light on every laser's stripe, whichever way it runs."""
+    lit: BoolArray = (points[:, 0] + 0.4 * points[:, 2]) % 0.03 < 0.006
+    return lit
+
+
+def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = example_rig()
+    net, wall = Plane.from_normal((0.1, 1.0, 0.0), 0.4), Plane.from_normal((0.0, 1.0, 0.1), 0.8)
+    behind = returns_of(rig, [(wall, everywhere)], 0.1)
+    camera = rig.camera()
+    searches, triangulator = plan_searches(rig, camera), Triangulator(rig, camera)
+    test = assignment.AssignmentTest(searches, triangulator, rig.working_range)
+
+    def overlooked(
+        part: dict[SearchAxis, Returns], *, mesh: bool = True, wall_is_mesh: bool = False
+    ) -> Surface | None:
+        readings = read_returns(joined([part, behind]), searches, triangulator)
+        chunks, index = readings.chunks()
+        near, far = (surface_on(one, chunks, len(rig.lasers), 850.0) for one in (net, wall))
+        near, far = replace(near, is_mesh=mesh), replace(far, is_mesh=wall_is_mesh)
+        assert test.overlooked(readings, chunks, index, [far, near], near) is None
+        return test.overlooked(readings, chunks, index, [far, near], far)
+
+    seen = returns_of(rig, [(net, slanted_strands)], 0.1)
+    found = overlooked(seen)
+    assert found is not None
+    assert found.is_mesh
+    assert found.plane.offset == net.offset
+    # It need not have the pattern of one, if the wall is seen through it.
+    dense = overlooked(seen, mesh=False)
+    assert dense is not None
+    assert dense.is_mesh
+    # Not a plate, and not what one laser alone shows.
+    assert overlooked(returns_of(rig, [(net, everywhere)], 0.1), mesh=False) is None
+    assert (
+        overlooked(returns_of(replace(rig, lasers=rig.lasers[:1]), [(net, slanted_strands)]))
+        is None
+    )
+    # The wall in its shadows may look broken, and has long stretches all the same.
+    assert overlooked(seen, wall_is_mesh=True) is not None
+    scanner, returns = Scanner(rig), joined([seen, behind])
+    monkeypatch.setattr("aqualvs.scanner.choose_target", lambda surfaces, *_: surfaces[0])
+    posture = scanner.measure(0, 0.0, returns).posture
+    assert isinstance(posture, Posture)
+    assert posture.range == pytest.approx(0.4 / np.hypot(0.1, 1.0), rel=2e-3)
+    monkeypatch.setattr(
+        assignment.AssignmentTest, "overlooked", lambda *_: replace(found, is_mesh=False)
+    )
     refused = scanner.measure(0, 0.0, returns).posture
     assert isinstance(refused, Refusal)
     assert refused.reason is Reason.AMBIGUOUS

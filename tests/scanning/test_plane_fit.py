@@ -158,6 +158,19 @@ def test_errors_larger_than_stated_are_seen_in_the_residuals() -> None:
     np.testing.assert_allclose(told.covariance, bold.covariance, rtol=0.25, atol=1e-5)
 
 
+def test_errors_smaller_than_stated_are_seen_in_many_residuals_only() -> None:
+    points = noisy(TILTED, np.random.default_rng(3))
+    sigma = []
+    for rows in (slice(None), slice(None, None, 12)):
+        told, shy = (fit(points, px, shared=INDEPENDENT, rows=rows) for px in (0.3, 1.5))
+        assert told is not None
+        assert shy is not None
+        sigma.append(np.sqrt(np.trace(shy.covariance) / np.trace(told.covariance)))
+    # 5 by what is stated, 1 by the residuals: of 180 observations and of 15.
+    assert sigma[0] < 2.5
+    assert 3.5 < sigma[1] < 5.5
+
+
 def test_shared_errors_widen_and_do_not_move() -> None:
     points = noisy(TILTED, np.random.default_rng(5))
     alone, common = fit(points, shared=INDEPENDENT), fit(points, shared=MESH_ERROR)

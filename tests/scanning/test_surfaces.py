@@ -234,6 +234,14 @@ def test_specks_that_reach_farther_than_an_unbroken_wall_has_gaps_are_no_net() -
     assert choose([wall, net], TargetKind.AUTO) is net
 
 
+def test_a_walls_light_is_no_measure_of_the_net_that_shadows_it() -> None:
+    wall = replace(surface(0.8, 400, True, extent=1200.0), is_unbroken=True)
+    net, specks = surface(0.6, 130, True, extent=1500.0), surface(0.4, 40, True, extent=1300.0)
+    assert choose([wall, net, specks], TargetKind.AUTO) is net
+    # What has nothing but strands is one.
+    assert choose([replace(wall, is_unbroken=False), net], TargetKind.AUTO) is not net
+
+
 def test_which_of_several_is_the_target() -> None:
     net, far_net = surface(0.5, 200, True), surface(0.9, 400, True)
     wall, box = surface(0.9, 900, False), surface(0.4, 300, False)

@@ -42,7 +42,7 @@ from aqualvs.scanning.assignment_kernels import (
 )
 from aqualvs.scanning.candidates import Chunks, Readings
 from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
-from aqualvs.scanning.net_surfaces import doubted
+from aqualvs.scanning.net_surfaces import doubted, seen_through
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.posture_estimator import Measurement
@@ -136,17 +136,69 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
+        small, faint = self._evidence(readings, chunks, chunk_index, surfaces, target)
+        return small and faint > _MAY_BE_FAINT
+
+    def overlooked(
+        self,
+        readings: Readings,
+        chunks: Chunks,
+        chunk_index: IntArray,
+        surfaces: Sequence[Surface],
+        target: Surface,
+    ) -> Surface | None:
+        """Return a surface before something solid that may be a net, if there is one.
+
+        It has light that no other surface explains, all lasers show it, and its stripes are broken:
+        a fish shows few lasers and long stripes, and specks that share a plane by chance have
+        little light.
+
+        Parameters
+        ----------
+        readings, chunks, chunk_index, surfaces
+            As in `by_chance`.
+        target : Surface
+            The one that was chosen.
+
+        Returns
+        -------
+        Surface or None
+            A net if it has the pattern of one, or if the target alternates with it along the
+            stripes. A surface that is no mesh may be one all the same.
+        """
+        if target.is_mesh and not target.is_unbroken:
+            return None
+        for one in surfaces:
+            # Only broken stripes have an extent.
+            if one is target or one.extent <= 0.0 or not _is_nearer(one, target, chunks):
+                continue
+            small, faint = self._evidence(readings, chunks, chunk_index, surfaces, one)
+            if small or faint > _MAY_BE_FAINT:
+                continue
+            is_net = one.is_mesh or seen_through(one.members, target.members, chunks)
+            return replace(one, is_mesh=is_net)
+        return None
+
+    def _evidence(
+        self,
+        readings: Readings,
+        chunks: Chunks,
+        chunk_index: IntArray,
+        surfaces: Sequence[Surface],
+        surface: Surface,
+    ) -> tuple[bool, float]:
+        """Return whether a surface is small, and the share of the lasers that are faint on it."""
         others = np.zeros(len(chunks), np.bool_)
         for one in surfaces:
-            if one is not target:
+            if one is not surface:
                 others |= one.members
-        plane = np.append(target.plane.normal, target.plane.offset)
-        light = light_left(readings.source, readings.trust, chunk_index, target.members, others)
+        plane = np.append(surface.plane.normal, surface.plane.offset)
+        light = light_left(readings.source, readings.trust, chunk_index, surface.members, others)
         # A plane needs two lasers: the surplus of one is no evidence for it.
-        light *= target.support / chunks.light[target.members].sum()
-        most, faint = seen_of(plane, target.members, chunks.n_lines, chunks.laser, self._bands)
-        small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not target.is_mesh)
-        return small and faint > _MAY_BE_FAINT
+        light *= surface.support / chunks.light[surface.members].sum()
+        most, faint = seen_of(plane, surface.members, chunks.n_lines, chunks.laser, self._bands)
+        small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not surface.is_mesh)
+        return small, faint
 
     def outweighed(
         self, chunks: Chunks, surfaces: Sequence[Surface], target: Surface
@@ -166,15 +218,14 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
-        voice, plane = chunks.table[WEIGHT], target.plane
-        near = plane.normal @ chunks.table[X : Z + 1] < plane.offset
+        plane = target.plane
         nearer = [
             one
             for one in surfaces
             if one is not target
             and one.is_mesh
             and one.voice >= target.voice
-            and voice[one.members & near].sum() > 0.5 * voice[one.members].sum()
+            and _is_nearer(one, target, chunks)
         ]
         if not (target.is_mesh and nearer):
             return None
@@ -234,6 +285,13 @@ class AssignmentTest:
             facts,
         )
         return _verdict(planes[: n + 1], facts[: n + 1])
+
+
+def _is_nearer(one: Surface, target: Surface, chunks: Chunks) -> bool:
+    """Return whether most of a surface's light lies before another surface's plane."""
+    voice, plane = chunks.table[WEIGHT], target.plane
+    near = plane.normal @ chunks.table[X : Z + 1] < plane.offset
+    return bool(voice[one.members & near].sum() > 0.5 * voice[one.members].sum())
 
 
 def widened(found: Measurement, outcome: Outcome) -> Measurement:

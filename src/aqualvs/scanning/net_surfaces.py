@@ -213,10 +213,28 @@ def doubted(posture: Posture, other: Posture, share: float) -> Posture:
     share : float
         Share of the light that supports the other one.
     """
-    apart = np.array(
+    apart = _apart(posture, other)
+    return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
+
+
+def disagreement(posture: Posture, other: Posture) -> float:
+    """Return the squared Mahalanobis distance of a posture from another, by the other's sigmas."""
+    return _squared_distance(_apart(posture, other), other.covariance)
+
+
+@kernel
+def _squared_distance(apart: FloatArray, covariance: FloatArray) -> float:
+    """Return the square of a difference over a covariance; infinite if that is singular."""
+    solved = np.empty(3)
+    if not solve_symmetric(covariance, apart, np.empty((3, 3)), solved):
+        return np.inf
+    return float(apart[0] * solved[0] + apart[1] * solved[1] + apart[2] * solved[2])
+
+
+def _apart(posture: Posture, other: Posture) -> FloatArray:
+    return np.array(
         [other.range - posture.range, other.pitch - posture.pitch, other.yaw - posture.yaw]
     )
-    return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
 
 
 # Duty of a mesh at most: a typical lit stretch over the sum of it and a typical gap. The gaps of a

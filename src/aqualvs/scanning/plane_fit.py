@@ -37,6 +37,8 @@ MESH_ERROR = SharedError(shift_px=0.08, tilt_px=0.12)
 
 _TUKEY = 4.685  # 95 % efficiency for normal errors
 _ITERATIONS = 6
+# The stated errors count as much as the scatter of this many observations.
+_STATED_COUNT = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,8 +203,10 @@ def _fit(
         if not solve_symmetric(normal, right, inverse, m):
             return np.nan
     _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
-    # With few observations, a scatter below the stated errors is chance.
-    factor = max(_huber_factor(z, _TUKEY * scale), 1.0)
+    factor = _huber_factor(z, _TUKEY * scale)
+    if factor < 1.0:
+        # With few observations, a scatter below the stated errors is chance.
+        factor = (_STATED_COUNT + n * factor) / (_STATED_COUNT + n)
     normal_equations(points, sigma, np.ones(n), normal, right)
     if not invert_symmetric(normal, covariance):
         return np.nan

@@ -20,7 +20,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
 from aqualvs.scanning.candidates import Observations, Readings
 from aqualvs.scanning.laser_bands import StripeSearch
-from aqualvs.scanning.net_surfaces import doubted, fit_mean
+from aqualvs.scanning.net_surfaces import disagreement, doubted, fit_mean
 from aqualvs.scanning.paraboloid import LEAST_BEND, fit_patch, hints_at_curvature, refit_at_nearest
 from aqualvs.scanning.patch import (
     Patch,
@@ -344,12 +344,20 @@ _LEAST_FOLDED = 12
 _FOLDED_RMS_SHARE = 0.04
 _NEAR_SHARE = 0.005
 # Light this near the plane (share of the range) may be the net's if nothing else explains it. A net
-# with less than the first two shares, of its strands and of their light, on the surface is mostly
-# folds; with more light than the last share, as beside a single fold, only the covariance is
-# inflated. Found on simulated nets: folded ones reach 0.43 and 0.51, with a single fold 0.37 and
-# 0.48; flat ones in strong sun and those with growth come down to 0.34 and 0.57, or to 0.56 and
-# 0.29.
-_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT, _DOUBTED_LIGHT = 0.06, 0.45, 0.54, 0.47
+# of which fewer strands than the second share lie on the surface, and less light than the third, is
+# mostly folds. Flat nets in strong sun and those with growth come down to 0.36 of the strands, and
+# to 0.31 of the light; folded ones reach 0.46 and 0.62.
+_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT = 0.06, 0.5, 0.47
+# Square of the distance between two postures, over the covariance of the one: its expected value if
+# only chance parts them, and what chance exceeds once in 1000 times (chi-squared, 3 values).
+_EXPECTED, _CONTRADICTS = 3.0, 16.27
+# The light about a mean plane is selected at most this many times more.
+_MOST_SELECTIONS = 5
+# A strand's light is brightest on the twine's front, and blur takes away the light on its edges:
+# its centroid lies before the mean of the surface it lights. On rendered nets of twelve kinds, in
+# clear and turbid water, all strands alike were 0.05 to 0.18 px off, to the near side; how far
+# depends on twine, growth and water, so that it is an error and no correction.
+_TWINE_PX = 0.11
 # Independent pieces of stripe that the second best laser must show.
 _MIN_PIECES = 3
 
@@ -441,13 +449,17 @@ class PostureMeter:
         fit = self._fit(readings, seen, target)
         if fit is None:
             return _nothing(readings, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
-        flat = self._measured(readings, seen, fit)
-        if flat is None:
+        flat = self._measured(readings, seen, fit, on_twine=mesh)
+        found = flat
+        if mesh and self._fit_method is FitMethod.ROBUST:
+            if flat is not None:
+                found = self._measure_net(readings, seen, fit, flat, target)
+            else:
+                found = self._measure_folds(readings, seen, fit)
+        if found is None:
             detail = "all lasers but one show too little of the target"
             return _nothing(readings, Refusal(Reason.ONE_LASER, detail))
-        if mesh and self._fit_method is FitMethod.ROBUST:
-            return self._believed(readings, self._measure_net(readings, seen, fit, flat, target))
-        return self._believed(readings, flat)
+        return self._believed(readings, found)
 
     def _believed(self, readings: Readings, found: Measurement) -> Measurement:
         """Return the measurement if a pilot may rely on it, else a refusal."""
@@ -479,8 +491,33 @@ class PostureMeter:
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         whole = self._followed(readings, best.rests_on, plane, patch)
         folded = self._folded(readings, whole, off, plane, patch, best)
-        best = folded or self._weighed(readings, whole, plane, patch, best, best is curved)
+        if folded is None or not folded.folded:
+            is_curved = best is curved
+            best = self._weighed(readings, whole, plane, patch, folded or best, is_curved)
+        else:
+            best = folded
         return replace(best, whole=whole)
+
+    def _measure_folds(
+        self, readings: Readings, seen: "_Seen", fit: PlaneFit
+    ) -> Measurement | None:
+        """Measure the posture to the mean plane of a net of which one laser alone fits a plane.
+
+        Such a plane may stand anywhere: its mean plane counts if every laser confirms it.
+        """
+        plane = _plane_of(fit)
+        off = np.empty(len(readings))
+        distances_off(readings.points, plane.normal, plane.offset, off)
+        rests_on = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
+        whole = self._followed(readings, rests_on, plane, packed_plane(plane))
+        folded = self._folded(readings, whole, off, plane, packed_plane(plane), None)
+        if folded is None:
+            return None
+        for index in range(len(self._planes)):
+            mine = folded.rests_on & (readings.laser == index)
+            if len(np.unique(readings.stretch[mine])) < _MIN_PIECES:
+                return None
+        return replace(folded, whole=whole)
 
     def _followed(
         self, readings: Readings, rests_on: BoolArray, plane: Plane, patch: FloatArray
@@ -509,25 +546,68 @@ class PostureMeter:
         off: FloatArray,
         plane: Plane,
         patch: FloatArray,
-        best: Measurement,
+        best: Measurement | None,
     ) -> Measurement | None:
         """Return the posture to the mean plane of a net most of whose light is off the surface.
 
-        A surface on one flank of a fold explains little of the light that lies about it.
+        A surface on one flank of a fold explains little of the light that lies about it, or the
+        mean plane of all that light contradicts it. `best` is the posture to the surface, if any:
+        where it is the main part of the net it is returned, widened as far as the two disagree.
         """
-        beside = np.empty(len(readings), np.bool_)
-        mark_beside(readings.source, whole, off, _BESIDE_SHARE, beside)
-        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, beside, plane.normal)
+        seen = self._beside(readings, whole, off, plane)
         if len(seen.pieces.laser) < _LEAST_FOLDED:
             return None
         near = _NEAR_SHARE * plane.offset
-        if share_near(seen.pieces.points, patch, near) >= _FOLDED_STRANDS:
+        strands = share_near(seen.pieces.points, patch, near)
+        few = strands < _FOLDED_STRANDS
+        if strands >= _WHOLE_SHARE or (best is None and not few):
             return None
         light = light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near)
-        mean = self._mean(readings, seen, plane) if light < _FOLDED_LIGHT else None
-        if mean is None or light < _DOUBTED_LIGHT:
+        if not few:
+            return best and self._widened(best, seen, plane, light)
+        mean = self._settled(readings, whole, seen, self._mean(readings, seen, plane))
+        if mean is None or best is None or light < _FOLDED_LIGHT:
             return mean
-        return _doubted(best, mean, 1.0 - light)
+        one, other = best.posture, mean.posture
+        if not (one and other):
+            return None
+        contradicts = disagreement(one, other) > _CONTRADICTS
+        return mean if contradicts else _disputed(best, other, light)
+
+    def _widened(self, best: Measurement, seen: "_Seen", plane: Plane, light: float) -> Measurement:
+        """Widen a posture by the mean plane of the light near it; `light` is its own share."""
+        fit = fit_mean(seen.pieces.points, plane)
+        if fit is None:
+            return best
+        return _disputed(best, posture_of(fit, 0.0, 0, self._axis_in_dome), light)
+
+    def _beside(
+        self, readings: Readings, whole: BoolArray, off: FloatArray, plane: Plane
+    ) -> "_Seen":
+        """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
+        beside = np.empty(len(readings), np.bool_)
+        mark_beside(readings.source, whole, off, _BESIDE_SHARE, beside)
+        return self._observe(readings, readings.stretch, _SHORTEST_STRAND, beside, plane.normal)
+
+    def _settled(
+        self, readings: Readings, whole: BoolArray, seen: "_Seen", mean: Measurement | None
+    ) -> Measurement | None:
+        """Measure a mean plane again from the light about it.
+
+        The light near one flank is more of that side than of the other: the selection is repeated
+        about the mean plane until it holds the same pieces.
+        """
+        off = np.empty(len(readings))
+        for _ in range(_MOST_SELECTIONS):
+            if mean is None or not isinstance(mean.posture, Posture):
+                break
+            plane = Plane(mean.posture.normal_in_dome, mean.posture.range)
+            distances_off(readings.points, plane.normal, plane.offset, off)
+            other = self._beside(readings, whole, off, plane)
+            if np.array_equal(other.group >= 0, seen.group >= 0):
+                break
+            seen, mean = other, self._mean(readings, other, plane)
+        return mean
 
     def _mean(self, readings: Readings, seen: "_Seen", plane: Plane) -> Measurement | None:
         """Measure the posture to the mean plane of a folded net."""
@@ -581,7 +661,7 @@ class PostureMeter:
         if fit is None or m is None:
             return None
         tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
-        found = self._measured(readings, seen, tangent)
+        found = self._measured(readings, seen, tangent, on_twine=True)
         if found is None or isinstance(found.posture, Refusal):
             return None
         along = fit.patch.coefficients[[3, 5]].tolist()
@@ -632,12 +712,19 @@ class PostureMeter:
         return fit_pseudo_inverse(points, len(pieces.laser), robust.covariance)
 
     def _measured(
-        self, readings: Readings, seen: "_Seen", fit: PlaneFit, *, of_all: bool = False
+        self,
+        readings: Readings,
+        seen: "_Seen",
+        fit: PlaneFit,
+        *,
+        of_all: bool = False,
+        on_twine: bool = False,
     ) -> Measurement | None:
         """Return the posture of a fit; None unless a second laser determines the plane's angles.
 
         A line and one point always share a plane: an error of a single piece would not show.
-        With `of_all`, pieces that the fit has rejected count too.
+        With `of_all`, pieces that the fit has rejected count too. With `on_twine`, the range has
+        the error that the light on all strands shares.
         """
         rests_on = np.empty(len(readings), np.bool_)
         laser = seen.pieces.laser
@@ -653,6 +740,8 @@ class PostureMeter:
             seen.group, fit.m, pieces.sensitivity, pieces.sigma_px, fit.weights, alike, weights
         )
         posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
+        if on_twine:
+            _add_twine_error(posture, fit, pieces.sensitivity)
         return Measurement(posture, rests_on, weights=weights)
 
 
@@ -667,6 +756,23 @@ class _Seen(NamedTuple):
 def _plane_of(fit: PlaneFit) -> Plane:
     distance = 1.0 / math.hypot(*fit.m.tolist())
     return Plane(fit.m * distance, distance)
+
+
+def _add_twine_error(posture: Posture, fit: PlaneFit, sensitivity: FloatArray) -> None:
+    """Widen the range of a posture, in place, by the error that the light on all strands shares."""
+    share = float(np.abs(sensitivity @ fit.m) @ fit.weights / fit.weights.sum())
+    posture.covariance[0, 0] += (_TWINE_PX * share * posture.range) ** 2
+
+
+def _disputed(found: Measurement, other: Posture, light: float) -> Measurement:
+    """Widen a posture by another one's difference that the other's scatter does not explain."""
+    if isinstance(found.posture, Refusal):
+        return found
+    apart = disagreement(found.posture, other)
+    if apart <= _EXPECTED:
+        return found
+    excess = 1.0 - _EXPECTED / apart
+    return replace(found, posture=doubted(found.posture, other, (1.0 - light) * excess))
 
 
 def _doubted(found: Measurement, other: Measurement, share: float) -> Measurement:

@@ -76,7 +76,9 @@ def choose_target(
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
     farthest = max((surface.extent for surface in meshes), default=0.0)
-    most = max((surface.voice for surface in meshes), default=0.0)
+    # What has long stretches as well may be a wall in a net's shadows: no measure of a net's light.
+    broken = [surface for surface in meshes if not surface.is_unbroken] or meshes
+    most = max((surface.voice for surface in broken), default=0.0)
     wide = [
         one
         for one in meshes
