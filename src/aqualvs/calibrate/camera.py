@@ -26,7 +26,7 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import check_rig_place
 from aqualvs.optics.solved import SolvedStep, with_step, with_uncertainty
 from aqualvs.report.calibration_material import (
-    Page,
+    CalibrationPage,
     ViewRow,
     facts,
     missed_rows,
@@ -113,7 +113,9 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)
 
 
-def _page(rig: Rig, result: CameraCalibration, found: Found, request: CameraRequest) -> Page:
+def _page(
+    rig: Rig, result: CameraCalibration, found: Found, request: CameraRequest
+) -> CalibrationPage:
     sigmas = result.uncertainty.sigmas
     lens = result.lens
     cards = [
@@ -134,7 +136,7 @@ def _page(rig: Rig, result: CameraCalibration, found: Found, request: CameraRequ
         cards.append(
             Card("held-back views", f"{result.held_back_rms_px:.3f} px", "corners predicted, rms")
         )
-    return Page(
+    return CalibrationPage(
         title="Calibration of the camera",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),

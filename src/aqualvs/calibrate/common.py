@@ -20,7 +20,7 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
-from aqualvs.report.calibration_page import Page, write_page
+from aqualvs.report.calibration_page import CalibrationPage, write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.sources.images import read_image
@@ -294,7 +294,13 @@ def medium_index(word: str | None, rig: Rig, default: float) -> float:
 
 
 def finish(
-    rig: Rig, page: Page, out: Path, step: str, tell: Tell, *, comments_of: Path | None = None
+    rig: Rig,
+    page: CalibrationPage,
+    out: Path,
+    step: str,
+    tell: Tell,
+    *,
+    comments_of: Path | None = None,
 ) -> None:
     """Write the rig and the page of a calibration, and print their paths.
 

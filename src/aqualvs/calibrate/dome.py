@@ -34,7 +34,7 @@ from aqualvs.optics.solved import (
     with_uncertainty,
 )
 from aqualvs.report.calibration_material import (
-    Page,
+    CalibrationPage,
     ViewRow,
     expectations,
     facts,
@@ -199,7 +199,7 @@ def _noted(rig: Rig, result: DomeCalibration) -> Rig:
 
 def _page(
     before: Rig, rig: Rig, result: DomeCalibration, shots: list[_Shots], request: DomeRequest
-) -> Page:
+) -> CalibrationPage:
     sigmas = result.uncertainty.sigmas
     lens = rig.dome_from_cam.translation
     cards = [
@@ -222,7 +222,7 @@ def _page(
         )
     missed = {name: why for one in shots for name, why in one.found.missed.items()}
     dome_names = [name for name in DOME_PARAMETERS if name in sigmas]
-    return Page(
+    return CalibrationPage(
         title="Calibration of the dome",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),

@@ -14,8 +14,8 @@ from aqualvs.design.settings import (
     Design,
     Goals,
     Mount,
-    NetFacts,
     Noise,
+    NominalNet,
     Tolerances,
     mount_of_laser,
     ring,
@@ -68,7 +68,7 @@ _Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
 _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
 
 
-class CameraPart(Part):
+class CameraDesign(Part):
     """Schema of `camera`: size and field of view, or a rig file with its intrinsics."""
 
     width_px: _Pixels | None = None
@@ -78,7 +78,7 @@ class CameraPart(Part):
     rig: str | None = None
 
 
-class DomePart(Part):
+class DomeDesign(Part):
     """Schema of `dome`."""
 
     inner_radius_mm: _Length
@@ -86,14 +86,14 @@ class DomePart(Part):
     n_acrylic: _Index = 1.49
 
 
-class LensPart(Part):
+class LensDesign(Part):
     """Schema of `lens`: nominal projection centre, and its tolerance."""
 
     position_mm: _Triple = Field(default=[0.0, 0.0, 0.0])
     centring_mm: NotNegative = 1.0
 
 
-class WaterPart(Part):
+class WaterDesign(Part):
     """Schema of `water`: its index, or the values to compute it from."""
 
     n: _Index | None = None
@@ -101,7 +101,7 @@ class WaterPart(Part):
     salinity_permille: Number | None = None
 
 
-class LasersPart(Part):
+class LasersDesign(Part):
     """Schema of `lasers`, evenly round the dome."""
 
     count: Annotated[int, Field(ge=1, le=8)] = 3
@@ -163,11 +163,11 @@ class DesignFile(Part):
 
     aqualvs_design: int
     name: str = "design"
-    camera: CameraPart
-    dome: DomePart | None = None
-    lens: LensPart = LensPart()
-    water: WaterPart = WaterPart(n=1.3345)
-    lasers: LasersPart | None = None
+    camera: CameraDesign
+    dome: DomeDesign | None = None
+    lens: LensDesign = LensDesign()
+    water: WaterDesign = WaterDesign(n=1.3345)
+    lasers: LasersDesign | None = None
     mounts: Annotated[list[MountPart], Field(min_length=1)] | None = None
     working_range_mm: Annotated[list[_Length], Field(min_length=2, max_length=2)]
     net: NetPart = NetPart()
@@ -287,7 +287,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         centring=file.lens.centring_mm * _MM,
         noise=_noise(file.noise),
         tolerances=_tolerances(file.tolerances),
-        net=NetFacts(bar=file.net.bar_mm * _MM, twine=file.net.twine_mm * _MM),
+        net=NominalNet(bar=file.net.bar_mm * _MM, twine=file.net.twine_mm * _MM),
         goals=Goals(
             range_share=file.goals.range_percent / 100.0,
             angle=math.radians(file.goals.angle_deg),
@@ -296,7 +296,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
     )
 
 
-def _lens(camera: CameraPart, folder: Path) -> tuple[Lens, tuple[int, int]]:
+def _lens(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int]]:
     if camera.rig is not None:
         if camera.width_px or camera.height_px or camera.fov_deg:
             raise OptionError(
@@ -323,7 +323,7 @@ def _lens(camera: CameraPart, folder: Path) -> tuple[Lens, tuple[int, int]]:
     return Lens(model=model, fx=focal, fy=focal, cx=middle[0], cy=middle[1]), (width, height)
 
 
-def _water_index(water: WaterPart) -> float:
+def _water_index(water: WaterDesign) -> float:
     if water.n is not None:
         if water.temperature_c is not None or water.salinity_permille is not None:
             raise OptionError("water gives n and what it would follow from; keep one of them")

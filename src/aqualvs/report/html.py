@@ -12,7 +12,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report.charts import reason_counts
 from aqualvs.report.findings import Card, errors_against
-from aqualvs.report.frames import Picture
+from aqualvs.report.frames import SampleFrame
 from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import LaserFacts, Track, facts
 from aqualvs.scanning.scan import Label
@@ -184,7 +184,7 @@ def cloud_view(points: PointSummary | None, planes_known: bool) -> str:
 
 def picture_view(
     captions: Mapping[int, tuple[str, str, bool]],
-    pictures: Mapping[int, Picture],
+    pictures: Mapping[int, SampleFrame],
     missing: str,
     names: list[str],
 ) -> str:
@@ -309,7 +309,7 @@ def _label_legend() -> str:
     return f'<ul class="legend">{items}</ul>'
 
 
-def _image(picture: Picture | None, missing: str, heading: str) -> str:
+def _image(picture: SampleFrame | None, missing: str, heading: str) -> str:
     if picture is None:
         return f'<div class="missing">{escape(missing)}</div>'
     width, height = picture.size_px

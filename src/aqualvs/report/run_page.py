@@ -17,7 +17,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report import charts, html
 from aqualvs.report.findings import headline, warnings_of
 from aqualvs.report.frames import (
-    Picture,
+    SampleFrame,
     choose_pictures,
     choose_samples,
     decode_frames,
@@ -78,7 +78,7 @@ class Material:
     lasers: list[LaserFacts]
     picture_rows: list[int]
     sample_rows: list[int]
-    pictures: dict[int, Picture]
+    pictures: dict[int, SampleFrame]
     no_pictures: str
     net: NetTables | None
     warnings: list[str]
@@ -196,7 +196,7 @@ def _pictures(
     decoded: "Future[dict[int, ImagePlane]]",
     track: Track,
     points: PointSummary | None,
-) -> tuple[dict[int, Picture], str]:
+) -> tuple[dict[int, SampleFrame], str]:
     if isinstance(source, str):
         return {}, source
     try:

@@ -26,7 +26,13 @@ from aqualvs.sources.image_messages import (
     kind_of_schema,
 )
 from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, decompressed
-from aqualvs.sources.message_source import MAX_BYTES, Logged, MessageSource, Topic, choose_topic
+from aqualvs.sources.message_source import (
+    MAX_BYTES,
+    ImageTopic,
+    Logged,
+    MessageSource,
+    choose_topic,
+)
 from aqualvs.special_files import refuse_special
 
 # Disk space to keep free where bags compressed as whole files are unpacked.
@@ -77,13 +83,13 @@ def open_bag(path: Path, topic: str | None = None) -> MessageSource:
     return MessageSource(f"{path}#{chosen.name}", messages, chosen.n_messages)
 
 
-def _image_topics(path: Path) -> list[Topic]:
+def _image_topics(path: Path) -> list[ImageTopic]:
     counts: dict[str, int] = {}
     with _opened(path) as reader:
         for connection in reader.connections:
             if kind_of_schema(connection.msgtype):
                 counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    return [Topic(name, n) for name, n in counts.items()]
+    return [ImageTopic(name, n) for name, n in counts.items()]
 
 
 def _messages(path: Path, topic: str) -> Iterator[Logged]:
@@ -213,27 +219,27 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     return MessageSource(f"{path}#{chosen.name}", messages, chosen.n_messages)
 
 
-def _mcap_image_topics(path: Path) -> list[Topic]:
+def _mcap_image_topics(path: Path) -> list[ImageTopic]:
     with _opened_mcap(path) as stream:
         summary = _summary(stream)
         if summary is None:
             return _listed(path, stream)
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return [
-            Topic(channel.topic, counts.get(channel.id))
+            ImageTopic(channel.topic, counts.get(channel.id))
             for channel in summary.channels.values()
             if channel.schema_id in summary.schemas
             and kind_of_schema(summary.schemas[channel.schema_id].name)
         ]
 
 
-def _listed(path: Path, stream: "_Bounded") -> list[Topic]:
+def _listed(path: Path, stream: "_Bounded") -> list[ImageTopic]:
     """Find the topics of a file without index by reading it to its end, or as far as it goes."""
-    found: dict[str, Topic] = {}
+    found: dict[str, ImageTopic] = {}
     try:
         for schema, channel, _ in _read(path, stream, None):
             if schema is not None and kind_of_schema(schema.name):
-                found[channel.topic] = Topic(channel.topic, None)
+                found[channel.topic] = ImageTopic(channel.topic, None)
     except SourceError:
         if not found:
             raise

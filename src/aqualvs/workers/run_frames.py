@@ -18,7 +18,7 @@ from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.workers.frame_results import (
-    Measured,
+    FrameResult,
     Meter,
     ScansFrames,
     in_blocks,
@@ -100,14 +100,14 @@ class RunMeasuring(Closing):
     ) -> None:
         self._source, self._rig, self._window = source, rig, window
         self._crew = None if work is None else Crew(work, n_processes)
-        self._head: list[Measured] | None = None
-        self._shared: Iterator[list[Measured]] = iter(())
+        self._head: list[FrameResult] | None = None
+        self._shared: Iterator[list[FrameResult]] = iter(())
         self._frames: Iterator[Frame] = iter(())
         self._stack = ExitStack()
 
     def blocks(
         self, scanner: ScansFrames, *, one_by_one: bool
-    ) -> Generator[list[Measured], None, None]:
+    ) -> Generator[list[FrameResult], None, None]:
         """Yield the results, in the order of the dive; to be closed before the source is.
 
         Parameters

@@ -23,7 +23,7 @@ WRONG_PERCENT = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class FrameAnswers:
     """Answers against the truth of N frames, of one dive or of many.
 
     Attributes
@@ -51,7 +51,7 @@ class Frames:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class ErrorSpread:
     """Absolute errors in few numbers; NaN without any."""
 
     rms: float
@@ -71,7 +71,7 @@ class Score:
         answer.
     available_percent : float
         Share of the last two; NaN where nothing is measurable.
-    range_percent, pitch_deg, yaw_deg : Spread
+    range_percent, pitch_deg, yaw_deg : ErrorSpread
         Errors of the answers in measurable frames.
     n_wrong : int
         Answers off by more than `WRONG_PERCENT` of the range in frames with any visible point.
@@ -88,9 +88,9 @@ class Score:
     n_measurable: int
     n_available: int
     available_percent: float
-    range_percent: Spread
-    pitch_deg: Spread
-    yaw_deg: Spread
+    range_percent: ErrorSpread
+    pitch_deg: ErrorSpread
+    yaw_deg: ErrorSpread
     n_wrong: int
     n_empty: int
     n_false: int
@@ -102,7 +102,7 @@ class Score:
     sigma_yaw_deg: float
 
 
-def compare(truth: DiveTruth, answers: Answers) -> Frames:
+def compare(truth: DiveTruth, answers: Answers) -> FrameAnswers:
     """Hold the answers to a dive against its truth."""
     shown = np.where(answers.valid[:, None], answers.posture, np.nan)
     error = shown - truth.posture
@@ -110,12 +110,12 @@ def compare(truth: DiveTruth, answers: Answers) -> Frames:
     error[:, 0] *= scale
     sigma = np.where(answers.valid[:, None], answers.sigma, np.nan)
     sigma[:, 0] *= scale
-    return Frames(answers.valid, truth.n_visible.astype(np.float64), error, sigma)
+    return FrameAnswers(answers.valid, truth.n_visible.astype(np.float64), error, sigma)
 
 
-def pooled(parts: Sequence[Frames]) -> Frames:
+def pooled(parts: Sequence[FrameAnswers]) -> FrameAnswers:
     """Return the frames of several dives as one."""
-    return Frames(
+    return FrameAnswers(
         np.concatenate([part.valid for part in parts]),
         np.concatenate([part.n_visible for part in parts]),
         np.concatenate([part.error for part in parts]),
@@ -123,7 +123,7 @@ def pooled(parts: Sequence[Frames]) -> Frames:
     )
 
 
-def score(frames: Frames) -> Score:
+def score(frames: FrameAnswers) -> Score:
     """Return the score of some frames."""
     measurable, empty = frames.measurable, frames.n_visible == 0
     n_measurable, n_available = int(measurable.sum()), int((measurable & frames.valid).sum())
@@ -151,12 +151,12 @@ def score(frames: Frames) -> Score:
     )
 
 
-def bars_against(frames: Frames, clear: Frames) -> FloatArray:
+def bars_against(frames: FrameAnswers, clear: FrameAnswers) -> FloatArray:
     """Return how much longer error bars are than those of the same frames in clear water.
 
     Parameters
     ----------
-    frames, clear : Frames
+    frames, clear : FrameAnswers
         Frame by frame the same course before the same target.
 
     Returns
@@ -170,12 +170,12 @@ def bars_against(frames: Frames, clear: Frames) -> FloatArray:
         return np.where(both[:, None], frames.sigma / clear.sigma, np.nan)
 
 
-def _spread(errors: FloatArray) -> Spread:
+def _spread(errors: FloatArray) -> ErrorSpread:
     sizes = np.abs(errors[np.isfinite(errors)])
     if not len(sizes):
-        return Spread(np.nan, np.nan, np.nan, np.nan)
+        return ErrorSpread(np.nan, np.nan, np.nan, np.nan)
     rms = float(np.sqrt(np.mean(sizes**2)))
-    return Spread(
+    return ErrorSpread(
         rms, float(np.median(sizes)), float(np.percentile(sizes, 95.0)), float(sizes.max())
     )
 
@@ -272,7 +272,7 @@ def score_systems(benchmark: BenchmarkSet, systems: Sequence[System]) -> Scores:
     return Scores(benchmark.title, tuple(entries), tuple(bars))
 
 
-def _bars(system: str, level: str, names: list[str], frames: dict[str, Frames]) -> list[Bars]:
+def _bars(system: str, level: str, names: list[str], frames: dict[str, FrameAnswers]) -> list[Bars]:
     """Compare dives with their clear twins; empty without twins or without claimed sigmas."""
     found = []
     for name in names:
