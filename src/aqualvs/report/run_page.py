@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plotly.offline import get_plotlyjs
-
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report import charts, html
@@ -276,7 +274,7 @@ def _machinery(m: Material) -> dict[str, str]:
     """Return style, scripts and the numbers that they draw."""
     return {
         "css": html.asset("report.css"),
-        "plotly": get_plotlyjs(),
+        "plotly": html.asset("plotly-gl3d.min.js"),
         "script": html.asset("report.js"),
         "data": html.embedded_json(_data(m)),
     }
