@@ -24,7 +24,6 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.results.files import replace_text
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.paper.detector import ThresholdOptions
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.sources import FrameSource
@@ -285,6 +284,8 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
     mesh_filter : {"none", "paper"}
     fit : {"robust", "pseudo_inverse"}
     """
+    from aqualvs.scanning.paper.detector import ThresholdOptions
+
     facts = target_facts(target)
     return ScannerOptions(
         target=facts.kind,
@@ -297,8 +298,8 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
 def scanner_facts(options: ScannerOptions) -> dict[str, Any]:
     """Return the scanner's options as `run.yaml` holds them."""
     found: dict[str, Any] = asdict(options)
-    threshold = isinstance(options.detector, ThresholdOptions)
-    found["detector"] = {"kind": "threshold" if threshold else "ridge", **found["detector"]}
+    ridge = isinstance(options.detector, StripeOptions)
+    found["detector"] = {"kind": "ridge" if ridge else "threshold", **found["detector"]}
     found["target"] = options.target.value
     found["fit"] = options.fit.value
     return found
