@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from aqualvs.control.gains_file import NotNegative, Number, Part, Positive, parse_settings
+from aqualvs.control.gains_file import parse_settings
 from aqualvs.design.settings import (
     Design,
     Goals,
@@ -27,6 +27,7 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, StrictPart
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.plane_fit import SharedError
 from aqualvs.yamlfile import parse_yaml, read_yaml
@@ -68,7 +69,7 @@ _Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
 _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
 
 
-class CameraDesign(Part):
+class CameraDesign(StrictPart):
     """Schema of `camera`: size and field of view, or a rig file with its intrinsics."""
 
     width_px: _Pixels | None = None
@@ -78,7 +79,7 @@ class CameraDesign(Part):
     rig: str | None = None
 
 
-class DomeDesign(Part):
+class DomeDesign(StrictPart):
     """Schema of `dome`."""
 
     inner_radius_mm: _Length
@@ -86,14 +87,14 @@ class DomeDesign(Part):
     n_acrylic: _Index = 1.49
 
 
-class LensDesign(Part):
+class LensDesign(StrictPart):
     """Schema of `lens`: nominal projection centre, and its tolerance."""
 
     position_mm: _Triple = Field(default=[0.0, 0.0, 0.0])
     centring_mm: NotNegative = 1.0
 
 
-class WaterDesign(Part):
+class WaterDesign(StrictPart):
     """Schema of `water`: its index, or the values to compute it from."""
 
     n: _Index | None = None
@@ -101,7 +102,7 @@ class WaterDesign(Part):
     salinity_permille: Number | None = None
 
 
-class LasersDesign(Part):
+class LasersDesign(StrictPart):
     """Schema of `lasers`, evenly round the dome."""
 
     count: Annotated[int, Field(ge=1, le=8)] = 3
@@ -111,7 +112,7 @@ class LasersDesign(Part):
     turn_stripes: bool = False
 
 
-class MountPart(Part):
+class MountPart(StrictPart):
     """Schema of one of `mounts`; missing angles are optimised."""
 
     name: str
@@ -121,14 +122,14 @@ class MountPart(Part):
     fan_deg: _Fan = FAN_DEG
 
 
-class NetPart(Part):
+class NetPart(StrictPart):
     """Schema of `net`."""
 
     bar_mm: _Length = 15.0
     twine_mm: _Length = 2.5
 
 
-class NoisePart(Part):
+class NoisePart(StrictPart):
     """Schema of `noise`: one sigma, see docs/hardware.md."""
 
     point_px: Positive = Noise().point
@@ -139,7 +140,7 @@ class NoisePart(Part):
     net_tilt_px: NotNegative = Noise().net.tilt_px
 
 
-class TolerancesPart(Part):
+class TolerancesPart(StrictPart):
     """Schema of `tolerances`: one sigma of the errors after calibration."""
 
     lens_mm: NotNegative = 0.03
@@ -151,14 +152,14 @@ class TolerancesPart(Part):
     laser_mm: NotNegative = 0.07
 
 
-class GoalsPart(Part):
+class GoalsPart(StrictPart):
     """Schema of `goals`."""
 
     range_percent: Positive = 0.5
     angle_deg: Positive = 0.5
 
 
-class DesignFile(Part):
+class DesignFile(StrictPart):
     """Schema of a whole design file."""
 
     aqualvs_design: int
