@@ -27,7 +27,7 @@ from aqualvs.report.calibration_page import (
     page_html,
     write_page,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 
 NASTY = "<script>alert(1)</script>&\"'<!-- $title ${css} 水"
 NAN = float("nan")

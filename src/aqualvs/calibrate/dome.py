@@ -8,6 +8,8 @@ from aqualvs.calibrate.common import (
     Found,
     Tell,
     check_same_size,
+    corner_residuals,
+    corner_rows,
     find_targets,
     finish,
     medium_index,
@@ -35,14 +37,11 @@ from aqualvs.optics.solved import (
 )
 from aqualvs.report.calibration_material import (
     CalibrationPage,
-    ViewRow,
     expectations,
     facts,
-    missed_rows,
     parameter_rows,
-    residual_map,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,22 +237,8 @@ def _page(
             [*POSE_PARAMETERS, *dome_names, *rig.lens.parameter_names],
             before,
         ),
-        residual_maps=(
-            residual_map(
-                "Corners of all views",
-                rig.size_px,
-                [fit.view for fit in result.views],
-                [fit.residuals for fit in result.views],
-                [fit.inliers for fit in result.views],
-            ),
-        ),
-        views=(
-            *(
-                ViewRow(name=fit.label, n_points=len(fit.view), rms_px=fit.rms_px)
-                for fit in result.views
-            ),
-            *missed_rows({**missed, **result.left_out}),
-        ),
+        residual_maps=(corner_residuals(result.views, rig.size_px),),
+        views=corner_rows(result.views, {**missed, **result.left_out}),
         facts=facts(
             ("rig before", str(request.rig)),
             ("board", str(request.board)),

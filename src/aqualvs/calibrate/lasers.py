@@ -61,7 +61,7 @@ from aqualvs.report.calibration_material import (
     parameter_rows,
     residual_map,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
 from aqualvs.text import laser_colour
 

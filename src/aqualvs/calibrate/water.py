@@ -31,7 +31,7 @@ from aqualvs.report.calibration_material import (
     expectations,
     facts,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.results.run_request import check_fits
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource

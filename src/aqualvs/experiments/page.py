@@ -15,7 +15,6 @@ embedded, and link to the files beside the page. The folder holds
 ==================  ========================================================================
 """
 
-import base64
 import csv
 import hashlib
 import json
@@ -44,7 +43,7 @@ from aqualvs.experiments.experiment import (
 )
 from aqualvs.report import html
 from aqualvs.report.figure_style import STYLE
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.results.files import writing
 
 RESULTS, TIMES, FIGURES, SERIES, WORK = "results.json", "times.json", "figures", "series", "work"
@@ -307,20 +306,22 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
         If a figure cannot be read.
     """
     return html.page(
+        "reproduce.html",
         {
-            "version": html.text(__version__),
+            "title": "The paper’s experiments, beside ours",
+            "version": __version__,
             "doi": DOI,
+            "results": RESULTS,
+        },
+        {
             "cards": html.cards(_cards(records, seconds)),
-            "notice": _notice(records),
+            "warnings": _notice(records),
             "bars": _bars(records),
             "contents": _contents(records),
             "sections": "\n".join(
                 _section(record, seconds.get(record.name), folder) for record in records
             ),
-            "results": RESULTS,
-            "css": html.asset("report.css") + html.asset("reproduce.css"),
         },
-        "reproduce.html",
     )
 
 
@@ -446,10 +447,9 @@ def _figure(picture: PrintedFigure, folder: Path) -> str:
     )
     caption = escape(picture.caption)
     width = f'style="max-width: {_PX_PER_INCH * picture.width_in:.0f}px"'
-    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     return (
-        f'<figure><img {width} src="{source}" alt="{caption}"><figcaption>{caption} '
-        f'<span class="files">{files}</span></figcaption></figure>'
+        f'<figure><img {width} src="{html.data_url(data, kind)}" alt="{caption}">'
+        f'<figcaption>{caption} <span class="files">{files}</span></figcaption></figure>'
     )
 
 

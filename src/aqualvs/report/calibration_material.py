@@ -22,7 +22,7 @@ from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.expected_error import expected_posture_errors
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty
 from aqualvs.optics.solved import completed_uncertainty
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.scanning.scan import ImagePlane
 
 MarkKind: TypeAlias = Literal["cross", "dot", "circle"]

@@ -307,17 +307,15 @@ def write_page(page: CalibrationPage, path: Path) -> Path:
 def page_html(page: CalibrationPage) -> str:
     """Return the report of a calibration as HTML."""
     return html.page(
+        "calibration.html",
+        {"title": page.title, "subtitle": page.subtitle},
         {
-            "title": html.text(page.title),
-            "subtitle": html.text(page.subtitle),
             "summary": _summary(page),
             "sections": "\n".join(
                 f'<section id="{name}">\n<h2>{heading}</h2>\n{body}\n</section>'
                 for name, heading, body in _sections(page)
             ),
-            "css": html.asset("report.css") + html.asset("calibration.css"),
         },
-        "calibration.html",
     )
 
 

@@ -1,7 +1,6 @@
 """Headline numbers and warnings of a run's report, in plain words."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report.charts import stretch_end_s, stretch_words, stretches
 from aqualvs.report.frames import SampleFrame
+from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import Track
 from aqualvs.text import clock, signed
@@ -18,15 +18,6 @@ _FEW_POINTS = 60
 _LOOSE = 0.02
 _WATER_STEP = 5e-4
 _MOST_GAPS = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Card:
-    """One number of the headline: its name, the number, and a line below it."""
-
-    name: str
-    value: str
-    note: str
 
 
 def headline(track: Track) -> list[Card]:
