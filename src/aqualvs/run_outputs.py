@@ -50,7 +50,7 @@ from aqualvs.sources import FrameSource
 from aqualvs.sources.base import bgr_of
 from aqualvs.terminal import StopSignals, Tick
 from aqualvs.workers.frame_results import FrameResult, ScansFrames
-from aqualvs.workers.replay import Replay
+from aqualvs.workers.run_frames import Replay
 from aqualvs.workers.water_index import WaterFollowingScanner
 
 if TYPE_CHECKING:

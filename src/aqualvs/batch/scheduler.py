@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 from aqualvs.batch.cluster import FinishedTask, Workers, WorkersLostError
 from aqualvs.batch.dataset import drop_dive, holds_net, put_net, read_seal, scratch, seal, sealed
+from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.merge import PieceLostError, finished_dive, join_dive
 from aqualvs.batch.parts import PieceResult, measure_piece
-from aqualvs.batch.records import DiveRecord, DiveState
 from aqualvs.batch.work import DiveProbe, DiveWork, content_digest, digest, survey
 from aqualvs.errors import AqualvsError
 from aqualvs.net_survey.command import StoredDive

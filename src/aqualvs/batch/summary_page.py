@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from aqualvs import __version__
-from aqualvs.batch.records import DiveRecord, DiveState
+from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.errors import OutputError
 from aqualvs.report import html
 from aqualvs.report.html import Card

@@ -27,7 +27,7 @@ from aqualvs.sources.images import ImageSource, images_in
 from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
 from aqualvs.sources.video import VideoSource
 from aqualvs.workers.frame_results import ScansFrames
-from aqualvs.workers.replay import Replay, replay_of
+from aqualvs.workers.run_frames import Replay, replay_of
 
 PIECE_FRAMES = 1500
 """Frames that a piece has at least: a minute of video, seconds of work."""
