@@ -21,10 +21,10 @@ from typing import Any
 
 import av
 
-from aqualvs.batch.cluster import DaskWorkers, Outcome
+from aqualvs.batch.cluster import DaskWorkers, FinishedTask
 from aqualvs.batch.parts import PieceResult
 from aqualvs.batch.scheduler import Season, Steps
-from aqualvs.batch.work import PIECE_FRAMES, DiveWork, Survey
+from aqualvs.batch.work import PIECE_FRAMES, DiveProbe, DiveWork
 from aqualvs.demo import bundled_dive
 from aqualvs.results.run_request import RunRequest
 from aqualvs.sources.spans import Span, SpanKind
@@ -64,19 +64,19 @@ class SimulatedWorkers:
         self._number += 1
         heappush(self._under_way, (ends, self._number, token, function(*arguments)))
 
-    def next_done(self, timeout_s: float) -> Outcome | None:  # noqa: ARG002
+    def next_done(self, timeout_s: float) -> FinishedTask | None:  # noqa: ARG002
         if not self._under_way:
             return None
         self.now, _, token, value = heappop(self._under_way)
-        return Outcome(token, value=value)
+        return FinishedTask(token, value=value)
 
 
-def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
+def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
     spans = tuple(
         Span(kind=SpanKind.VIDEO, first=i * PIECE_FRAMES, stop=(i + 1) * PIECE_FRAMES, n_bytes=1)
         for i in range(_PIECES_A_DIVE)
     )
-    survey = Survey(
+    survey = DiveProbe(
         source_key=work.name,
         result_key="",
         spans=spans,
@@ -88,11 +88,11 @@ def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
     return survey, None
 
 
-def measure(_work: DiveWork, _survey: Survey, number: int) -> PieceResult:
+def measure(_work: DiveWork, _survey: DiveProbe, number: int) -> PieceResult:
     return PieceResult(number=number, n_frames=1, n_valid=1, duration_s=0.0, fault="")
 
 
-def join(_work: DiveWork, _survey: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
+def join(_work: DiveWork, _survey: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     return {"fault": "", "n_frames": len(results)}
 
 

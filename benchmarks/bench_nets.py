@@ -25,7 +25,7 @@ from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
-from aqualvs.simulation.scene import Label, Scene
+from aqualvs.simulation.scene import Scene, SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 
 _DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")
@@ -72,7 +72,7 @@ def shoot(scene: Scene, index: int) -> tuple[Frame, FloatArray]:
     """Return the frame, and normal and offset of the plane through the net's visible light."""
     picture = Renderer(example_rig()).render(scene, 0.0, np.random.default_rng([7, index]))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    seen = visible_fit(picture.lit, Label.NET)
+    seen = visible_fit(picture.lit, SurfaceKind.NET)
     plane = scene.target_plane() if seen is None else seen[0]
     return Frame(index, 0.0, luma, chroma), np.append(plane.normal, plane.offset)
 

@@ -116,7 +116,7 @@ def start_rows(rounds: int, *, with_imports: bool) -> list[dict[str, Any]]:
         "aqualvs.optics": "numpy, numba",
         "aqualvs.scanner": "numpy, numba, cv2",
         "aqualvs.pipeline": "numpy, numba, cv2, av, pydantic, yaml",
-        "aqualvs.run_outputs": "numpy, numba, cv2, av, pydantic, yaml, pyarrow, plotly.offline",
+        "aqualvs.run_outputs": "numpy, numba, cv2, av, pydantic, yaml, pyarrow",
     }
     found = [
         start_row("aqualvs --help", ["-m", "aqualvs", "--help"], ["-c", _PLAIN_HELP], rounds),

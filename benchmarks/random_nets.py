@@ -23,7 +23,7 @@ from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
-from aqualvs.simulation.scene import Label
+from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 
 DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")
@@ -59,7 +59,7 @@ def _render(renderer: Renderer, index: int) -> tuple[FloatArray, ...]:
     scene = random_scene(np.random.default_rng([2023, index]), DIFFICULTIES[index % 3])
     picture = renderer.render(scene, 0.0, np.random.default_rng([7, index]))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    seen = visible_fit(picture.lit, Label.NET)
+    seen = visible_fit(picture.lit, SurfaceKind.NET)
     plane = np.full(4, np.nan) if seen is None else np.append(seen[0].normal, seen[0].offset)
     return luma, *chroma, plane
 

@@ -71,7 +71,7 @@ def test_every_package_has_its_layer() -> None:
 
 def test_help_needs_no_numerical_package() -> None:
     """`aqualvs --help` must answer at once."""
-    heavy = ("numpy", "numba", "cv2", "scipy", "pyarrow", "plotly", "av")
+    heavy = ("numpy", "numba", "cv2", "scipy", "pyarrow", "av")
     code = f"import sys, aqualvs.cli.main; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True

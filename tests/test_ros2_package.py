@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from aqualvs.live.outputs.dds import dds_types
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, to_ros2
-from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
+from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import State
 from live_cases import demo_samples
@@ -169,22 +169,22 @@ def test_messages_are_those_of_dds(make: Callable[..., Any], sample: LiveSample)
     output = make(node)
     output.send(sample)
     dds = dds_types("jazzy")
-    for topic, message in MessageMaker(RosOptions()).messages(sample, set(Topic)):
-        name = "/diagnostics" if topic is Topic.DIAGNOSTICS else f"~/{topic}"
+    for topic, message in MessageMaker(RosOptions()).messages(sample, set(PublishedTopic)):
+        name = "/diagnostics" if topic is PublishedTopic.DIAGNOSTICS else f"~/{topic}"
         (published,) = node.publishers[name].published
         expected = to_ros2(dds, message).serialize(use_version_2=False)
         assert serialized(published, topic) == expected
     assert output.health().state is State.OK
 
 
-def serialized(message: Any, topic: Topic) -> bytes:
+def serialized(message: Any, topic: PublishedTopic) -> bytes:
     """Bytes of a message, after the kinds of values that rclpy insists on were put in order."""
-    if topic is Topic.CLOUD:
+    if topic is PublishedTopic.CLOUD:
         assert isinstance(message.data, array.array)
         message.data = np.array(message.data, np.uint8)
-    if topic is Topic.POSTURE:
+    if topic is PublishedTopic.POSTURE:
         message.pose.covariance = np.array(message.pose.covariance)
-    if topic is Topic.DIAGNOSTICS:
+    if topic is PublishedTopic.DIAGNOSTICS:
         for status in message.status:
             assert isinstance(status.level, bytes)
             status.level = status.level[0]

@@ -14,11 +14,11 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning import posture_estimator
 from aqualvs.scanning.laser_bands import SearchAxis
-from aqualvs.scanning.paper.detector import ThresholdOptions
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
+from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import returns_of

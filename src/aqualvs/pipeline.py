@@ -21,8 +21,7 @@ from aqualvs.sources import FrameSource, open_source
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import ScansFrames
 from aqualvs.workers.pool import CrewWork, crew_work
-from aqualvs.workers.replay import Replay, replay_of
-from aqualvs.workers.run_frames import RunMeasuring
+from aqualvs.workers.run_frames import Replay, RunMeasuring, replay_of
 from aqualvs.workers.water_index import WaterFollowingScanner
 
 ScannerFor = Callable[[Rig, ScannerOptions], ScansFrames]

@@ -49,8 +49,8 @@ from aqualvs.scanning.stripe import Returns
 from aqualvs.sources import FrameSource
 from aqualvs.sources.base import bgr_of
 from aqualvs.terminal import StopSignals, Tick
-from aqualvs.workers.frame_results import Measured, ScansFrames
-from aqualvs.workers.replay import Replay
+from aqualvs.workers.frame_results import FrameResult, ScansFrames
+from aqualvs.workers.run_frames import Replay
 from aqualvs.workers.water_index import WaterFollowingScanner
 
 if TYPE_CHECKING:
@@ -286,7 +286,7 @@ class RunBareLens(Closing):
             with writing(self._path):
                 self._file = PostureCsv(self._path)
 
-    def write(self, *found: Measured) -> None:
+    def write(self, *found: FrameResult) -> None:
         """Append the rows of frames."""
         if self._file is None:
             return
@@ -340,7 +340,7 @@ class RunWriters:
         """Return the scanner to measure with, which records its results if requested."""
         return self._mcap.recorded(scanner)
 
-    def write(self, *found: Measured) -> None:
+    def write(self, *found: FrameResult) -> None:
         """Write the results of frames, and scans of lost ones, in their order."""
         self._outputs.write(*(measured.scan for measured in found))
         self._bare_lens.write(*found)
@@ -394,7 +394,7 @@ def writers(
 
 
 def write_all(
-    blocks: Iterable[list[Measured]], writers: RunWriters, stop: StopSignals, tick: Tick
+    blocks: Iterable[list[FrameResult]], writers: RunWriters, stop: StopSignals, tick: Tick
 ) -> None:
     """Write all results until they end, or a signal stops the run."""
     for block in blocks:

@@ -1,6 +1,7 @@
 """The main path: a frame in, posture and points out."""
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,8 +16,6 @@ from aqualvs.scanning.candidates import Chunks, Readings, read_returns
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_readings
 from aqualvs.scanning.laser_bands import SearchAxis, plan_searches, searched_range
-from aqualvs.scanning.paper.detector import PaperFilter, ThresholdOptions
-from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.patch import fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureMeter
@@ -31,6 +30,10 @@ from aqualvs.scanning.surfaces import (
 )
 from aqualvs.scanning.target import TargetKind, choose_target, read_as_wanted
 from aqualvs.scanning.triangulate import Triangulator
+
+if TYPE_CHECKING:
+    from aqualvs.scanning.paper.detector import PaperFilter
+    from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +54,7 @@ class ScannerOptions:
     """
 
     detector: DetectorOptions = field(default_factory=StripeOptions)
-    mesh_filter: MeshFilterOptions | None = None
+    mesh_filter: "MeshFilterOptions | None" = None
     target: TargetKind = TargetKind.AUTO
     fit: FitMethod = FitMethod.ROBUST
 
@@ -139,11 +142,14 @@ class Scanner:
         posture = self._with_rig_covariance(found, readings)
         return Scan(index, time_s, posture, points, self.rig.n_water)
 
-    def _make_paper_filter(self, camera: Camera) -> PaperFilter | None:
+    def _make_paper_filter(self, camera: Camera) -> "PaperFilter | None":
         options = self.options.mesh_filter
         if options is None:
             return None
-        every_pixel = isinstance(self.options.detector, ThresholdOptions)
+        # Only for comparisons with the paper.
+        from aqualvs.scanning.paper.detector import PaperFilter
+
+        every_pixel = not isinstance(self.options.detector, StripeOptions)
         return PaperFilter(self.rig, camera, self._searches, options, every_pixel=every_pixel)
 
     def _measured(self, readings: Readings) -> tuple[Measurement, ScanPoints, IntArray]:
@@ -228,7 +234,7 @@ class Scanner:
         return read_as_wanted([rival, *kept], self.options.target)
 
 
-def _on_mesh(paper_filter: PaperFilter, points: ScanPoints) -> BoolArray:
+def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
     laser = points.laser.astype(np.int64)
     return paper_filter.apply(points.pixels, points.width, laser).returns_on_mesh(len(points))
 

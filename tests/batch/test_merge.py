@@ -6,7 +6,7 @@ import yaml
 
 from aqualvs.batch.cluster import WorkersLostError
 from aqualvs.batch.dataset import holds_dive, read_seal
-from aqualvs.batch.records import DiveState
+from aqualvs.batch.dives import DiveState
 from aqualvs.batch.scheduler import Season, look
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.pipeline import run

@@ -8,7 +8,7 @@ from pyarrow import dataset as arrow_dataset
 from pyarrow import parquet
 
 from aqualvs.batch.dataset import drop_dive, holds_dive, put_dive, write_dives
-from aqualvs.batch.records import DiveRecord, DiveState
+from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.summary_page import range_steps, range_svg, write_summary
 from aqualvs.results.folder import PostureCsv
 from aqualvs.results.points import PointsJournal, export_points

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from pyarrow import dataset as arrow_dataset
 
-from aqualvs.batch.records import DiveState
+from aqualvs.batch.dives import DiveState
 from aqualvs.batch.scheduler import Season, known_net
 from aqualvs.batch.summary_page import write_summary
 from aqualvs.batch.work import survey

@@ -8,7 +8,7 @@ import pytest
 
 from aqualvs.calibrate.board import BoardRequest, print_board
 from aqualvs.calibration.detection.detection import detect_board, detect_markers
-from aqualvs.calibration.targets.printed import Page, Text, pdf_bytes
+from aqualvs.calibration.targets.printed import PdfPage, Text, pdf_bytes
 from aqualvs.calibration.targets.target_files import load_board, load_box, load_target
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, OptionError, OutputError
@@ -190,7 +190,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_words_are_escaped_and_bytes_repeat():
-    page = Page(100.0, 50.0, np.array([[1.0, 2.0, 3.0, 4.0]]), (Text(1, 2, 3, r"a (b) \ 5 µm"),))
+    page = PdfPage(100.0, 50.0, np.array([[1.0, 2.0, 3.0, 4.0]]), (Text(1, 2, 3, r"a (b) \ 5 µm"),))
     data = pdf_bytes([page], "t")
     assert rb"(a \(b\) \\ 5 " + "µ".encode("cp1252") + b"m) Tj" in data
     assert data == pdf_bytes([page], "t")

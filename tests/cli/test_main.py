@@ -19,7 +19,7 @@ from aqualvs.errors import AqualvsError
 from shell_cases import rig_file
 
 COMMANDS = ("run", "simulate", "demo", "check", "report", "board")
-HEAVY = {"numpy", "numba", "cv2", "av", "pydantic", "pyarrow", "plotly", "scipy", "rich", "yaml"}
+HEAVY = {"numpy", "numba", "cv2", "av", "pydantic", "pyarrow", "scipy", "rich", "yaml"}
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["--version"]])

@@ -11,7 +11,7 @@ from aqualvs.control.autopilot import Decision
 from aqualvs.control.coverage import Across, Coverage, CoverageMap, CoverageOptions
 from aqualvs.control.follow_log import FOLLOW_COLUMNS, FollowLog
 from aqualvs.control.missions import Guidance, Stage
-from aqualvs.control.safety import Reason
+from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.scanning.posture import Reason as NoPosture
@@ -19,7 +19,7 @@ from aqualvs.scanning.posture import Refusal
 from control_cases import FRAME_S, posture_at, state_at
 
 
-def decided(sway: float = 0.2, reason: Reason | None = None) -> Decision:
+def decided(sway: float = 0.2, reason: LimitReason | None = None) -> Decision:
     guidance = Guidance(setpoint=Setpoint(0.6, 0.1), sway=sway, stage=Stage.FOLLOWING)
     return Decision(Effort(forward=0.25, right=-0.5, yaw=0.125), reason, guidance, True)
 
@@ -110,7 +110,9 @@ def test_the_log_tells_posture_setpoint_errors_effort_and_reason(tmp_path: Path)
         state = state_at(2.0, depth=4.125, heading=math.radians(30.0), mode_name="ALT_HOLD")
         log.write(2.0, 1.5, posture_at(0.65, 0.2), decided(), state)
         lost = Refusal(NoPosture.NO_STRIPES)
-        log.write(2.04, 1.54, lost, decided(reason=Reason.NO_POSTURE), state_at(2.04, depth=None))
+        log.write(
+            2.04, 1.54, lost, decided(reason=LimitReason.NO_POSTURE), state_at(2.04, depth=None)
+        )
         # On disk at once, while the log is open.
         first, second = rows(path)
     assert tuple(first) == FOLLOW_COLUMNS

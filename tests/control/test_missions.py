@@ -22,7 +22,7 @@ from aqualvs.control.missions import (
     SurveyOptions,
     Turn,
 )
-from aqualvs.control.safety import Reason, SafetyGate
+from aqualvs.control.safety import LimitReason, SafetyGate
 from aqualvs.control.vehicle import NEUTRAL, Setpoint, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Reason as NoPosture
@@ -217,7 +217,7 @@ class Loop:
     def now(self) -> float:
         return self.plant.time
 
-    def engage(self) -> Reason | None:
+    def engage(self) -> LimitReason | None:
         return self.pilot.engage(self.now, state_at(self.now))
 
     def go(
@@ -241,7 +241,7 @@ def test_the_pilot_does_nothing_until_engaged_then_holds() -> None:
     loop = Loop(HoldMission(HOLD), distance=0.8)
     idle = loop.go(1.0)
     assert {(one.effort, one.reason, one.guidance.stage) for one in idle} == {
-        (NEUTRAL, Reason.NOT_ENGAGED, Stage.IDLE)
+        (NEUTRAL, LimitReason.NOT_ENGAGED, Stage.IDLE)
     }
     assert loop.engage() is None
     loop.go(12.0)
@@ -257,7 +257,7 @@ def test_neutral_within_a_fifth_of_a_second_without_a_posture() -> None:
     n_pushing = sum(one.effort != NEUTRAL for one in lost)
     assert n_pushing * FRAME_S <= 0.2
     assert all(one.effort == NEUTRAL for one in lost[n_pushing:])
-    assert {one.reason for one in lost[n_pushing:]} == {Reason.NO_POSTURE}
+    assert {one.reason for one in lost[n_pushing:]} == {LimitReason.NO_POSTURE}
     # It goes on by itself, and knows the current.
     loop.go(10.0)
     assert loop.plant.distance == pytest.approx(0.6, abs=0.02)
@@ -270,7 +270,7 @@ def test_it_gives_up_for_good_after_the_time_set() -> None:
     loop.go(3.0, there=False)
     assert not loop.pilot.engaged
     back = loop.go(3.0)
-    assert {(one.effort, one.reason) for one in back} == {(NEUTRAL, Reason.GAVE_UP)}
+    assert {(one.effort, one.reason) for one in back} == {(NEUTRAL, LimitReason.GAVE_UP)}
     assert loop.engage() is None
     assert loop.go(1.0)[-1].reason is None
 
@@ -285,11 +285,11 @@ def test_a_mission_that_is_over_holds_until_the_pilot_takes_over(mission: Missio
     loop = Loop(mission, current=(0.2, 0.0))
     loop.engage()
     last = loop.go(25.0)[-1]
-    assert (last.reason, last.engaged, last.guidance.sway) == (Reason.MISSION_OVER, True, 0.0)
+    assert (last.reason, last.engaged, last.guidance.sway) == (LimitReason.MISSION_OVER, True, 0.0)
     assert loop.plant.distance == pytest.approx(0.6, abs=0.01)
     assert last.effort.forward < -0.05
     touched = loop.go(FRAME_S, state=state_at(0.0, pilot_moves=True))[0]
-    assert (touched.effort, touched.reason) == (NEUTRAL, Reason.PILOT_STICKS)
+    assert (touched.effort, touched.reason) == (NEUTRAL, LimitReason.PILOT_STICKS)
     assert not touched.engaged
 
 
@@ -298,7 +298,7 @@ def test_the_pilots_stick_takes_over_at_once_and_for_good() -> None:
     loop.engage()
     loop.go(0.6)
     touched = loop.go(FRAME_S, state=state_at(0.0, pilot_moves=True))
-    assert (touched[0].effort, touched[0].reason) == (NEUTRAL, Reason.PILOT_STICKS)
+    assert (touched[0].effort, touched[0].reason) == (NEUTRAL, LimitReason.PILOT_STICKS)
     assert {one.effort for one in loop.go(5.0)} == {NEUTRAL}
     assert loop.engage() is None
     first = loop.go(FRAME_S)[0]
@@ -334,7 +334,7 @@ def test_no_setpoint_is_neutral() -> None:
     loop = Loop(mission)
     loop.engage()
     last = loop.go(1.0)[-1]
-    assert (last.effort, last.reason, last.engaged) == (NEUTRAL, Reason.NO_SETPOINT, True)
+    assert (last.effort, last.reason, last.engaged) == (NEUTRAL, LimitReason.NO_SETPOINT, True)
     mission.setpoint = Setpoint(0.7)
     loop.go(10.0)
     # In still water the thrusters' dead band leaves some millimetres.
@@ -349,7 +349,7 @@ def test_a_picture_that_stands_still_is_no_posture() -> None:
     for k in range(10):
         now = frozen + FRAME_S * k
         decision = loop.pilot.step(now, frozen, posture_at(0.8), None, state(now))
-    assert (decision.effort, decision.reason) == (NEUTRAL, Reason.NO_POSTURE)
+    assert (decision.effort, decision.reason) == (NEUTRAL, LimitReason.NO_POSTURE)
 
 
 def test_frame_times_that_jump_back_stop_one_step_and_start_anew() -> None:
@@ -358,7 +358,7 @@ def test_frame_times_that_jump_back_stop_one_step_and_start_anew() -> None:
     loop.go(1.0)
     now = loop.now
     jumped = loop.pilot.step(now, 0.0, posture_at(0.8), None, state_at(now))
-    assert (jumped.effort, jumped.reason) == (NEUTRAL, Reason.CLOCK)
+    assert (jumped.effort, jumped.reason) == (NEUTRAL, LimitReason.CLOCK)
     for k in range(1, 30):
         now = loop.now + FRAME_S * k
         seen = posture_at(0.8 + 1e-4 * (k % 2))
@@ -395,5 +395,5 @@ def test_it_stops_before_the_least_range_whatever_the_controller_wants() -> None
         plant.step(decision.effort)
         nearest = min(nearest, plant.distance)
         reasons.add(decision.reason)
-    assert {Reason.TOO_FAST} <= reasons
+    assert {LimitReason.TOO_FAST} <= reasons
     assert nearest > SafetyGate().limits.least_range - 0.05

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.control.safety import Reason, SafetyGate, SafetyLimits
+from aqualvs.control.safety import LimitReason, SafetyGate, SafetyLimits
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode
 from aqualvs.errors import OptionError
 from control_cases import posture_at, state_at
@@ -27,27 +27,27 @@ def test_a_sound_effort_passes_unchanged() -> None:
 
 def test_nothing_passes_before_engaging() -> None:
     found = SafetyGate().check(1.0, 0.0, posture_at(), state_at(1.0), ASKED)
-    assert found == (NEUTRAL, Reason.NOT_ENGAGED)
+    assert found == (NEUTRAL, LimitReason.NOT_ENGAGED)
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"pilot_moves": True}, Reason.PILOT_STICKS),
-        ({"mode": Mode.PILOT}, Reason.PILOT_MODE),
-        ({"mode": Mode.NO_STATION}, Reason.NO_STATION),
-        ({"mode": Mode.IGNORED}, Reason.IGNORED),
-        ({"mode": Mode.CONFLICT}, Reason.CONFLICT),
-        ({"mode": Mode.UNKNOWN}, Reason.UNKNOWN_MODE),
-        ({"armed": False}, Reason.DISARMED),
-        ({"heard_s": 98.9}, Reason.NO_HEARTBEAT),
-        ({"heard_s": -math.inf}, Reason.NO_HEARTBEAT),
-        ({"heard_s": math.nan}, Reason.NO_HEARTBEAT),
-        ({"heard_s": 200.0}, Reason.NO_HEARTBEAT),
+        ({"pilot_moves": True}, LimitReason.PILOT_STICKS),
+        ({"mode": Mode.PILOT}, LimitReason.PILOT_MODE),
+        ({"mode": Mode.NO_STATION}, LimitReason.NO_STATION),
+        ({"mode": Mode.IGNORED}, LimitReason.IGNORED),
+        ({"mode": Mode.CONFLICT}, LimitReason.CONFLICT),
+        ({"mode": Mode.UNKNOWN}, LimitReason.UNKNOWN_MODE),
+        ({"armed": False}, LimitReason.DISARMED),
+        ({"heard_s": 98.9}, LimitReason.NO_HEARTBEAT),
+        ({"heard_s": -math.inf}, LimitReason.NO_HEARTBEAT),
+        ({"heard_s": math.nan}, LimitReason.NO_HEARTBEAT),
+        ({"heard_s": 200.0}, LimitReason.NO_HEARTBEAT),
     ],
 )
 def test_the_vehicle_stops_us_until_engaged_again(
-    change: dict[str, object], reason: Reason
+    change: dict[str, object], reason: LimitReason
 ) -> None:
     gate = engaged()
     spoilt = state_at(100.0, **change)
@@ -64,7 +64,7 @@ def test_the_vehicle_stops_us_until_engaged_again(
 
 def test_a_rival_keeps_us_from_engaging_but_does_not_stop_us() -> None:
     gate = SafetyGate()
-    assert gate.engage(5.0, state_at(5.0, rival="two addresses")) is Reason.CONFLICT
+    assert gate.engage(5.0, state_at(5.0, rival="two addresses")) is LimitReason.CONFLICT
     assert gate.engage(5.0, state_at(5.0)) is None
     rival = state_at(5.1, rival="two addresses")
     assert gate.check(5.1, 0.0, posture_at(), rival, ASKED) == (ASKED, None)
@@ -72,9 +72,9 @@ def test_a_rival_keeps_us_from_engaging_but_does_not_stop_us() -> None:
 
 def test_engaging_is_refused_while_the_vehicle_is_not_ours() -> None:
     gate = SafetyGate()
-    assert gate.engage(5.0, state_at(5.0, armed=False)) is Reason.DISARMED
-    assert gate.engage(5.0, state_at(5.0, pilot_moves=True)) is Reason.PILOT_STICKS
-    assert gate.latched is Reason.NOT_ENGAGED
+    assert gate.engage(5.0, state_at(5.0, armed=False)) is LimitReason.DISARMED
+    assert gate.engage(5.0, state_at(5.0, pilot_moves=True)) is LimitReason.PILOT_STICKS
+    assert gate.latched is LimitReason.NOT_ENGAGED
     assert gate.check(5.0, 0.0, posture_at(), state_at(5.0), ASKED)[0] == NEUTRAL
 
 
@@ -85,7 +85,7 @@ def test_no_posture_is_neutral_within_the_time_and_not_for_good() -> None:
     young = gate.check(100.04, limits.posture_age - 0.01, posture_at(), state_at(100.04), ASKED)
     assert young == (ASKED, None)
     old = gate.check(100.08, limits.posture_age, posture_at(), state_at(100.08), ASKED)
-    assert old == (NEUTRAL, Reason.NO_POSTURE)
+    assert old == (NEUTRAL, LimitReason.NO_POSTURE)
     back = gate.check(100.12, 0.0, posture_at(), state_at(100.12), ASKED)
     assert back == (ASKED, None)
 
@@ -93,12 +93,12 @@ def test_no_posture_is_neutral_within_the_time_and_not_for_good() -> None:
 @pytest.mark.parametrize("age", [math.inf, math.nan, -0.1])
 def test_an_age_that_makes_no_sense_is_no_posture(age: float) -> None:
     found = engaged().check(100.0, age, posture_at(), state_at(100.0), ASKED)
-    assert found == (NEUTRAL, Reason.NO_POSTURE)
+    assert found == (NEUTRAL, LimitReason.NO_POSTURE)
 
 
 def test_never_a_posture_is_no_posture() -> None:
     found = engaged().check(100.0, 0.0, None, state_at(100.0), ASKED)
-    assert found == (NEUTRAL, Reason.NO_POSTURE)
+    assert found == (NEUTRAL, LimitReason.NO_POSTURE)
 
 
 @pytest.mark.parametrize("spoilt", ["forward", "right", "down", "yaw"])
@@ -106,30 +106,30 @@ def test_never_a_posture_is_no_posture() -> None:
 def test_efforts_that_are_no_numbers(spoilt: str, bad: float) -> None:
     effort = replace(ASKED, **{spoilt: bad})
     found = engaged().check(100.0, 0.0, posture_at(), state_at(100.0), effort)
-    assert found == (NEUTRAL, Reason.NOT_FINITE)
+    assert found == (NEUTRAL, LimitReason.NOT_FINITE)
 
 
 def test_postures_that_are_no_numbers() -> None:
     for posture in (posture_at(math.nan), posture_at(yaw=math.nan), posture_at(nearest=math.nan)):
         found = engaged().check(100.0, 0.0, posture, state_at(100.0), ASKED)
-        assert found == (NEUTRAL, Reason.NOT_FINITE)
+        assert found == (NEUTRAL, LimitReason.NOT_FINITE)
 
 
 def test_time_that_runs_backwards_stops_one_update() -> None:
     gate = engaged()
     gate.check(100.0, 0.0, posture_at(), state_at(100.0), ASKED)
     found = gate.check(90.0, 0.0, posture_at(), state_at(90.0), ASKED)
-    assert found == (NEUTRAL, Reason.CLOCK)
+    assert found == (NEUTRAL, LimitReason.CLOCK)
     assert gate.check(90.04, 0.0, posture_at(), state_at(90.04), ASKED) == (ASKED, None)
     found = gate.check(math.nan, 0.0, posture_at(), state_at(90.04), ASKED)
-    assert found == (NEUTRAL, Reason.CLOCK)
+    assert found == (NEUTRAL, LimitReason.CLOCK)
 
 
 def test_too_close_backs_away_and_does_nothing_else() -> None:
     gate = engaged()
     near = posture_at(gate.limits.least_range - 0.01)
     effort, reason = gate.check(100.0, 0.0, near, state_at(100.0), ASKED)
-    assert reason is Reason.TOO_CLOSE
+    assert reason is LimitReason.TOO_CLOSE
     # 10 of the 50 mm over which the retreat grows firm.
     back = -(0.25 + 0.2 * (0.5 - 0.25))
     assert effort.forward == pytest.approx(back)
@@ -155,13 +155,13 @@ def test_a_posture_that_ages_is_taken_to_have_come_closer() -> None:
     young = gate.check(100.0, 0.0, posture, state_at(100.0), ASKED, range_rate=-0.1)
     assert young == (ASKED, None)
     old = gate.check(100.1, 0.1, posture, state_at(100.1), ASKED, range_rate=-0.1)
-    assert old[1] is Reason.TOO_FAST
+    assert old[1] is LimitReason.TOO_FAST
 
 
 def test_the_nearest_point_counts_where_it_is_nearer_than_the_plane() -> None:
     gate = engaged()
     fold = posture_at(0.6, nearest=gate.limits.least_range - 0.01)
-    assert gate.check(100.0, 0.0, fold, state_at(100.0), ASKED)[1] is Reason.TOO_CLOSE
+    assert gate.check(100.0, 0.0, fold, state_at(100.0), ASKED)[1] is LimitReason.TOO_CLOSE
 
 
 @pytest.mark.parametrize(
@@ -169,16 +169,16 @@ def test_the_nearest_point_counts_where_it_is_nearer_than_the_plane() -> None:
     [
         (1.0, -0.29, None, 0.3),
         # 0.04 m/s too fast, of the 0.2 m/s (two thirds of what is allowed) that brake in full.
-        (1.0, -0.34, Reason.TOO_FAST, -0.1),
-        (1.0, -0.6, Reason.TOO_FAST, -0.5),
+        (1.0, -0.34, LimitReason.TOO_FAST, -0.1),
+        (1.0, -0.6, LimitReason.TOO_FAST, -0.5),
         # 70 mm are left: 0.1 m/s for 0.7 s.
         (0.42, -0.09, None, 0.3),
-        (0.42, -0.14, Reason.TOO_FAST, -0.3),
+        (0.42, -0.14, LimitReason.TOO_FAST, -0.3),
         (0.42, 0.5, None, 0.3),
     ],
 )
 def test_closing_speed_is_limited_by_the_way_that_is_left(
-    distance: float, range_rate: float, reason: Reason | None, sent: float
+    distance: float, range_rate: float, reason: LimitReason | None, sent: float
 ) -> None:
     posture = posture_at(distance)
     effort, found = engaged().check(
@@ -188,8 +188,8 @@ def test_closing_speed_is_limited_by_the_way_that_is_left(
     assert effort.forward == pytest.approx(sent, abs=1e-5)
 
 
-@pytest.mark.parametrize(("speed", "reason"), [(0.25, None), (0.4, Reason.TOO_FAST)])
-def test_closing_speed_is_known_without_a_filter(speed: float, reason: Reason | None) -> None:
+@pytest.mark.parametrize(("speed", "reason"), [(0.25, None), (0.4, LimitReason.TOO_FAST)])
+def test_closing_speed_is_known_without_a_filter(speed: float, reason: LimitReason | None) -> None:
     gate = engaged()
     for k in range(10):
         now = 100.0 + 0.04 * k
@@ -231,7 +231,7 @@ def test_whatever_comes_the_gate_never_adds_approach(
 
 
 def test_every_reason_has_words() -> None:
-    for reason in Reason:
+    for reason in LimitReason:
         assert reason.words
         assert "\n" not in reason.words
 

@@ -9,11 +9,11 @@ import pytest
 from aqualvs.control.autopilot import Decision
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
-from aqualvs.control.safety import AnswerLimits, AnswerWatch, Reason
+from aqualvs.control.safety import AnswerLimits, AnswerWatch, LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
-from aqualvs.follow.sensor_model import Blind, Loss, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, SampledEye
 from aqualvs.scanning.posture import Posture
 from control_cases import FRAME_S, posture_at, state_at
 
@@ -26,7 +26,7 @@ def noisy(rng: np.random.Generator, distance: float = 0.6, yaw: float = 0.0) -> 
     return replace(seen, pitch=3e-3 * rng.normal())
 
 
-def watched(postures: list[Posture], effort: Effort = HELD) -> list[Reason | None]:
+def watched(postures: list[Posture], effort: Effort = HELD) -> list[LimitReason | None]:
     watch, found = AnswerWatch(GAINS.vehicle), []
     for k, seen in enumerate(postures):
         now_s = FRAME_S * k
@@ -43,9 +43,9 @@ def test_noise_passes() -> None:
 def test_a_posture_that_repeats_under_thrust_is_frozen_until_it_changes() -> None:
     rng = np.random.default_rng(2)
     found = watched([noisy(rng)] * 20 + [noisy(rng) for _ in range(5)])
-    first = found.index(Reason.FROZEN)
+    first = found.index(LimitReason.FROZEN)
     assert first * FRAME_S == pytest.approx(0.2, abs=FRAME_S)
-    assert set(found[first:20]) == {Reason.FROZEN}
+    assert set(found[first:20]) == {LimitReason.FROZEN}
     assert found[20:] == [None] * 5
 
 
@@ -78,7 +78,7 @@ def test_noise_that_vanishes_is_a_still_that_an_encoder_repeats() -> None:
     found = watched(live + still)
     assert set(found[:100]) == {None}
     # Eight postures tell it.
-    assert set(found[107:]) == {Reason.FROZEN}
+    assert set(found[107:]) == {LimitReason.FROZEN}
 
 
 def test_a_yaw_that_does_not_follow_the_heading() -> None:
@@ -93,11 +93,11 @@ def test_a_yaw_that_does_not_follow_the_heading() -> None:
             found.add(watch.see(now_s, seen, state_at(now_s, heading=turned)))
             watch.done(now_s, HELD)
         answering.append(found)
-    assert answering == [{None}, {None, Reason.NO_ANSWER}]
+    assert answering == [{None}, {None, LimitReason.NO_ANSWER}]
 
 
 def frozen_hold(
-    name: str, loss: Loss, *, before: float = 0.6, seed: int = 1
+    name: str, loss: LossOfSight, *, before: float = 0.6, seed: int = 1
 ) -> tuple[float, float, list[Decision]]:
     """Hold 0.6 m in calm water; sight freezes at 14 s, just before of which the setpoint came."""
     freeze_s, mission = 14.0, HoldMission(Setpoint(before))
@@ -133,20 +133,20 @@ def frozen_hold(
 @pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
 @pytest.mark.parametrize("before", [0.6, 0.75])
 def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) -> None:
-    neutral_s, nearest, decisions = frozen_hold(name, Loss.FROZEN, before=before)
+    neutral_s, nearest, decisions = frozen_hold(name, LossOfSight.FROZEN, before=before)
     assert neutral_s <= 0.5
     assert nearest >= 0.45
     assert decisions[-1].effort == NEUTRAL
-    assert decisions[-1].reason is Reason.FROZEN
+    assert decisions[-1].reason is LimitReason.FROZEN
 
 
 def test_a_vehicle_that_moves_unseen_is_given_back() -> None:
     """The picture stands still, yet has noise: efforts alone tell."""
-    neutral_s, _, decisions = frozen_hold("bluerov2", Loss.STUCK, before=0.75)
+    neutral_s, _, decisions = frozen_hold("bluerov2", LossOfSight.STUCK, before=0.75)
     assert neutral_s <= 2.5
-    assert decisions[-1].reason is Reason.NO_ANSWER
+    assert decisions[-1].reason is LimitReason.NO_ANSWER
     assert not decisions[-1].engaged
-    assert Reason.NO_ANSWER.takes_over
+    assert LimitReason.NO_ANSWER.takes_over
 
 
 def test_limits_that_cannot_work_are_refused() -> None:

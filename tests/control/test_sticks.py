@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from aqualvs.control.sticks import PARAMETERS, StickChannel, StickShaping, shaping_of
 from aqualvs.control.tune import shaping_of_model
 from aqualvs.control.vehicle import NEUTRAL, Effort
-from aqualvs.simulation.vehicle.models import BLUEROV2, Sticks
+from aqualvs.simulation.vehicle.models import BLUEROV2, StickInput
 
 SHARES = st.floats(-1.0, 1.0)
 
 
-def answered(effort: Effort, own: Sticks) -> tuple[float, float, float, float]:
+def answered(effort: Effort, own: StickInput) -> tuple[float, float, float, float]:
     """What a vehicle does for an effort, as shares of what it does for a full one."""
     model = replace(BLUEROV2, sticks=own)
     shaping = shaping_of_model(model)
@@ -52,7 +52,9 @@ def test_the_vehicle_does_what_the_effort_says(
     throttle_zone: int,
     trims: tuple[int, int, int],
 ) -> None:
-    own = Sticks(gain=gain, yaw_dead_zone=yaw_zone, throttle_dead_zone=throttle_zone, trims=trims)
+    own = StickInput(
+        gain=gain, yaw_dead_zone=yaw_zone, throttle_dead_zone=throttle_zone, trims=trims
+    )
     effort = Effort(forward=forward, right=right, down=down, yaw=yaw)
     # A whole microsecond of the 400 at full gain, less what the dead zone takes; the throttle cuts
     # to thousandths on the way.
@@ -72,7 +74,7 @@ def test_nothing_is_nothing() -> None:
     neutral = StickShaping().sticks(NEUTRAL)
     assert (neutral.x, neutral.y, neutral.z, neutral.r) == (0, 0, 500, 0)
     # The trim is where the vehicle does nothing.
-    own = Sticks(trims=(1500, 1510, 1500))
+    own = StickInput(trims=(1500, 1510, 1500))
     sticks = shaping_of_model(replace(BLUEROV2, sticks=own)).sticks(NEUTRAL)
     assert own.asked(sticks.x, sticks.y, sticks.z, sticks.r) == (0.0, 0.0, 0.0, 0.0)
     assert sticks.x != 0

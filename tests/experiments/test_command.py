@@ -15,7 +15,13 @@ from aqualvs.experiments.command import (
     left_in_words,
     reproduce,
 )
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
 from aqualvs.experiments.page import PAGE
 from aqualvs.report.figure_style import new_figure
 from aqualvs.results.files import RECORD, Claim
@@ -25,21 +31,23 @@ from aqualvs.terminal import hidden_progress, progress
 def chart():
     figure = new_figure(1.0, "column")
     figure.add_subplot().plot([1, 2], [3, 4])
-    return Picture(name="chart", caption="Two points.", figure=figure)
+    return ExperimentFigure(name="chart", caption="Two points.", figure=figure)
 
 
 def experiment(name, *, met=True, fault=None, columns=None, sentence="Found 1.", drawn=False):
     def run(laboratory):
         if fault is not None:
             raise fault
-        return Outcome(
+        return ExperimentResult(
             sentence=sentence,
             findings=(
-                Finding(what="range error, %", paper="2.3", ours="0.1", bar="0.5", met=met),
-                Finding(what="frames", paper="", ours="3"),
+                ExperimentRow(what="range error, %", paper="2.3", ours="0.1", bar="0.5", met=met),
+                ExperimentRow(what="frames", paper="", ours="3"),
             ),
             pictures=(chart(),) if drawn else (),
-            series=(Series(name="rows", columns=columns or {"x_mm": np.array([0.1, np.nan])}),),
+            series=(
+                DataColumns(name="rows", columns=columns or {"x_mm": np.array([0.1, np.nan])}),
+            ),
             notes=("Not the paper's tank.",),
         )
 

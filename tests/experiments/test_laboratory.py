@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from aqualvs.experiments.dome_or_not import Distances, _calibrated_without, distances, level_laser
-from aqualvs.experiments.laboratory import Laboratory, Measured, Variant, told
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, Variant, told
 from aqualvs.experiments.mesh_filter import LitTruth, judge_pixels, judge_reflections, mean_judged
 from aqualvs.scanning.paper.detector import FilteredPoints
 from aqualvs.scanning.posture import Reason, Refusal
@@ -69,7 +69,7 @@ def test_the_mean_leaves_out_what_nothing_is_said_of():
 def refused(n=2):
     none = Refusal(Reason.NO_STRIPES)
     scans = [Scan(i, 0.04 * i, none, ScanPoints.none(), 1.333) for i in range(n)]
-    return Measured(scans, np.tile([0.5, 0.0, 0.1], (n, 1)))
+    return MeasuredDive(scans, np.tile([0.5, 0.0, 0.1], (n, 1)))
 
 
 def test_frames_without_a_posture_have_no_error():

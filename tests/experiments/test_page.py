@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 import pytest
 
 from aqualvs.errors import OutputError
-from aqualvs.experiments.experiment import Finding
-from aqualvs.experiments.page import Record, Shown, duration, page_html, write_page
+from aqualvs.experiments.experiment import ExperimentRow
+from aqualvs.experiments.page import PrintedFigure, Record, duration, page_html, write_page
 
 NASTY = '<script>alert("1")</script> & $css'
 
@@ -45,13 +45,13 @@ def with_figure(folder, *, svg_bytes=100, caption="A chart."):
     (folder / "figures").mkdir()
     (folder / "figures" / "rig_chart.svg").write_bytes(b"<svg>" + b" " * svg_bytes)
     (folder / "figures" / "rig_chart.png").write_bytes(b"png")
-    return record(pictures=(Shown(file="rig_chart", caption=caption, width_in=3.5),))
+    return record(pictures=(PrintedFigure(file="rig_chart", caption=caption, width_in=3.5),))
 
 
 def test_every_bar_stands_in_the_table_at_the_top(tmp_path):
-    good = Finding(what="range, %", paper="2.3", ours="0.04", bar="<= 0.5", met=True)
-    bad = Finding(what="yaw, deg", paper="14 %", ours="0.71", bar="0.5", met=False)
-    plain = Finding(what="frames", paper="", ours="731")
+    good = ExperimentRow(what="range, %", paper="2.3", ours="0.04", bar="<= 0.5", met=True)
+    bad = ExperimentRow(what="yaw, deg", paper="14 %", ours="0.71", bar="0.5", met=False)
+    plain = ExperimentRow(what="frames", paper="", ours="731")
     one, two = record("rig", findings=(good, plain)), record("box", findings=(bad,))
     read = Reader(page_html([one, two], {"rig": 3.0, "box": 62.4}, tmp_path))
     summary = read.text.split("Contents")[0]
@@ -91,7 +91,7 @@ def test_text_is_shown_as_it_is(tmp_path):
         sentence=NASTY,
         notes=(NASTY,),
         failure=NASTY,
-        findings=(Finding(what=NASTY, paper=NASTY, ours=NASTY, bar=NASTY, met=False),),
+        findings=(ExperimentRow(what=NASTY, paper=NASTY, ours=NASTY, bar=NASTY, met=False),),
     )
     read = Reader(page_html([nasty], {}, tmp_path))
     assert "script" not in read.tags
@@ -106,7 +106,7 @@ def test_failed_experiment_says_so_at_the_top_and_at_its_place(tmp_path):
 
 
 def test_missing_figure_is_an_error_that_names_the_page(tmp_path):
-    shown = record(pictures=(Shown(file="gone", caption="", width_in=7.2),))
+    shown = record(pictures=(PrintedFigure(file="gone", caption="", width_in=7.2),))
     with pytest.raises(OutputError, match=r"reproduce\.html"):
         write_page([shown], {}, tmp_path)
 

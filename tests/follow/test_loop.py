@@ -10,14 +10,14 @@ import pytest
 
 from aqualvs.control.missions import HoldMission
 from aqualvs.control.safety import AnswerLimits
-from aqualvs.control.safety import Reason as GateReason
+from aqualvs.control.safety import LimitReason as GateReason
 from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.follow.log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
 from aqualvs.follow.loop import SimulatedLoop, Timing
 from aqualvs.follow.monte_carlo import random_dive
-from aqualvs.follow.sensor_model import Blind, Loss, PostureNoise, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledEye
 from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
@@ -49,7 +49,7 @@ def test_eye_has_the_noise_that_it_claims() -> None:
 
 def test_eye_loses_target_and_stream_when_told_to() -> None:
     net = NetWall()
-    blind = (Blind(1.0, 2.0), Blind(3.0, 4.0, Loss.STREAM))
+    blind = (Blind(1.0, 2.0), Blind(3.0, 4.0, LossOfSight.STREAM))
     eye = SampledEye(net, np.random.default_rng(1), PostureNoise(), blind)
     near, far = net.station(0.6), net.station(1.5)
     assert eye.look(near, 0.5)
@@ -73,8 +73,8 @@ def test_no_effort_comes_before_the_first_frame_has_arrived() -> None:
     assert 0.15 <= thrust[0] <= 0.15 + 2.0 / 25.0
 
 
-@pytest.mark.parametrize("loss", [Loss.TARGET, Loss.STREAM])
-def test_thrust_ends_in_time_when_sight_is_lost(loss: Loss) -> None:
+@pytest.mark.parametrize("loss", [LossOfSight.TARGET, LossOfSight.STREAM])
+def test_thrust_ends_in_time_when_sight_is_lost(loss: LossOfSight) -> None:
     blind = (Blind(6.0, 7.0, loss), Blind(9.0, 9.5, loss))
     log = loop_of(ROUGH, blind).run(12.0)
     assert log.n_blind == 2
@@ -91,7 +91,7 @@ def test_thrust_ends_in_time_when_sight_is_lost(loss: Loss) -> None:
 
 def test_thrust_ends_in_time_when_the_picture_stands_still() -> None:
     """Its postures are valid to the scanner: the log counts no stretch without one."""
-    blind = (Blind(6.0, 7.0, Loss.FROZEN), Blind(9.0, 9.5, Loss.FROZEN))
+    blind = (Blind(6.0, 7.0, LossOfSight.FROZEN), Blind(9.0, 9.5, LossOfSight.FROZEN))
     log = loop_of(ROUGH, blind).run(12.0)
     assert log.n_blind == 0
     delay, frame = ROUGH.timing.delay, 1.0 / ROUGH.timing.fps

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aqualvs.control.missions import Guidance, Stage
-from aqualvs.control.safety import Reason
+from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import Effort, Setpoint, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
@@ -33,7 +33,7 @@ class Reports:
             frame=frame,
             engaged=True,
             effort=Effort(forward=forward),
-            reason=Reason.TOO_FAST if frame == 2 else None,
+            reason=LimitReason.TOO_FAST if frame == 2 else None,
             guidance=Guidance(setpoint=Setpoint(0.6), stage=Stage.HOLDING),
             state=VehicleState(armed=True, depth=4.0),
         )

@@ -119,3 +119,32 @@ def test_cached_kernels_load_without_what_only_compiling_needs(tmp_path: Path) -
     # The first is loaded; the second, which inlines it, is compiled, and loaded the next time.
     assert run_caller(tmp_path, "allocating.py") == [*found, "1", "0", "True"]
     assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]
+
+
+PAIR = """
+from typing import NamedTuple
+
+class {name}(NamedTuple):
+    x: float
+
+def pair():
+    return {name}(2.0)
+"""
+OF_PAIR = """
+from aqualvs.geometry.compiled import kernel
+from pair import pair
+
+@kernel
+def half(pair):
+    return 0.5 * pair.x
+
+print(half(pair()))
+"""
+
+
+def test_code_on_disk_for_a_class_that_is_gone_is_compiled_anew(tmp_path: Path) -> None:
+    (tmp_path / "of_pair.py").write_text(OF_PAIR)
+    for name in ("Before", "After"):
+        (tmp_path / "pair.py").write_text(PAIR.format(name=name))
+        assert run_caller(tmp_path, "of_pair.py") == ["1.0"]
+    assert list((tmp_path / "cache").rglob("of_pair.half*.nbi"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import av
 
-from aqualvs.batch.cluster import Outcome
+from aqualvs.batch.cluster import FinishedTask
 from aqualvs.batch.work import DiveWork
 from aqualvs.demo import bundled_dive
 from aqualvs.results.run_request import RunRequest
@@ -73,9 +73,9 @@ class InlineWorkers:
         try:
             if self.fail is not None:
                 self.fail(function.__name__, len(self.done))
-            return Outcome(token, value=function(*arguments))
+            return FinishedTask(token, value=function(*arguments))
         except Exception as error:
-            return Outcome(token, error=error)
+            return FinishedTask(token, error=error)
 
 
 class Listener:

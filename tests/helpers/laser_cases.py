@@ -6,7 +6,7 @@ import numpy as np
 
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripePoints,
-    Surfaces,
+    TargetSurfaces,
     board_surface,
     box_surfaces,
 )
@@ -57,7 +57,7 @@ def box_corners() -> FloatArray:
     return np.concatenate(found)
 
 
-def box() -> Surfaces:
+def box() -> TargetSurfaces:
     return box_surfaces(BOX_PLANES, box_corners())
 
 
@@ -92,7 +92,7 @@ def simulated(
     rig: Rig,
     poses: list[SE3],
     corners: FloatArray,
-    surfaces: Surfaces,
+    surfaces: TargetSurfaces,
     *,
     noise: Noise | None = None,
     seed: int = 0,
@@ -119,7 +119,7 @@ def simulated(
 def _stripe(
     camera: Camera,
     pose: SE3,
-    surfaces: Surfaces,
+    surfaces: TargetSurfaces,
     i_surface: int,
     sheet: Sheet,
     spacing: float,

@@ -12,8 +12,8 @@ from aqualvs.scanning.scan import Label, Scan, ScanPoints
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.scene import Label as TrueLabel
 from aqualvs.simulation.scene import Net, Scene
+from aqualvs.simulation.scene import SurfaceKind as TrueLabel
 from aqualvs.simulation.truth import LitPoints
 
 # How much wider than the twine a detector sees its light, as `net_twine` assumes.

@@ -17,7 +17,7 @@ from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target, random_bubbles, random_fish
 from aqualvs.simulation.scenarios import Difficulty, random_scene
-from aqualvs.simulation.scene import Label, Net, Scene, Wall
+from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import cast
 from aqualvs.simulation.video import VideoWriter
@@ -287,7 +287,7 @@ def _offsets(
     own = scene.dome_from_scene.inverse().apply(lit.points_in_dome)[:, [0, 2]] - middle
     offsets = []
     for laser in range(len(renderer.rig.lasers)):
-        line = own[(lit.laser == laser) & (lit.label == Label.WALL)]
+        line = own[(lit.laser == laser) & (lit.label == SurfaceKind.WALL)]
         inside = line[np.hypot(*line.T) < radius]
         along = inside[-1] - inside[0] if len(inside) else np.zeros(2)
         length = float(np.hypot(*along))
@@ -337,7 +337,7 @@ def _longest_chords(renderer: Renderer, dive: Dive, t: float) -> FloatArray:
     longest = np.zeros((len(dive.net.holes), len(renderer.rig.lasers)))
     for k, (x, z, radius) in enumerate(dive.net.holes):
         for i in range(longest.shape[1]):
-            line = own[(lit.laser == i) & (lit.label == Label.WALL)] - [x, z]
+            line = own[(lit.laser == i) & (lit.label == SurfaceKind.WALL)] - [x, z]
             inside = line[np.hypot(*line.T) < radius]
             if len(inside) < 2:
                 continue

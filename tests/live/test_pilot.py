@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aqualvs.control.autopilot import Motion
-from aqualvs.control.safety import Reason
+from aqualvs.control.safety import LimitReason
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, Setpoint, SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
@@ -115,7 +115,7 @@ def test_follows_the_setpoint_as_it_is_changed(pilot: Pilot, vehicle: Vehicle) -
     pilot.send(sample(2, posture(0.7)))
     assert vehicle.sent[-1] == NEUTRAL
     assert pilot.latest is not None
-    assert pilot.latest.reason is Reason.NO_SETPOINT
+    assert pilot.latest.reason is LimitReason.NO_SETPOINT
 
 
 def test_not_engaged_without_a_setpoint(vehicle: Vehicle) -> None:
@@ -157,7 +157,7 @@ def test_old_postures_are_none(pilot: Pilot, vehicle: Vehicle) -> None:
     pilot.send(sample(0, posture(0.9), arrived_s=vehicle.clock.now_s - 0.3))
     assert vehicle.sent == [NEUTRAL]
     assert pilot.latest is not None
-    assert pilot.latest.reason is Reason.NO_POSTURE
+    assert pilot.latest.reason is LimitReason.NO_POSTURE
 
 
 def test_filter_is_handed_on(vehicle: Vehicle) -> None:

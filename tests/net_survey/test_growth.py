@@ -5,7 +5,7 @@ from datetime import date
 import numpy as np
 import pytest
 
-from aqualvs.net_survey.alignment import Shift
+from aqualvs.net_survey.alignment import SurveyShift
 from aqualvs.net_survey.comparison import compare
 from aqualvs.net_survey.frames import WallFrame, place_survey
 from aqualvs.net_survey.growth import Growth, common_cells, history
@@ -131,7 +131,7 @@ def test_what_instruments_are_off_by_would_else_make_holes_new(pairs, monkeypatc
     """Guard of the test above: without the shift most holes would be new, and as many gone."""
     from aqualvs.net_survey import comparison as body
 
-    monkeypatch.setattr(body, "align", lambda *_: Shift.first())
+    monkeypatch.setattr(body, "align", lambda *_: SurveyShift.first())
     survey = pairs[0][2].surveys
     one = survey[1]
     moved = dive(pairs[0][0], DAYS, bearings=ARC, depths=LANES, shift=(6.0, 0.0))
@@ -177,7 +177,10 @@ def test_places_weigh_where_solidity_changes_from_place_to_place():
             for day, depths in ((0, (3.1, 3.4)), (DAYS, (3.3, 3.6)))
         ]
         for open_sigma in (0.0, 0.5):
-            shifts = [Shift.first(), Shift(np.zeros(2), np.full(2, open_sigma), np.ones(2, bool))]
+            shifts = [
+                SurveyShift.first(),
+                SurveyShift(np.zeros(2), np.full(2, open_sigma), np.ones(2, bool)),
+            ]
             wall = history(placed, shifts, frame, 1.0)
             variance[pattern, open_sigma] = wall.place_variance[common_cells(wall)].mean(axis=0)
     assert variance[0.0, 0.5] == pytest.approx([0.0, 0.0], abs=1e-12)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.net_survey.alignment import Shift
+from aqualvs.net_survey.alignment import SurveyShift
 from aqualvs.net_survey.frames import WallFrame, place_survey
 from aqualvs.net_survey.hole_sites import HoleState, find_sites
 from aqualvs.net_survey.surveys import Holes
@@ -32,7 +32,7 @@ def seen(day, holes, *, bearings=(0.0, 40.0), sigma=(0.0, 0.0)):
     placed = place_survey(replace(survey, holes=replace(found, time_s=np.zeros(n))), FRAME)
     u = RADIUS * np.deg2rad(columns[0])
     placed = replace(placed, holes=np.stack([u, columns[1]], axis=-1))
-    return placed, Shift(np.zeros(2), np.array(sigma), np.ones(2, bool))
+    return placed, SurveyShift(np.zeros(2), np.array(sigma), np.ones(2, bool))
 
 
 def sites(*dives):

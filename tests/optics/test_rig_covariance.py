@@ -28,7 +28,7 @@ from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import Returns
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
-from aqualvs.simulation.scene import Label
+from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 
 WINDOW = Window(Plane.from_normal([-0.3, 0.95, 0.1], 0.05), np.array([-0.15, 0.0, 0.0]))
@@ -54,7 +54,7 @@ def seen(name: str, scenario: str, time_s: float) -> tuple[dict[SearchAxis, Retu
     plane = scene.target_plane()
     if scene.target == "net":
         # Lit twine stands a twine radius in front of the net plane.
-        fit = visible_fit(picture.lit, Label.NET)
+        fit = visible_fit(picture.lit, SurfaceKind.NET)
         assert fit is not None
         plane = fit[0]
     image = cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR)

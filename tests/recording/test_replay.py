@@ -19,7 +19,7 @@ from aqualvs.recording import DiveRecording, PictureFormat, Recorder, RecorderOp
 from aqualvs.recording.encoding import TOPICS
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.paper.detector import ThresholdOptions
+from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.target import TargetKind
 from live_cases import demo_rig, demo_samples
 from repository import ROOT

@@ -17,7 +17,7 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Fold, Net, Scene, Wall
-from aqualvs.simulation.scene import Label as Kind
+from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import LitPoints, visible_fit
 
 PITCH, YAW = 4.0, -6.0

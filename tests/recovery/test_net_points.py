@@ -15,15 +15,16 @@ from aqualvs.experiments.mesh_filter import LitTruth, judge_reflections, mean_ju
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import plan_searches
-from aqualvs.scanning.paper.detector import PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.detector import PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
+from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.target import TargetKind
-from aqualvs.simulation.render import Picture, Renderer
+from aqualvs.simulation.render import RenderedFrame, Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
-from aqualvs.simulation.scene import Label as Kind
 from aqualvs.simulation.scene import Net, Scene, Wall
+from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit
 from aqualvs.sources import open_source
 from rig_from_sample_truth import load_truth
@@ -134,7 +135,7 @@ def renderer() -> Renderer:
     return Renderer(example_rig(), threads=2)
 
 
-def shoot(scene: Scene, seed: int) -> tuple[Frame, Picture]:
+def shoot(scene: Scene, seed: int) -> tuple[Frame, RenderedFrame]:
     picture = renderer().render(scene, 0.0, np.random.default_rng([7, seed]))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
     return Frame(0, 0.0, luma, chroma), picture

@@ -15,7 +15,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
-from aqualvs.simulation.scene import Label
+from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 
 SMALL, WIDE = "example", "bluerov2"
@@ -55,7 +55,7 @@ def shoot(scenario_name: str, t: float, rig_name: str = SMALL) -> Shot:
     truth = scene.target_plane()
     if scene.target == "net":
         # Lit twine stands a twine radius in front of the net plane.
-        seen = visible_fit(picture.lit, Label.NET)
+        seen = visible_fit(picture.lit, SurfaceKind.NET)
         assert seen is not None
         truth = seen[0]
     behind = min((wall.depth for wall in scene.walls), default=np.inf)

@@ -17,8 +17,8 @@ from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
-from aqualvs.simulation.scene import Label as Kind
 from aqualvs.simulation.scene import Scene
+from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit
 from windowed_cases import windowed
 

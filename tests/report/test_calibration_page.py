@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OutputError
 from aqualvs.report.calibration_page import (
+    CalibrationPage,
     ExpectationRow,
     LaserRow,
     Overlay,
-    Page,
     ParameterRow,
     PictureShot,
     ResidualMap,
@@ -27,7 +27,7 @@ from aqualvs.report.calibration_page import (
     page_html,
     write_page,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 
 NASTY = "<script>alert(1)</script>&\"'<!-- $title ${css} 水"
 NAN = float("nan")
@@ -113,12 +113,12 @@ def expectation(range_m: float, **changes: Any) -> ExpectationRow:
     return replace(row, **changes)
 
 
-def full_page(words: str = "plain") -> Page:
+def full_page(words: str = "plain") -> CalibrationPage:
     """Return a page with every part, `words` wherever there is text."""
     x = np.linspace(0.0, 9.0, 50)
     image = np.full((60, 80, 3), 90, np.uint8)
     dots = Overlay(pixels=np.array([[3.0, 4.0]]), colour="#E69F00", kind="dot", label=words)
-    return Page(
+    return CalibrationPage(
         title=words,
         subtitle=words,
         cards=(Card(words, words, words),),
@@ -194,7 +194,7 @@ def test_pictures_have_words_for_those_who_cannot_see_them() -> None:
 
 
 def test_parts_that_are_empty_leave_no_heading() -> None:
-    html = page_html(Page(title="Camera"))
+    html = page_html(CalibrationPage(title="Camera"))
     assert "<h2>" not in html
     assert "<h3>" not in html
     assert "<table" not in html
@@ -217,14 +217,14 @@ def test_parts_that_are_empty_leave_no_heading() -> None:
     ],
 )
 def test_each_part_stands_alone(part: str, heading: str) -> None:
-    html = page_html(Page(title="t", **{part: getattr(full_page(), part)}))
+    html = page_html(CalibrationPage(title="t", **{part: getattr(full_page(), part)}))
     assert re.findall(r"<h2>(.*?)</h2>", html) == [heading]
     assert not Tags(html).open
 
 
 def test_unknown_numbers_show_as_a_dash() -> None:
     unknown = np.full(20, np.nan)
-    page = Page(
+    page = CalibrationPage(
         title="t",
         views=(
             ViewRow(name="a", n_points=0, rms_px=NAN, used=False),
@@ -281,7 +281,7 @@ def test_parameters_tell_what_moved_in_sigmas() -> None:
         ParameterRow(name="z", value=-3.0, sigma=0.00234, unit="mm", digits=1, remark="known"),
         ParameterRow(name="radius", value=44.25, sigma=None, unit="mm", digits=2),
     )
-    html = page_html(Page(title="t", parameters=rows))
+    html = page_html(CalibrationPage(title="t", parameters=rows))
     head, x, y, z, radius = rows_of(html, "parameters")
     assert head[4:7] == ["before", "change", "change in σ"]
     assert x == ["x", "3.08", "0.061", "mm", "3.10", "−0.02", "−0.3", ""]
@@ -292,12 +292,14 @@ def test_parameters_tell_what_moved_in_sigmas() -> None:
 
 
 def test_columns_that_say_nothing_are_left_out() -> None:
-    html = page_html(Page(title="t", parameters=(ParameterRow(name="x", value=1.0, sigma=0.1),)))
+    html = page_html(
+        CalibrationPage(title="t", parameters=(ParameterRow(name="x", value=1.0, sigma=0.1),))
+    )
     assert rows_of(html, "parameters")[0] == ["parameter", "value", "± σ", "unit"]
 
 
 def test_expectation_adds_both_causes_and_is_fine_within_limits() -> None:
-    html = page_html(Page(title="t", expectations=(expectation(0.5), expectation(1.0))))
+    html = page_html(CalibrationPage(title="t", expectations=(expectation(0.5), expectation(1.0))))
     rows = rows_of(html, "expectations")
     assert len(rows) == 1 + 3 * 2
     assert rows[1] == ["0.50 m", "calibration", "0.30", "0.060", "0.030", "0.060"]
@@ -319,7 +321,9 @@ def test_expectation_adds_both_causes_and_is_fine_within_limits() -> None:
 def test_expectation_beyond_a_limit_is_flagged(
     changes: dict[str, float], flagged: set[str]
 ) -> None:
-    html = page_html(Page(title="t", expectations=(expectation(0.5), expectation(1.0, **changes))))
+    html = page_html(
+        CalibrationPage(title="t", expectations=(expectation(0.5), expectation(1.0, **changes)))
+    )
     assert "Not good to 0.5 % of range and 0.5°." in html
     assert 'class="verdict bad"' in html
     assert "On a target at 1.00 m" in html
@@ -328,9 +332,11 @@ def test_expectation_beyond_a_limit_is_flagged(
 
 def test_expectation_without_noise_speaks_for_the_calibration_alone() -> None:
     alone = {"noise_range_mm": NAN, "noise_pitch_deg": NAN, "noise_yaw_deg": NAN}
-    html = page_html(Page(title="t", expectations=(expectation(1.0, **alone),)))
+    html = page_html(CalibrationPage(title="t", expectations=(expectation(1.0, **alone),)))
     assert "the calibration alone gives the range to 0.3 mm (0.03 %)" in html
-    unknown = page_html(Page(title="t", expectations=(expectation(1.0, sigma_range_mm=NAN),)))
+    unknown = page_html(
+        CalibrationPage(title="t", expectations=(expectation(1.0, sigma_range_mm=NAN),))
+    )
     assert "is not known" in unknown
     assert "Good to" not in unknown
 
@@ -342,7 +348,7 @@ def test_outlier_views_stand_out() -> None:
         ViewRow(name="high.png", n_points=54, rms_px=0.3),
         ViewRow(name="far.png", n_points=1054, rms_px=40.0, remark="moved", used=False),
     )
-    html = page_html(Page(title="t", views=views))
+    html = page_html(CalibrationPage(title="t", views=views))
     rows = rows_of(html, "views")
     assert rows[-1] == ["far.png", "", "40.000", "1,054", "left out; moved"]
     marked = re.findall(r'class="refused">(.*?)<', html)
@@ -355,7 +361,7 @@ def test_outlier_views_stand_out() -> None:
 
 def test_many_views_stand_in_two_columns() -> None:
     views = tuple(ViewRow(name=f"{i}", n_points=9, rms_px=0.1) for i in range(41))
-    html = page_html(Page(title="t", views=views))
+    html = page_html(CalibrationPage(title="t", views=views))
     assert html.count("<table>") == 2
     assert [row[0] for row in rows_of(html, "views") if row[0] != "view"] == [
         f"{i}" for i in range(41)
@@ -363,7 +369,9 @@ def test_many_views_stand_in_two_columns() -> None:
 
 
 def test_lasers_have_their_colours_in_the_rig_s_order() -> None:
-    html = page_html(Page(title="t", lasers=(laser(), laser(name="vertical", moved="0.4°"))))
+    html = page_html(
+        CalibrationPage(title="t", lasers=(laser(), laser(name="vertical", moved="0.4°")))
+    )
     assert re.findall(r"swatch\" style=\"background:(#\w+)", html) == ["#E69F00", "#56B4E9"] * 2
     head, first, second = rows_of(html, "lasers")[:3]
     assert head[-1] == "moved"
@@ -391,7 +399,9 @@ def test_pictures_are_embedded_at_most_960_wide(
 ) -> None:
     image = np.zeros(shape, np.uint8)
     image[: shape[0] // 2] = 200
-    shown = embedded(page_html(Page(title="t", pictures=(PictureShot(caption="c", image=image),))))
+    shown = embedded(
+        page_html(CalibrationPage(title="t", pictures=(PictureShot(caption="c", image=image),)))
+    )
     assert shown[0].shape[:2] == expected
     # JPEG moves flat areas by a grey level or two.
     assert shown[0][10, 10].tolist() == pytest.approx([200] * 3, abs=3)
@@ -406,7 +416,7 @@ def test_overlays_lie_on_their_pixels(kind: Any) -> None:
         image=np.zeros((1080, 1920), np.uint8),
         points=(Overlay(pixels=pixels, colour="#56B4E9", kind=kind, label="corners"),),
     )
-    html = page_html(Page(title="t", pictures=(shot,)))
+    html = page_html(CalibrationPage(title="t", pictures=(shot,)))
     path = re.search(r'<path id="marks-0-0" d="([^"]*)"', html)
     assert path is not None
     # A mark begins left of its centre by its size: 5 or 5.5 at 640 px, 1.5 times that at 960.
@@ -430,7 +440,7 @@ def test_overlays_lie_on_their_pixels(kind: Any) -> None:
 )
 def test_pictures_that_are_none_are_refused(image: Any) -> None:
     with pytest.raises(ValueError, match="image has"):
-        page_html(Page(title="t", pictures=(PictureShot(caption="c", image=image),)))
+        page_html(CalibrationPage(title="t", pictures=(PictureShot(caption="c", image=image),)))
 
 
 def test_page_stays_below_a_megabyte(tmp_path: Path) -> None:
@@ -439,7 +449,7 @@ def test_page_stays_below_a_megabyte(tmp_path: Path) -> None:
     corners = Overlay(pixels=rng.uniform(0, 700, (3000, 2)), colour="#E69F00", label="corners")
     x = np.linspace(0.0, 2000.0, 50_000)
     long = Series(title="n", x_label="t", y_label="n", x=x, y=rng.normal(size=len(x)), sigma=x)
-    page = Page(
+    page = CalibrationPage(
         title="t",
         residual_maps=tuple(residual_map(20_000) for _ in range(4)),
         views=tuple(ViewRow(name=f"{i}.png", n_points=54, rms_px=0.1) for i in range(80)),
@@ -453,12 +463,12 @@ def test_page_stays_below_a_megabyte(tmp_path: Path) -> None:
 
 def test_names_that_are_no_unicode_are_written(tmp_path: Path) -> None:
     name = b"caf\xe9.png".decode("utf-8", "surrogateescape")
-    path = write_page(Page(title=name, warnings=(name,)), tmp_path / "page.html")
+    path = write_page(CalibrationPage(title=name, warnings=(name,)), tmp_path / "page.html")
     assert "caf?.png" in path.read_text(encoding="utf-8")
 
 
 def test_page_that_cannot_be_written_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="absent"):
-        write_page(Page(title="t"), tmp_path / "absent" / "page.html")
+        write_page(CalibrationPage(title="t"), tmp_path / "absent" / "page.html")
     with pytest.raises(OutputError, match="choose another name"):
-        write_page(Page(title="t"), tmp_path)
+        write_page(CalibrationPage(title="t"), tmp_path)

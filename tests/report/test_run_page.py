@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from jinja2 import UndefinedError
 from numpy.typing import NDArray
 from pyarrow import parquet
 
@@ -20,6 +21,7 @@ from aqualvs.errors import OutputError, SourceError
 from aqualvs.report.charts import breaks, merged, stretches, thin
 from aqualvs.report.frames import choose_pictures, choose_samples, decode_frames
 from aqualvs.report.html import embedded_json
+from aqualvs.report.html import page as filled_page
 from aqualvs.report.overlay import OverlayWriter
 from aqualvs.report.points import summarize_points
 from aqualvs.report.run_data import Track, lasers_of, read_track
@@ -539,3 +541,13 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
     monkeypatch.undo()
     assert (run / "report.html").read_bytes() == good
     assert not list(run.glob("*.part"))
+
+
+def test_a_page_escapes_its_texts_and_misses_none() -> None:
+    texts = {"title": "<b>&", "subtitle": '"<i>"'}
+    html = filled_page("follow.html", texts, {"facts": "<table></table>", "figures": ""})
+    assert "<title>&lt;b&gt;&amp; – aqualvs follow</title>" in html
+    assert '<p class="sub">&#34;&lt;i&gt;&#34;</p>' in html
+    assert "<table></table>" in html
+    with pytest.raises(UndefinedError, match="figures"):
+        filled_page("follow.html", texts, {"facts": ""})

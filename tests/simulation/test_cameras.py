@@ -20,7 +20,7 @@ from aqualvs.simulation.cameras import (
 from aqualvs.simulation.lasers import GREEN_NM, ColourFilters, band_shares, laser_wavelength_nm
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.scene import Scene, Sensor, WaterOptics
+from aqualvs.simulation.scene import CameraSensor, Scene, WaterOptics
 from camera_cases import REAL, chroma, line_minus_background, wall_pictures
 
 _STILL = WaterOptics(forward_scatter=0.0)
@@ -41,7 +41,7 @@ def _shoot(radiance, t=0.0, rng=None, filters=None, **options):
         filters=ColourFilters() if filters is None else filters,
         development=replace(_PLAIN, **options),
     )
-    return camera.picture(radiance, _STILL, Sensor(), t, rng)
+    return camera.picture(radiance, _STILL, CameraSensor(), t, rng)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_other_wavelengths_have_their_own_colour(name):
 def test_the_ideal_camera_is_the_scene_s_sensor_and_nothing_else():
     rng = np.random.default_rng(0)
     radiance = rng.uniform(0.0, 2.0, (48, 64, 3)).astype(np.float32)
-    water, sensor = WaterOptics(), Sensor()
+    water, sensor = WaterOptics(), CameraSensor()
     ours = IDEAL.picture(radiance, water, sensor, 3.0, np.random.default_rng(1))
     theirs = expose(spread(radiance, water, sensor), sensor, np.random.default_rng(1))
     assert np.array_equal(ours, theirs)
@@ -141,7 +141,7 @@ def test_daylight_keeps_its_colour_and_a_laser_does_not():
 def test_light_far_above_full_scale_is_white(name):
     sky = _flat((0.1, 0.1, 0.1), (96, 96))
     sky[40:56, 40:56] = 60.0
-    shown = simulated_camera(name).picture(sky, _STILL, Sensor())
+    shown = simulated_camera(name).picture(sky, _STILL, CameraSensor())
     assert shown[48, 48].min() == 255
 
 

@@ -13,7 +13,7 @@ from aqualvs.simulation.lasers import Sheets, default_sources, light_on_points, 
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
-from aqualvs.simulation.scene import Box, Label, Net, Scene, Wall, WaterOptics
+from aqualvs.simulation.scene import Box, Net, Scene, SurfaceKind, Wall, WaterOptics
 from aqualvs.simulation.shading import crossing_sheet
 from windowed_cases import windowed
 
@@ -130,7 +130,7 @@ def test_shadows_fall_where_bent_light_is_kept_out() -> None:
     shaded = replace(open_wall, boxes=(box,))
     every, some = (renderer.lit_points(scene) for scene in (open_wall, shaded))
     points, pixels = every.points_in_dome[every.laser == 0], every.pixels[every.laser == 0]
-    still_lit = some.points_in_dome[(some.laser == 0) & (some.label == Label.WALL)]
+    still_lit = some.points_in_dome[(some.laser == 0) & (some.label == SurfaceKind.WALL)]
     gap = np.array([np.min(np.linalg.norm(still_lit - point, axis=1)) for point in points])
     x, y = np.rint(pixels).astype(int).clip([0, 0], [719, 575]).T
     before, after = (renderer.radiance(scene)[y, x, 1] for scene in (open_wall, shaded))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from aqualvs.simulation.scenario import dome_from_target
-from aqualvs.simulation.scene import Label, Net, Scene
+from aqualvs.simulation.scene import Net, Scene, SurfaceKind
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import cast
 
@@ -17,7 +17,7 @@ def _hits(net, origins, directions, pose=None):
     scene = Scene(dome_from_scene=pose, nets=(net,), target="net")
     reach = cast(origins, directions, pack_surfaces(scene, 0.0))
     hit = np.isfinite(reach.solid)
-    assert np.all(reach.kind[hit] == Label.NET)
+    assert np.all(reach.kind[hit] == SurfaceKind.NET)
     points = origins[hit] + reach.solid[hit, None] * directions[hit]
     return pose.inverse().apply(points), hit
 

@@ -21,7 +21,7 @@ from aqualvs.simulation.panels import (
     RoomLight,
     panel_sheets,
 )
-from aqualvs.simulation.scene import Sensor
+from aqualvs.simulation.scene import CameraSensor
 from aqualvs.simulation.textures import (
     INK,
     PAPER,
@@ -204,7 +204,7 @@ def test_a_board_is_printed_as_calibration_expects_it():
 def test_without_a_source_of_chance_there_is_no_noise():
     scene = PanelScene(
         panels=[board_panel(BOARD, facing(0.3, size=squares_size(BOARD)))],
-        sensor=Sensor(read_noise=0.02),
+        sensor=CameraSensor(read_noise=0.02),
     )
     renderer = PanelRenderer(camera_in("bare"))
     first, second = renderer.render(scene), renderer.render(scene)

@@ -189,7 +189,7 @@ def test_culling_changes_nothing(renderer, monkeypatch):
 
 def test_rays_between_corners_are_the_cameras_rays():
     rig = example_rig()
-    corners = render_module.corner_rays(rig)
+    corners = render_module.corner_rays(rig.camera())
     rng = np.random.default_rng(4)
     pixels = rng.integers(0, [720, 576], (500, 2))
     i, j = pixels.T

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.simulation.scenario import dome_from_target
-from aqualvs.simulation.scene import Box, Bubble, Fish, Label, Scene, Wall
+from aqualvs.simulation.scene import Box, Bubble, Fish, Scene, SurfaceKind, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import cast
 
@@ -34,7 +34,7 @@ def test_wall_points_lie_on_the_target_plane(distance, pitch, yaw, x, z):
     if np.isfinite(reach.solid[0]):
         # Fused multiply-add leaves a few units in the last place of distances up to 100 m.
         assert abs(plane.signed_distance(points)[0]) < 1e-12 * max(1.0, reach.solid[0])
-        assert reach.kind[0] == Label.WALL
+        assert reach.kind[0] == SurfaceKind.WALL
     else:
         assert np.array([x, 1.0, z]) @ plane.normal <= 1e-3
 
@@ -43,7 +43,7 @@ def test_a_wall_behind_the_vehicle_is_not_seen():
     scene = Scene(dome_from_scene=_AHEAD, walls=(Wall(),))
     reach, _ = _reach(scene, [0.0, -1.0, 0.1])
     assert np.isinf(reach.solid[0])
-    assert reach.kind[0] == Label.NONE
+    assert reach.kind[0] == SurfaceKind.NONE
 
 
 def test_turned_wall_keeps_the_sign_convention():
@@ -66,7 +66,7 @@ def test_box_points_lie_on_a_face(x, z, heading):
     local = (_AHEAD @ turn).inverse().apply(points[0])
     shares = np.abs(local) / (np.array(box.size) / 2.0)
     assert abs(shares.max() - 1.0) < 1e-9
-    assert reach.kind[0] == Label.SOLID
+    assert reach.kind[0] == SurfaceKind.SOLID
 
 
 def test_box_is_hit_where_it_must_be():
@@ -81,7 +81,7 @@ def test_fish_swims_and_is_thinner_than_long():
     scene = Scene(dome_from_scene=_AHEAD, fish=(fish,))
     reach, _ = _reach(scene, [0.0, 1.0, 0.0])
     assert abs(reach.solid[0] - (0.5 - 0.016)) < 1e-12
-    assert reach.kind[0] == Label.FISH
+    assert reach.kind[0] == SurfaceKind.FISH
     away = np.array([0.2, 0.5, 0.0])
     assert np.isfinite(_reach(scene, away, t=1.0)[0].solid[0])
     assert np.isinf(_reach(scene, [0.0, 1.0, 0.0], t=1.0)[0].solid[0])

@@ -10,7 +10,7 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
-from aqualvs.simulation.scene import Label, Net, Scene, Wall, WaterOptics
+from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall, WaterOptics
 from windowed_cases import windowed
 
 # Laser light alone: nothing else can pull a stripe's centre.
@@ -96,7 +96,7 @@ def test_points_on_twine_are_bright_and_within_a_radius_of_the_net_plane():
     image = renderer.radiance(scene)[..., 1]
     lit = renderer.lit_points(scene)
     distance = scene.target_plane().signed_distance(lit.points_in_dome)
-    assert np.all(lit.label == Label.NET)
+    assert np.all(lit.label == SurfaceKind.NET)
     assert len(lit) > 200
     assert np.all(np.abs(distance) < 1.45 * 0.0015)
     # Lit and seen from the front: never behind the axis by more than where both views graze.
@@ -152,12 +152,12 @@ def test_hidden_points_are_no_truth():
     scene = scenario.scene_at(0.0)
     lit = renderer.lit_points(scene)
     kinds = np.bincount(lit.label, minlength=6)
-    assert kinds[Label.NET] > 100
-    assert kinds[Label.WALL] > 500
-    assert kinds[Label.SOLID] > 50
+    assert kinds[SurfaceKind.NET] > 100
+    assert kinds[SurfaceKind.WALL] > 500
+    assert kinds[SurfaceKind.SOLID] > 50
     # No wall or box point may be seen through a strand: march from the lens side to the point.
     rays = renderer.rig.camera().rays(lit.pixels)
-    behind = lit.label != Label.NET
+    behind = lit.label != SurfaceKind.NET
     crossing, valid = scene.target_plane().intersect(
         Rays(rays.origins[behind], rays.directions[behind], rays.valid[behind])
     )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.simulation.video import Recording, VideoWriter, jpeg
+from aqualvs.simulation.video import Compression, VideoWriter, jpeg
 
 
 def _frames(n=5, size=(64, 48)):
@@ -26,7 +26,7 @@ def _read(path):
 
 def test_lossless_gives_back_every_value(tmp_path):
     path, frames = tmp_path / "a.mp4", _frames()
-    with VideoWriter(path, (64, 48), 25.0, Recording(codec="lossless")) as writer:
+    with VideoWriter(path, (64, 48), 25.0, Compression(codec="lossless")) as writer:
         for frame in frames:
             writer.write(frame)
     _, read = _read(path)
@@ -51,7 +51,7 @@ def test_h264_is_420_with_the_right_clock(tmp_path):
 
 def test_mjpeg_holds_every_frame_as_a_jpeg_in_full_range(tmp_path):
     path, frames = tmp_path / "a.mp4", _frames()
-    with VideoWriter(path, (64, 48), 29.97, Recording(codec="mjpeg", jpeg_quality=90)) as writer:
+    with VideoWriter(path, (64, 48), 29.97, Compression(codec="mjpeg", jpeg_quality=90)) as writer:
         for frame in frames:
             writer.write(frame)
     pixel_format, read = _read(path)
@@ -77,7 +77,7 @@ def test_smaller_crf_or_more_bits_make_a_larger_file(tmp_path):
         "few_bits": {"bit_rate": 100_000},
     }.items():
         path = tmp_path / f"{name}.mp4"
-        with VideoWriter(path, (128, 96), 25.0, Recording(**options)) as writer:
+        with VideoWriter(path, (128, 96), 25.0, Compression(**options)) as writer:
             for frame in frames:
                 writer.write(frame)
         sizes[name] = path.stat().st_size
@@ -105,7 +105,7 @@ def test_an_interrupted_file_can_be_read(tmp_path):
 )
 def test_senseless_compression_is_refused(options):
     with pytest.raises(OptionError):
-        Recording(**options)
+        Compression(**options)
 
 
 @pytest.mark.parametrize("options", [{"size_px": (63, 48)}, {"fps": 0.0}])

@@ -28,7 +28,7 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import open_source
 from aqualvs.workers import channel, pool
 from aqualvs.workers.channel import Ended, Receiver, Sender, SharedMemory
-from aqualvs.workers.frame_results import Measured, Meter, block_length, in_blocks, read_ahead
+from aqualvs.workers.frame_results import FrameResult, Meter, block_length, in_blocks, read_ahead
 from aqualvs.workers.pool import Crew, crew_work
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 from shell_cases import destroy_frame
@@ -250,7 +250,7 @@ def assert_like(block, found):
 def test_messages_arrive_as_they_were(block, ends):
     sender, receiver, _ = ends
     refused = Scan(7, 0.5, Refusal(Reason.NO_STRIPES, "dark"), ScanPoints.none(), 1.34)
-    dark = [Measured(refused, refused.posture), Measured(refused, None)]
+    dark = [FrameResult(refused, refused.posture), FrameResult(refused, None)]
     for message in (block, dark, [*dark, *block], block[:1], block, dark):
         sender.send(message)
         assert_like(message, receiver.receive())

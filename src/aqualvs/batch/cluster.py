@@ -42,7 +42,7 @@ _STARTS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FinishedTask:
     """A task that has ended.
 
     Attributes
@@ -78,7 +78,7 @@ class Workers(Protocol):
     def submit(self, token: object, function: Callable[..., Any], *arguments: object) -> None:
         """Have a task done."""
 
-    def next_done(self, timeout_s: float) -> Outcome | None:
+    def next_done(self, timeout_s: float) -> FinishedTask | None:
         """Return a task that has ended; None if none does within the time."""
 
 
@@ -143,18 +143,18 @@ class DaskWorkers(Closing):
         future = self._client.submit(function, *arguments, pure=False)
         future.add_done_callback(lambda ended: self._ended.put((token, ended)))
 
-    def next_done(self, timeout_s: float) -> Outcome | None:
+    def next_done(self, timeout_s: float) -> FinishedTask | None:
         """Return a task that has ended; None if none does within the time."""
         try:
             token, future = self._ended.get(timeout=timeout_s)
         except queue.Empty:
             return None
         if future.status == "finished":
-            return Outcome(token, value=future.result())
+            return FinishedTask(token, value=future.result())
         error = future.exception() if future.status == "error" else None
         if error is None or isinstance(error, self._killed):
             error = WorkersLostError("the processes that worked on it died, again and again")
-        return Outcome(token, error=error)
+        return FinishedTask(token, error=error)
 
     def check_sight(self, path: Path) -> None:
         """Raise unless every worker sees a file and has the same versions as this process.

@@ -13,7 +13,7 @@ from typing import Any
 from aqualvs.batch.dataset import clear, drop_net, holds_dive, put_dive, scratch, seal, sealed
 from aqualvs.batch.parts import SUMMARY, PieceResult, peak_bytes, piece_folder, piece_key
 from aqualvs.batch.summary_page import range_steps
-from aqualvs.batch.work import DiveWork, Survey
+from aqualvs.batch.work import DiveProbe, DiveWork
 from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.pipeline import OpenDive, open_dive, summary_for
 from aqualvs.report.run_page import write_report
@@ -60,7 +60,7 @@ class PieceLostError(Exception):
     """A finished piece is not there any more, or not intact; it must be measured again."""
 
 
-def finished_dive(work: DiveWork, survey: Survey) -> dict[str, Any] | None:
+def finished_dive(work: DiveWork, survey: DiveProbe) -> dict[str, Any] | None:
     """Return the facts of a dive that an earlier batch has finished; None if it has not.
 
     Its files must be there and intact, and made from the same dive, rig, options and versions.
@@ -72,13 +72,13 @@ def finished_dive(work: DiveWork, survey: Survey) -> dict[str, Any] | None:
     return facts if holds_dive(work.dataset, work.name) else None
 
 
-def join_dive(work: DiveWork, survey: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
+def join_dive(work: DiveWork, survey: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     """Join the pieces of a dive, write its report, and drop the pieces.
 
     Parameters
     ----------
     work : DiveWork
-    survey : Survey
+    survey : DiveProbe
     results : sequence of PieceResult
         Of all pieces, in order.
 
@@ -121,7 +121,7 @@ def join_dive(work: DiveWork, survey: Survey, results: Sequence[PieceResult]) ->
 
 def _write_run_file(
     work: DiveWork,
-    survey: Survey,
+    survey: DiveProbe,
     results: Sequence[PieceResult],
     pieces: Sequence[Path],
     folder: Path,

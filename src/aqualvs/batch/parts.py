@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 
 from aqualvs.batch.dataset import drafted, seal, sealed
-from aqualvs.batch.work import DiveWork, Survey, digest
+from aqualvs.batch.work import DiveProbe, DiveWork, digest
 from aqualvs.errors import SourceError
 from aqualvs.pipeline import OpenDive, open_dive, summary_for
 from aqualvs.results.files import writing
@@ -21,7 +21,13 @@ from aqualvs.results.run_request import FrameWindow
 from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.spans import Span, SpanKind, VideoParts, image_frames
-from aqualvs.workers.frame_results import Measured, Meter, ScansFrames, in_blocks, measured_blocks
+from aqualvs.workers.frame_results import (
+    FrameResult,
+    Meter,
+    ScansFrames,
+    in_blocks,
+    measured_blocks,
+)
 from aqualvs.workers.run_frames import ready, with_losses
 
 SUMMARY = "summary.npz"
@@ -60,20 +66,20 @@ class PieceResult:
     reused: bool = False
 
 
-def piece_folder(work: DiveWork, survey: Survey, number: int) -> Path:
+def piece_folder(work: DiveWork, survey: DiveProbe, number: int) -> Path:
     """Return the folder of a piece; another rig, option or version has another."""
     span = survey.spans[number]
     kind = f"{span.first:08d}" if span.kind is not SpanKind.WHOLE else "whole"
     return work.home / f"pieces-{survey.key[:12]}" / kind
 
 
-def piece_key(survey: Survey, number: int) -> str:
+def piece_key(survey: DiveProbe, number: int) -> str:
     """Return what a piece is made from, as a short text."""
     span = survey.spans[number]
     return digest({"dive": survey.key, "kind": span.kind, "first": span.first, "stop": span.stop})
 
 
-def measure_piece(work: DiveWork, survey: Survey, number: int) -> PieceResult:
+def measure_piece(work: DiveWork, survey: DiveProbe, number: int) -> PieceResult:
     """Measure one piece of a dive, or take what an earlier batch has finished.
 
     Raises
@@ -161,7 +167,7 @@ def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[
 
 def _blocks(
     dive: OpenDive, span: Span, frames: Iterator[Frame], meter: Meter
-) -> Iterator[list[Measured]]:
+) -> Iterator[list[FrameResult]]:
     """Yield the results of a piece's frames, and refusals in place of lost frames."""
     # A recording tells of lost frames itself.
     first = None if dive.is_replay else span.first
@@ -179,7 +185,7 @@ class _Kept(threading.local):
 _KEPT = _Kept()
 
 
-def _scanner(dive: OpenDive, survey: Survey) -> ScansFrames:
+def _scanner(dive: OpenDive, survey: DiveProbe) -> ScansFrames:
     if dive.is_replay or dive.request.index_target is not None:
         return dive.scanner()
     if _KEPT.key != survey.result_key or _KEPT.scanner is None:

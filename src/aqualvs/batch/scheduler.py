@@ -12,12 +12,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from aqualvs.batch.cluster import Outcome, Workers, WorkersLostError
+from aqualvs.batch.cluster import FinishedTask, Workers, WorkersLostError
 from aqualvs.batch.dataset import drop_dive, holds_net, put_net, read_seal, scratch, seal, sealed
+from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.merge import PieceLostError, finished_dive, join_dive
 from aqualvs.batch.parts import PieceResult, measure_piece
-from aqualvs.batch.records import DiveRecord, DiveState
-from aqualvs.batch.work import DiveWork, Survey, content_digest, digest, survey
+from aqualvs.batch.work import DiveProbe, DiveWork, content_digest, digest, survey
 from aqualvs.errors import AqualvsError
 from aqualvs.net_survey.command import StoredDive
 from aqualvs.nets.target_file import NetRequest
@@ -38,7 +38,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
     ----------
     work : DiveWork
     key : str
-        Of the dive's result, `Survey.key`.
+        Of the dive's result, `DiveProbe.key`.
     facts : mapping
         From `join_dive`.
 
@@ -107,7 +107,7 @@ _WAIT_S = 0.2
 _MOST_BEGINNINGS = 3
 
 
-class Watcher(Protocol):
+class BatchObserver(Protocol):
     """Observer of a batch's progress."""
 
     def expect(self, n_bytes: int) -> None:
@@ -127,7 +127,7 @@ class _Dive:
     work: DiveWork
     # What the watcher was told to expect of it, and not yet that it is done.
     n_bytes: int
-    survey: Survey | None = None
+    survey: DiveProbe | None = None
     results: dict[int, PieceResult] = field(default_factory=dict)
     n_beginnings: int = 0
     is_done: bool = False
@@ -142,7 +142,7 @@ class _Task:
     piece: int | None = None
 
 
-def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
+def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
     """Look at a dive; returns its survey, and its facts if an earlier batch has finished it.
 
     Then the state of its net is told, if it is wanted and has not been.
@@ -157,7 +157,7 @@ def look(work: DiveWork) -> tuple[Survey, dict[str, Any] | None]:
     return found, None if facts is None else with_net(work, found.key, facts)
 
 
-def join(work: DiveWork, found: Survey, results: Sequence[PieceResult]) -> dict[str, Any]:
+def join(work: DiveWork, found: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     """Merge as `join_dive` does, and evaluate the dive's net if it is wanted."""
     return with_net(work, found.key, join_dive(work, found, results))
 
@@ -172,9 +172,9 @@ class Steps:
         As `look`, `measure_piece` and `join`.
     """
 
-    look: Callable[[DiveWork], tuple[Survey, dict[str, Any] | None]] = look
-    measure: Callable[[DiveWork, Survey, int], PieceResult] = measure_piece
-    join: Callable[[DiveWork, Survey, Sequence[PieceResult]], dict[str, Any]] = join
+    look: Callable[[DiveWork], tuple[DiveProbe, dict[str, Any] | None]] = look
+    measure: Callable[[DiveWork, DiveProbe, int], PieceResult] = measure_piece
+    join: Callable[[DiveWork, DiveProbe, Sequence[PieceResult]], dict[str, Any]] = join
 
 
 class Season:
@@ -185,7 +185,7 @@ class Season:
     works : sequence of (DiveWork, int)
         The dives with the sizes of their sources in bytes, in the order in which they are begun.
     workers : Workers
-    watcher : Watcher
+    watcher : BatchObserver
     steps : Steps, optional
         In place of the real ones.
     """
@@ -194,7 +194,7 @@ class Season:
         self,
         works: Sequence[tuple[DiveWork, int]],
         workers: Workers,
-        watcher: Watcher,
+        watcher: BatchObserver,
         steps: Steps | None = None,
     ) -> None:
         self._workers, self._watcher, self._steps = workers, watcher, steps or Steps()
@@ -247,13 +247,13 @@ class Season:
         dive.results.clear()
         self._ready.append((_Task(dive, dive.n_beginnings), self._steps.look, (dive.work,)))
 
-    def _measure(self, dive: _Dive, found: Survey) -> None:
+    def _measure(self, dive: _Dive, found: DiveProbe) -> None:
         dive.survey = found
         for piece in range(len(found.spans)):
             task = _Task(dive, dive.n_beginnings, piece)
             self._ready.append((task, self._steps.measure, (dive.work, found.only(piece), 0)))
 
-    def _take(self, outcome: Outcome) -> None:
+    def _take(self, outcome: FinishedTask) -> None:
         task: _Task = outcome.token
         if self._is_stale(task):
             return
@@ -271,7 +271,7 @@ class Season:
                 ),
             )
 
-    def _surveyed(self, dive: _Dive, found: Survey, facts: dict[str, Any] | None) -> None:
+    def _surveyed(self, dive: _Dive, found: DiveProbe, facts: dict[str, Any] | None) -> None:
         self._expect(dive, found.n_bytes)
         if facts is None:
             self._measure(dive, found)

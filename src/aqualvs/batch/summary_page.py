@@ -5,19 +5,17 @@ The range over each dive is shown as a sparkline.
 
 from collections.abc import Iterator, Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from aqualvs import __version__
-from aqualvs.batch.records import DiveRecord, DiveState
+from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.errors import OutputError
 from aqualvs.report import html
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text
 from aqualvs.results.folder import NET_MAP_PNG, REPORT_HTML
 from aqualvs.results.run_request import now
@@ -104,8 +102,7 @@ def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
         If the page cannot be written.
     """
     path = folder / SUMMARY_HTML
-    template = files("aqualvs.batch").joinpath("assets", SUMMARY_HTML)
-    text = Template(template.read_text(encoding="utf-8")).substitute(_parts(folder, records))
+    text = _page(folder, records)
     try:
         replace_text(path, text)
     except OSError as fault:
@@ -115,24 +112,26 @@ def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
     return path
 
 
-def _parts(folder: Path, records: Sequence[DiveRecord]) -> dict[str, str]:
+def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
     ranges = [r.summary[key] for r in records for key in _ENDS if key in r.summary]
     low, high = (min(ranges), max(ranges)) if ranges else (0.0, 0.0)
     lead = "Ranges over time share one scale"
     lead += f", {low:.2f} to {high:.2f} m; a gap is a stretch without a posture." if ranges else "."
-    return {
-        "css": html.asset("report.css"),
-        "title": escape(folder.resolve().name),
-        "subtitle": escape(_rigs(records)),
+    texts = {
+        "title": folder.resolve().name,
+        "subtitle": _rigs(records),
+        "lead": lead,
+        "footer": f"Written {now()} by aqualvs {__version__}.",
+    }
+    parts = {
         "cards": html.cards(_cards(records)),
         "warnings": html.notice(list(_notes(records))),
-        "lead": escape(lead),
         "table": _table(folder, records, low, high),
         "dataset": "".join(
             f"<h3>{name}</h3><pre>{escape(code)}</pre>" for name, code in _EXAMPLES.items()
         ),
-        "footer": escape(f"Written {now()} by aqualvs {__version__}."),
     }
+    return html.page("summary.html", texts, parts)
 
 
 _ENDS = ("range_min_m", "range_max_m")

@@ -103,7 +103,7 @@ _MEMORY = "survey"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Survey:
+class DiveProbe:
     """Result of the first look at a dive: its content, and where it is cut.
 
     Attributes
@@ -142,17 +142,17 @@ class Survey:
         """True if the dive is not cut."""
         return [span.kind for span in self.spans] == [SpanKind.WHOLE]
 
-    def only(self, number: int) -> "Survey":
+    def only(self, number: int) -> "DiveProbe":
         """Return the survey with one of its pieces alone, as its process needs it."""
         return replace(self, spans=(self.spans[number],))
 
-    def in_one_piece(self, why: str) -> "Survey":
+    def in_one_piece(self, why: str) -> "DiveProbe":
         """Return the survey of the same dive, not to be cut."""
         whole = (Span(kind=SpanKind.WHOLE, n_bytes=self.n_bytes),)
         return replace(self, spans=whole, why_whole=why)
 
 
-def survey(work: DiveWork) -> Survey:
+def survey(work: DiveWork) -> DiveProbe:
     """Look at a dive.
 
     Reads the whole file once, unless an earlier look is still valid, but decodes nothing.
@@ -163,7 +163,7 @@ def survey(work: DiveWork) -> Survey:
         If the dive or its rig cannot be used.
     """
     with open_dive(work.request) as dive:
-        found = Survey(
+        found = DiveProbe(
             source_key="",
             result_key=result_key(dive),
             spans=(),

@@ -14,8 +14,8 @@ import numpy as np
 from aqualvs.calibration.targets.printed import (
     FIT,
     BoxPlan,
-    Page,
-    Patch,
+    PdfPage,
+    SheetPatch,
     best_paper,
     board_rectangles,
     box_patches,
@@ -127,7 +127,7 @@ def print_board(request: BoardRequest, tell: Tell) -> None:
         tell(f"note: {word}")
 
 
-def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]]:
+def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
     board = _board(request)
     border = _MM * board.border
     width, height = (_MM * side + 2.0 * border for side in board.size)
@@ -187,7 +187,7 @@ def _smallest_dictionary(n_markers: int) -> str:
     return f"DICT_4X4_{fitting[0]}"
 
 
-def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]]:
+def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
     plan = BoxPlan(
         width=request.width_mm / _MM,
         height=request.height_mm / _MM,
@@ -207,7 +207,7 @@ def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]
     ]
 
 
-def _patch_page(request: BoardRequest, plan: BoxPlan, patch: Patch) -> Page:
+def _patch_page(request: BoardRequest, plan: BoxPlan, patch: SheetPatch) -> PdfPage:
     width, height = _MM * patch.size[0], _MM * patch.size[1]
     paper = best_paper(request.paper, width, height, f"a sheet of plane {patch.plane}")
     rectangles = [
@@ -224,7 +224,7 @@ def _patch_page(request: BoardRequest, plan: BoxPlan, patch: Patch) -> Page:
     return sheet(paper, black, (width, height), words)
 
 
-def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[Page], list[str]]:
+def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
     columns, rows = request.squares_x or 3, request.squares_y or 2
     size = request.marker_mm or 12.0
     family = request.dictionary or "DICT_APRILTAG_36h11"

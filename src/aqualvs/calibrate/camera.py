@@ -11,6 +11,8 @@ from aqualvs.calibrate.common import (
     Found,
     Nominal,
     Tell,
+    corner_residuals,
+    corner_rows,
     find_targets,
     finish,
     load_nominal,
@@ -26,14 +28,11 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import check_rig_place
 from aqualvs.optics.solved import SolvedStep, with_step, with_uncertainty
 from aqualvs.report.calibration_material import (
-    Page,
-    ViewRow,
+    CalibrationPage,
     facts,
-    missed_rows,
     parameter_rows,
-    residual_map,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +112,9 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)
 
 
-def _page(rig: Rig, result: CameraCalibration, found: Found, request: CameraRequest) -> Page:
+def _page(
+    rig: Rig, result: CameraCalibration, found: Found, request: CameraRequest
+) -> CalibrationPage:
     sigmas = result.uncertainty.sigmas
     lens = result.lens
     cards = [
@@ -134,7 +135,7 @@ def _page(rig: Rig, result: CameraCalibration, found: Found, request: CameraRequ
         cards.append(
             Card("held-back views", f"{result.held_back_rms_px:.3f} px", "corners predicted, rms")
         )
-    return Page(
+    return CalibrationPage(
         title="Calibration of the camera",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),
@@ -144,22 +145,8 @@ def _page(rig: Rig, result: CameraCalibration, found: Found, request: CameraRequ
         ),
         words=result.findings,
         parameters=parameter_rows(rig, result.uncertainty, lens.parameter_names),
-        residual_maps=(
-            residual_map(
-                "Corners of all views",
-                result.size_px,
-                [fit.view for fit in result.views],
-                [fit.residuals for fit in result.views],
-                [fit.inliers for fit in result.views],
-            ),
-        ),
-        views=(
-            *(
-                ViewRow(name=fit.label, n_points=len(fit.view), rms_px=fit.rms_px)
-                for fit in result.views
-            ),
-            *missed_rows({**found.missed, **result.left_out}),
-        ),
+        residual_maps=(corner_residuals(result.views, result.size_px),),
+        views=corner_rows(result.views, {**found.missed, **result.left_out}),
         facts=facts(
             ("board", str(request.board)),
             ("nominal rig", str(request.nominal or "none")),

@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from aqualvs.calibration.solver.result import ViewFit
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
-from aqualvs.report.calibration_page import Page, write_page
+from aqualvs.report.calibration_material import ResidualMap, ViewRow, missed_rows, residual_map
+from aqualvs.report.calibration_page import CalibrationPage, write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.sources.images import read_image
@@ -293,8 +295,31 @@ def medium_index(word: str | None, rig: Rig, default: float) -> float:
         ) from None
 
 
+def corner_residuals(views: Sequence[ViewFit], size_px: tuple[int, int]) -> ResidualMap:
+    """Return the residuals of a target's corners over the picture."""
+    return residual_map(
+        "Corners of all views",
+        size_px,
+        [fit.view for fit in views],
+        [fit.residuals for fit in views],
+        [fit.inliers for fit in views],
+    )
+
+
+def corner_rows(views: Sequence[ViewFit], missed: Mapping[str, str]) -> tuple[ViewRow, ...]:
+    """Return the rows of the views that were used, and of those that were not, with the reason."""
+    used = (ViewRow(name=fit.label, n_points=len(fit.view), rms_px=fit.rms_px) for fit in views)
+    return (*used, *missed_rows(missed))
+
+
 def finish(
-    rig: Rig, page: Page, out: Path, step: str, tell: Tell, *, comments_of: Path | None = None
+    rig: Rig,
+    page: CalibrationPage,
+    out: Path,
+    step: str,
+    tell: Tell,
+    *,
+    comments_of: Path | None = None,
 ) -> None:
     """Write the rig and the page of a calibration, and print their paths.
 

@@ -8,6 +8,8 @@ from aqualvs.calibrate.common import (
     Found,
     Tell,
     check_same_size,
+    corner_residuals,
+    corner_rows,
     find_targets,
     finish,
     medium_index,
@@ -34,15 +36,12 @@ from aqualvs.optics.solved import (
     with_uncertainty,
 )
 from aqualvs.report.calibration_material import (
-    Page,
-    ViewRow,
+    CalibrationPage,
     expectations,
     facts,
-    missed_rows,
     parameter_rows,
-    residual_map,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,7 +198,7 @@ def _noted(rig: Rig, result: DomeCalibration) -> Rig:
 
 def _page(
     before: Rig, rig: Rig, result: DomeCalibration, shots: list[_Shots], request: DomeRequest
-) -> Page:
+) -> CalibrationPage:
     sigmas = result.uncertainty.sigmas
     lens = rig.dome_from_cam.translation
     cards = [
@@ -222,7 +221,7 @@ def _page(
         )
     missed = {name: why for one in shots for name, why in one.found.missed.items()}
     dome_names = [name for name in DOME_PARAMETERS if name in sigmas]
-    return Page(
+    return CalibrationPage(
         title="Calibration of the dome",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),
@@ -238,22 +237,8 @@ def _page(
             [*POSE_PARAMETERS, *dome_names, *rig.lens.parameter_names],
             before,
         ),
-        residual_maps=(
-            residual_map(
-                "Corners of all views",
-                rig.size_px,
-                [fit.view for fit in result.views],
-                [fit.residuals for fit in result.views],
-                [fit.inliers for fit in result.views],
-            ),
-        ),
-        views=(
-            *(
-                ViewRow(name=fit.label, n_points=len(fit.view), rms_px=fit.rms_px)
-                for fit in result.views
-            ),
-            *missed_rows({**missed, **result.left_out}),
-        ),
+        residual_maps=(corner_residuals(result.views, rig.size_px),),
+        views=corner_rows(result.views, {**missed, **result.left_out}),
         facts=facts(
             ("rig before", str(request.rig)),
             ("board", str(request.board)),

@@ -25,7 +25,7 @@ from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_laser
 from aqualvs.calibration.lasers.report import LaserCalibration, LaserFigures
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripePoints,
-    Surfaces,
+    TargetSurfaces,
     board_surface,
     box_surfaces,
 )
@@ -49,9 +49,9 @@ from aqualvs.optics.solved import (
     with_uncertainty,
 )
 from aqualvs.report.calibration_material import (
+    CalibrationPage,
     LaserRow,
     Overlay,
-    Page,
     ParameterRow,
     PictureShot,
     ViewRow,
@@ -61,7 +61,7 @@ from aqualvs.report.calibration_material import (
     parameter_rows,
     residual_map,
 )
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
 from aqualvs.text import laser_colour
 
@@ -91,7 +91,7 @@ class _Target:
     """Target that the lasers shine on."""
 
     file: Path
-    surfaces: Surfaces
+    surfaces: TargetSurfaces
     found: Found
     n_medium: float
 
@@ -303,7 +303,7 @@ def _page(
     target: _Target,
     views: Sequence[LaserView],
     request: LasersRequest,
-) -> Page:
+) -> CalibrationPage:
     used = {one.name for one in result.views}
     rows = [
         ViewRow(
@@ -317,7 +317,7 @@ def _page(
         for one in result.views
     ]
     worst = max(figures.sigma_normal for figures in result.lasers)
-    return Page(
+    return CalibrationPage(
         title="Calibration of the lasers",
         subtitle=f"Rig “{rig.name}”, {target.file.name}, index outside {target.n_medium:.4f}",
         cards=(

@@ -24,8 +24,14 @@ from aqualvs.optics.solved import (
     with_step,
     with_uncertainty,
 )
-from aqualvs.report.calibration_material import Page, Series, ViewRow, expectations, facts
-from aqualvs.report.findings import Card
+from aqualvs.report.calibration_material import (
+    CalibrationPage,
+    Series,
+    ViewRow,
+    expectations,
+    facts,
+)
+from aqualvs.report.html import Card
 from aqualvs.results.run_request import check_fits
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
@@ -142,12 +148,12 @@ def _noted(rig: Rig, result: WaterCalibration) -> Rig:
 
 def _page(
     rig: Rig, result: WaterCalibration, prior: IndexPrior | None, request: WaterRequest
-) -> Page:
+) -> CalibrationPage:
     counted = [reading for reading in result.readings if reading]
     times = np.array([reading.time for reading in counted])
     marks = tuple((step.time, f"{step.size:+.4f}") for step in result.steps)
     level = None if prior is None else (prior.source, prior.n)
-    return Page(
+    return CalibrationPage(
         title="Calibration of the water",
         subtitle=f"Rig “{rig.name}”, {' '.join(request.source[:3])}",
         cards=(

@@ -226,7 +226,7 @@ _SCALES = {"mm": 1e3, "deg": math.degrees(1.0)}
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class ComparedPart:
     """A part of a rig and how it has changed.
 
     Attributes
@@ -328,7 +328,7 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     return 0
 
 
-def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Part]:
+def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[ComparedPart]:
     """Return the parts that both rigs have, and how each has changed."""
     parts = [_lens_part(difference), _turn_part(difference)]
     if same_lens_model(new, old):
@@ -338,7 +338,7 @@ def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Part]:
     return parts + [_laser_part(new, a, b, difference) for a, b in _shared_lasers(new, old)]
 
 
-def verdict(parts: list[Part]) -> str:
+def verdict(parts: list[ComparedPart]) -> str:
     """Return what moved and what stayed, in one sentence."""
     moved = [part.sentence for part in parts if part.moved]
     stayed = [part.sentence for part in parts if not part.moved and not part.is_same]
@@ -378,20 +378,20 @@ def _loaded(path: Path) -> tuple[Rig, RigUncertainty]:
         raise RigError(f"{path}: {error}") from None
 
 
-def _lens_part(difference: RigDifference) -> Part:
+def _lens_part(difference: RigDifference) -> ComparedPart:
     names = POSE_PARAMETERS[:3]
     way = float(np.linalg.norm([difference.of(name) for name in names]))
     return _part(difference, "the lens", names, f"moved by {way * 1e3:.2g} mm", way > _LENS_M)
 
 
-def _turn_part(difference: RigDifference) -> Part:
+def _turn_part(difference: RigDifference) -> ComparedPart:
     names = POSE_PARAMETERS[3:]
     angle = float(np.linalg.norm([difference.of(name) for name in names]))
     did = f"turned by {math.degrees(angle):.2g} deg"
     return _part(difference, "the camera", names, did, angle > _TURN, "did not turn")
 
 
-def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> Part:
+def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedPart:
     share = max(abs(new.lens.fx / old.lens.fx - 1.0), abs(new.lens.fy / old.lens.fy - 1.0))
     centre = math.hypot(difference.of("cx"), difference.of("cy"))
     did = f"changed by {share:.2%} in focal length and {centre:.2g} px in the image centre"
@@ -400,7 +400,7 @@ def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> Part:
     return _part(difference, "the intrinsics", names, did, matters)
 
 
-def _shell_part(difference: RigDifference) -> Part:
+def _shell_part(difference: RigDifference) -> ComparedPart:
     names = ("inner_radius", "thickness", "n_acrylic")
     radius, thickness, index = (difference.of(name) for name in names)
     did = f"changed by {radius * 1e3:+.2g} mm in radius, {thickness * 1e3:+.2g} mm in thickness"
@@ -409,13 +409,13 @@ def _shell_part(difference: RigDifference) -> Part:
     return _part(difference, "the dome", names, did, matters)
 
 
-def _water_part(difference: RigDifference) -> Part:
+def _water_part(difference: RigDifference) -> ComparedPart:
     change = difference.of("n_water")
     did = f"changed its index by {change:+.4f}"
     return _part(difference, "the water", ("n_water",), did, abs(change) > _INDEX)
 
 
-def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> Part:
+def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> ComparedPart:
     names = _names(old)
     angle, shift, _ = _laser_move(new_rig, new, old, difference)
     did = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at 0.6 m"
@@ -430,9 +430,9 @@ def _part(
     did: str,
     matters: bool,
     stayed: str = "stayed",
-) -> Part:
+) -> ComparedPart:
     moved = difference.has_moved(names)
-    return Part(
+    return ComparedPart(
         name=name,
         did=did,
         stayed=stayed,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.missions import Guidance, Mission, Stage
-from aqualvs.control.safety import AnswerWatch, Reason, SafetyGate
+from aqualvs.control.safety import AnswerWatch, LimitReason, SafetyGate
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture, Refusal
@@ -41,7 +41,7 @@ class Decision:
     ----------
     effort : Effort
         What may be sent; neutral unless engaged.
-    reason : Reason or None
+    reason : LimitReason or None
         Why it is not what the controller asked for, or why that is no more than to stay.
     guidance : Guidance
         What the mission wanted.
@@ -50,7 +50,7 @@ class Decision:
     """
 
     effort: Effort
-    reason: Reason | None
+    reason: LimitReason | None
     guidance: Guidance
     engaged: bool
 
@@ -84,7 +84,7 @@ class NetPilot:
         self.mission, self.controller = mission, controller
         self.gate = gate or SafetyGate()
         self._watch = AnswerWatch(controller.gains.vehicle)
-        self._doubt: Reason | None = None
+        self._doubt: LimitReason | None = None
         self._posture: Posture | None = None
         self._seen_s = self._frame_s = -math.inf
         self._asked: Effort | None = None
@@ -94,7 +94,7 @@ class NetPilot:
         """Whether efforts pass."""
         return self.gate.latched is None
 
-    def engage(self, now_s: float, state: VehicleState) -> Reason | None:
+    def engage(self, now_s: float, state: VehicleState) -> LimitReason | None:
         """Begin, or go on, as the pilot wants it; return why not, None if so."""
         refused = self.gate.engage(now_s, state)
         if refused is None:
@@ -133,7 +133,7 @@ class NetPilot:
         """
         if self._other_stream(time_s):
             _, reason = self.gate.check(now_s, math.inf, None, state, NEUTRAL)
-            stopped = reason if reason is not None and reason.takes_over else Reason.CLOCK
+            stopped = reason if reason is not None and reason.takes_over else LimitReason.CLOCK
             return Decision(NEUTRAL, stopped, _IDLE, self.engaged)
         present = self._present(now_s, time_s, posture, state)
         guidance = self._guide(now_s, present, state)
@@ -153,12 +153,12 @@ class NetPilot:
         reason = self._end(guidance) or reason or _mission_says(guidance)
         return Decision(effort, reason, guidance, self.engaged)
 
-    def _end(self, guidance: Guidance) -> Reason | None:
+    def _end(self, guidance: Guidance) -> LimitReason | None:
         """Give the vehicle back where the target stayed away; return why."""
         if guidance.stage is not Stage.GAVE_UP:
             return None
-        self.gate.stop(Reason.GAVE_UP)
-        return Reason.GAVE_UP
+        self.gate.stop(LimitReason.GAVE_UP)
+        return LimitReason.GAVE_UP
 
     def _other_stream(self, time_s: float) -> bool:
         """Return whether frame times have jumped back; then all that was seen is forgotten."""
@@ -175,13 +175,13 @@ class NetPilot:
     ) -> Posture | None:
         """Return the posture of a new frame; a picture that stands still is none."""
         if isinstance(posture, Refusal) and posture.reason is NoPosture.FROZEN:
-            self._doubt = Reason.FROZEN
+            self._doubt = LimitReason.FROZEN
             return None
         if not (isinstance(posture, Posture) and time_s > self._frame_s):
             return None
         self._frame_s = time_s
         self._doubt = self._watch.see(now_s, posture, state)
-        if self._doubt is Reason.FROZEN:
+        if self._doubt is LimitReason.FROZEN:
             return None
         self._posture, self._seen_s = posture, now_s
         return posture
@@ -217,7 +217,7 @@ class NetPilot:
             guidance.down,
         )
 
-    def _settle(self, asked: Effort | None, effort: Effort, reason: Reason | None) -> None:
+    def _settle(self, asked: Effort | None, effort: Effort, reason: LimitReason | None) -> None:
         """Report the sent effort to the controller."""
         self._asked = asked
         if asked is None or (reason is not None and effort == NEUTRAL):
@@ -232,13 +232,13 @@ _LATE_S = 0.5
 _IDLE = Guidance(setpoint=None, stage=Stage.IDLE)
 
 
-def _mission_says(guidance: Guidance) -> Reason | None:
+def _mission_says(guidance: Guidance) -> LimitReason | None:
     """Return why a mission asks for nothing, or for no more than to stay."""
     if guidance.stage is Stage.WAITING:
-        return Reason.NO_POSTURE
+        return LimitReason.NO_POSTURE
     if guidance.setpoint is None:
-        return Reason.NO_SETPOINT
-    return Reason.MISSION_OVER if guidance.stage is Stage.OVER else None
+        return LimitReason.NO_SETPOINT
+    return LimitReason.MISSION_OVER if guidance.stage is Stage.OVER else None
 
 
 @dataclass(frozen=True, slots=True)

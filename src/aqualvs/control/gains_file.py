@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from aqualvs.control.gains import (
@@ -25,20 +25,10 @@ from aqualvs.control.gains import (
     YawGains,
 )
 from aqualvs.errors import OptionError
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, StrictPart
 from aqualvs.yamlfile import parse_yaml, read_yaml, write_text
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-
-
-class Part(BaseModel):
-    """A mapping of known keys; anything else is refused."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-AnyPart = TypeVar("AnyPart", bound=Part)
+AnyPart = TypeVar("AnyPart", bound=StrictPart)
 
 
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
@@ -87,7 +77,7 @@ def parse_settings(
         raise OptionError(f"{name}: {_first_fault(error, kind)}") from None
 
 
-def _first_fault(error: ValidationError, kind: type[Part]) -> str:
+def _first_fault(error: ValidationError, kind: type[StrictPart]) -> str:
     """One line on the fault to mend first; a misspelt key explains the one that is missing."""
     faults = error.errors(include_url=False)
     unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
@@ -110,7 +100,7 @@ def _remedy(fault: ErrorDetails) -> str:
     return message[0].lower() + message[1:] if message.startswith("S") else f"it {message}"
 
 
-def _closest(fault: ErrorDetails, kind: type[Part]) -> str:
+def _closest(fault: ErrorDetails, kind: type[StrictPart]) -> str:
     known = _keys_at(kind, fault["loc"][:-1])
     close = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1)
     if close:
@@ -118,7 +108,7 @@ def _closest(fault: ErrorDetails, kind: type[Part]) -> str:
     return f"known are {', '.join(known)}" if known else "leave it out"
 
 
-def _keys_at(kind: type[Part], places: tuple[int | str, ...]) -> list[str]:
+def _keys_at(kind: type[StrictPart], places: tuple[int | str, ...]) -> list[str]:
     """Return the keys that a mapping at a place may have."""
     for place in places:
         field = kind.model_fields.get(str(place))
@@ -129,9 +119,9 @@ def _keys_at(kind: type[Part], places: tuple[int | str, ...]) -> list[str]:
     return list(kind.model_fields)
 
 
-def _part_of(annotation: Any) -> type[Part] | None:
+def _part_of(annotation: Any) -> type[StrictPart] | None:
     options = (annotation, *getattr(annotation, "__args__", ()))
-    parts = [one for one in options if isinstance(one, type) and issubclass(one, Part)]
+    parts = [one for one in options if isinstance(one, type) and issubclass(one, StrictPart)]
     return parts[0] if parts else None
 
 
@@ -146,14 +136,14 @@ Share = Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)]
 PositiveShare = Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
 
 
-class DragPart(Part):
+class DragPart(StrictPart):
     """Resistance along one axis."""
 
     linear_n_s_m: NotNegative
     quadratic_n_s2_m2: NotNegative
 
 
-class ThrustPart(Part):
+class ThrustPart(StrictPart):
     """Section `thrust`: thrust of an effort of 1, and the curve up to it."""
 
     forward_n: Positive
@@ -164,7 +154,7 @@ class ThrustPart(Part):
     layout: Literal["vectored", "straight"] = "vectored"
 
 
-class VehiclePart(Part):
+class VehiclePart(StrictPart):
     """Section `vehicle`: its assumed properties."""
 
     mass_kg: Positive
@@ -176,7 +166,7 @@ class VehiclePart(Part):
     dome_forward_m: Number = 0.0
 
 
-class RangePart(Part):
+class RangePart(StrictPart):
     """`range`: the cascade that holds it."""
 
     position_per_s: Positive
@@ -194,7 +184,7 @@ class RangePart(Part):
     crossing_share: NotNegative = 0.4
 
 
-class YawPart(Part):
+class YawPart(StrictPart):
     """`yaw`: the loop that holds it."""
 
     proportional_per_s: Positive
@@ -208,7 +198,7 @@ class YawPart(Part):
     quiet_rate_deg_s: NotNegative = 0.8
 
 
-class GainsFile(Part):
+class GainsFile(StrictPart):
     """A whole gains file."""
 
     aqualvs_gains: int

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from aqualvs.control.gains_file import NotNegative, Number, Part, Positive, load_settings
+from aqualvs.control.gains_file import load_settings
 from aqualvs.control.missions import (
     FollowMission,
     HoldMission,
@@ -22,6 +22,7 @@ from aqualvs.control.missions import (
 from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.vehicle import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, StrictPart
 
 VERSION = 1
 """Version of the format that is read."""
@@ -35,7 +36,7 @@ Two = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Speed = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 
 
-class LegPart(Part):
+class LegPart(StrictPart):
     """`leg`: where one way along the net ends."""
 
     time_s: Positive | None = None
@@ -43,7 +44,7 @@ class LegPart(Part):
     bearings_deg: Two | None = None
 
 
-class SurveyPart(Part):
+class SurveyPart(StrictPart):
     """Section `survey`: the depths, and what happens between them."""
 
     depths_m: Annotated[list[NotNegative], Field(min_length=1)]
@@ -53,7 +54,7 @@ class SurveyPart(Part):
     patience_s: Positive = 20.0
 
 
-class LossPart(Part):
+class LossPart(StrictPart):
     """Section `loss`: behaviour without the target."""
 
     after_s: Positive = 0.15
@@ -61,7 +62,7 @@ class LossPart(Part):
     give_up_s: Positive = 10.0
 
 
-class SafetyPart(Part):
+class SafetyPart(StrictPart):
     """`safety`: where the gate steps in."""
 
     posture_age_s: Positive = 0.15
@@ -73,7 +74,7 @@ class SafetyPart(Part):
     brake_effort: Positive = 0.5
 
 
-class PlanFile(Part):
+class PlanFile(StrictPart):
     """A whole plan file."""
 
     aqualvs_plan: int

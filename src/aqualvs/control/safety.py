@@ -20,7 +20,7 @@ from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture
 
 
-class Reason(StrEnum):
+class LimitReason(StrEnum):
     """Reason why an effort was changed or stopped; the value is what logs write in `reason`."""
 
     NOT_ENGAGED = "not_engaged"
@@ -55,48 +55,50 @@ class Reason(StrEnum):
 
 
 _WORDS = {
-    Reason.NOT_ENGAGED: "not engaged: the pilot steers until told otherwise",
-    Reason.NO_HEARTBEAT: "the vehicle is silent; stopped until engaged again",
-    Reason.DISARMED: "the vehicle is disarmed; arm it and engage again",
-    Reason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
-    Reason.NO_STATION: "no ground station heard; stopped until engaged again",
-    Reason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
-    Reason.CONFLICT: "two speak as the vehicle; stopped until engaged again",
-    Reason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
-    Reason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
-    Reason.CLOCK: "time ran backwards; stopped for this update",
-    Reason.FROZEN: "the picture stands still; neutral until it moves",
-    Reason.NO_ANSWER: "the posture does not answer to the efforts; stopped until engaged again",
-    Reason.NO_POSTURE: "no valid posture; neutral until it is back",
-    Reason.NOT_FINITE: "a number is not finite; neutral for this update",
-    Reason.TOO_CLOSE: "closer than the least range; backing away",
-    Reason.TOO_FAST: "closing in too fast; braking",
-    Reason.NO_SETPOINT: "no range is set to hold",
-    Reason.MISSION_OVER: "the plan is done; holding until the pilot takes over",
-    Reason.GAVE_UP: "the target was lost for too long; stopped until engaged again",
+    LimitReason.NOT_ENGAGED: "not engaged: the pilot steers until told otherwise",
+    LimitReason.NO_HEARTBEAT: "the vehicle is silent; stopped until engaged again",
+    LimitReason.DISARMED: "the vehicle is disarmed; arm it and engage again",
+    LimitReason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
+    LimitReason.NO_STATION: "no ground station heard; stopped until engaged again",
+    LimitReason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
+    LimitReason.CONFLICT: "two speak as the vehicle; stopped until engaged again",
+    LimitReason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
+    LimitReason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
+    LimitReason.CLOCK: "time ran backwards; stopped for this update",
+    LimitReason.FROZEN: "the picture stands still; neutral until it moves",
+    LimitReason.NO_ANSWER: (
+        "the posture does not answer to the efforts; stopped until engaged again"
+    ),
+    LimitReason.NO_POSTURE: "no valid posture; neutral until it is back",
+    LimitReason.NOT_FINITE: "a number is not finite; neutral for this update",
+    LimitReason.TOO_CLOSE: "closer than the least range; backing away",
+    LimitReason.TOO_FAST: "closing in too fast; braking",
+    LimitReason.NO_SETPOINT: "no range is set to hold",
+    LimitReason.MISSION_OVER: "the plan is done; holding until the pilot takes over",
+    LimitReason.GAVE_UP: "the target was lost for too long; stopped until engaged again",
 }
 _TAKES_OVER = frozenset(
     {
-        Reason.NOT_ENGAGED,
-        Reason.NO_HEARTBEAT,
-        Reason.DISARMED,
-        Reason.PILOT_MODE,
-        Reason.NO_STATION,
-        Reason.IGNORED,
-        Reason.CONFLICT,
-        Reason.UNKNOWN_MODE,
-        Reason.PILOT_STICKS,
-        Reason.NO_ANSWER,
-        Reason.GAVE_UP,
+        LimitReason.NOT_ENGAGED,
+        LimitReason.NO_HEARTBEAT,
+        LimitReason.DISARMED,
+        LimitReason.PILOT_MODE,
+        LimitReason.NO_STATION,
+        LimitReason.IGNORED,
+        LimitReason.CONFLICT,
+        LimitReason.UNKNOWN_MODE,
+        LimitReason.PILOT_STICKS,
+        LimitReason.NO_ANSWER,
+        LimitReason.GAVE_UP,
     }
 )
 
 _REFUSED_MODES = {
-    Mode.PILOT: Reason.PILOT_MODE,
-    Mode.NO_STATION: Reason.NO_STATION,
-    Mode.IGNORED: Reason.IGNORED,
-    Mode.CONFLICT: Reason.CONFLICT,
-    Mode.UNKNOWN: Reason.UNKNOWN_MODE,
+    Mode.PILOT: LimitReason.PILOT_MODE,
+    Mode.NO_STATION: LimitReason.NO_STATION,
+    Mode.IGNORED: LimitReason.IGNORED,
+    Mode.CONFLICT: LimitReason.CONFLICT,
+    Mode.UNKNOWN: LimitReason.UNKNOWN_MODE,
 }
 
 
@@ -170,26 +172,26 @@ class SafetyGate:
 
     Attributes
     ----------
-    latched : Reason or None
+    latched : LimitReason or None
         Why nothing passes until `engage`; None while engaged.
     """
 
     def __init__(self, limits: SafetyLimits | None = None) -> None:
         self.limits = limits or SafetyLimits()
-        self.latched: Reason | None = Reason.NOT_ENGAGED
+        self.latched: LimitReason | None = LimitReason.NOT_ENGAGED
         self._last_s = -math.inf
         self._seen: deque[tuple[float, float]] = deque(maxlen=32)
 
-    def engage(self, now_s: float, state: VehicleState) -> Reason | None:
+    def engage(self, now_s: float, state: VehicleState) -> LimitReason | None:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
         refused = self._vehicle_refuses(now_s, state)
         if refused is None and state.rival:
             # At the start it is unknown which of them is the vehicle; later, the newcomer is not.
-            refused = Reason.CONFLICT
-        self.latched = Reason.NOT_ENGAGED if refused else None
+            refused = LimitReason.CONFLICT
+        self.latched = LimitReason.NOT_ENGAGED if refused else None
         return refused
 
-    def stop(self, reason: Reason = Reason.NOT_ENGAGED) -> None:
+    def stop(self, reason: LimitReason = LimitReason.NOT_ENGAGED) -> None:
         """Let nothing pass until `engage`."""
         self.latched = reason
 
@@ -202,8 +204,8 @@ class SafetyGate:
         effort: Effort,
         *,
         range_rate: float | None = None,
-        doubt: Reason | None = None,
-    ) -> tuple[Effort, Reason | None]:
+        doubt: LimitReason | None = None,
+    ) -> tuple[Effort, LimitReason | None]:
         """Return the effort that may be sent, and the reason if it differs from the request.
 
         Parameters
@@ -220,30 +222,30 @@ class SafetyGate:
             What controllers ask for.
         range_rate : float, optional
             In m/s, where a filter knows it; else it follows from postures in a row.
-        doubt : Reason, optional
+        doubt : LimitReason, optional
             Why the posture is not to be trusted, where something has noticed.
         """
         refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state, doubt)
         refused = refused or self._sight_refuses(posture_age_s, posture) or _refused_effort(effort)
         if refused is not None or posture is None:
-            return NEUTRAL, refused or Reason.NO_POSTURE
+            return NEUTRAL, refused or LimitReason.NO_POSTURE
         near = min(posture.range, posture.nearest)
         closing = self._closing_speed(now_s - posture_age_s, near, range_rate)
         # A target that approached is assumed to approach further while it is not seen.
         return self._guarded(effort, near - max(closing, 0.0) * posture_age_s, closing)
 
-    def _clock_refuses(self, now_s: float) -> Reason | None:
+    def _clock_refuses(self, now_s: float) -> LimitReason | None:
         backwards = not now_s >= self._last_s
         # Continue from the new time: a clock that was set back must not stop the gate for good.
         self._last_s = now_s if math.isfinite(now_s) else -math.inf
         if backwards or not math.isfinite(now_s):
             self._seen.clear()
-            return Reason.CLOCK
+            return LimitReason.CLOCK
         return None
 
     def _vehicle_stops(
-        self, now_s: float, state: VehicleState, doubt: Reason | None
-    ) -> Reason | None:
+        self, now_s: float, state: VehicleState, doubt: LimitReason | None
+    ) -> LimitReason | None:
         """Return why the vehicle may not be steered; most reasons last until engaged again."""
         if self.latched is None:
             self.latched = self._vehicle_refuses(now_s, state)
@@ -251,24 +253,24 @@ class SafetyGate:
             self.latched = doubt
         return self.latched or doubt
 
-    def _vehicle_refuses(self, now_s: float, state: VehicleState) -> Reason | None:
+    def _vehicle_refuses(self, now_s: float, state: VehicleState) -> LimitReason | None:
         # A heartbeat from the future is by another clock, and useless.
         if not -self.limits.heartbeat_age <= now_s - state.heard_s <= self.limits.heartbeat_age:
-            return Reason.NO_HEARTBEAT
+            return LimitReason.NO_HEARTBEAT
         if not state.armed:
-            return Reason.DISARMED
+            return LimitReason.DISARMED
         if state.mode is not Mode.OURS:
             return _REFUSED_MODES[state.mode]
         if state.pilot_moves:
-            return Reason.PILOT_STICKS
+            return LimitReason.PILOT_STICKS
         return None
 
-    def _sight_refuses(self, age_s: float, posture: Posture | None) -> Reason | None:
+    def _sight_refuses(self, age_s: float, posture: Posture | None) -> LimitReason | None:
         if posture is None or not 0.0 <= age_s < self.limits.posture_age:
-            return Reason.NO_POSTURE
+            return LimitReason.NO_POSTURE
         known = (posture.range, posture.pitch, posture.yaw, posture.nearest)
         if not all(map(math.isfinite, known)):
-            return Reason.NOT_FINITE
+            return LimitReason.NOT_FINITE
         return None
 
     def _closing_speed(self, seen_s: float, near: float, range_rate: float | None) -> float:
@@ -289,16 +291,18 @@ class SafetyGate:
         gentle, firm = self.limits.retreat_effort, self.limits.brake_effort
         return gentle + max(firm - gentle, 0.0) * min(within / _FIRM_WITHIN_M, 1.0)
 
-    def _guarded(self, effort: Effort, near: float, closing: float) -> tuple[Effort, Reason | None]:
+    def _guarded(
+        self, effort: Effort, near: float, closing: float
+    ) -> tuple[Effort, LimitReason | None]:
         """Return the effort without the part that brings the target too close."""
         limits = self.limits
         left = near - limits.least_range
         if left < 0.0:
-            return _backing(effort, self._retreat(-left)), Reason.TOO_CLOSE
+            return _backing(effort, self._retreat(-left)), LimitReason.TOO_CLOSE
         allowed = min(limits.approach_speed, left / limits.stopping_time)
         if closing > allowed:
             share = min((closing - allowed) / (_FIRM_ABOVE * allowed + 1e-6), 1.0)
-            return _backing(effort, share * limits.brake_effort), Reason.TOO_FAST
+            return _backing(effort, share * limits.brake_effort), LimitReason.TOO_FAST
         return _clipped(effort), None
 
 
@@ -311,9 +315,9 @@ _SPEED_WINDOW_S = 0.4
 _LEAST_WINDOW_S = 0.15
 
 
-def _refused_effort(effort: Effort) -> Reason | None:
+def _refused_effort(effort: Effort) -> LimitReason | None:
     parts = (effort.forward, effort.right, effort.down, effort.yaw)
-    return None if all(map(math.isfinite, parts)) else Reason.NOT_FINITE
+    return None if all(map(math.isfinite, parts)) else LimitReason.NOT_FINITE
 
 
 def _backing(effort: Effort, least: float) -> Effort:
@@ -415,10 +419,11 @@ class _Moment(NamedTuple):
 class AnswerWatch:
     """Detector of postures that do not respond to efforts.
 
-    `Reason.FROZEN` while postures repeat to the bit, or their noise has all but vanished: a picture
-    that stands still. `Reason.NO_ANSWER` where the efforts must have brought the vehicle nearer, or
-    the autopilot reports that it has turned, and the posture shows nothing of it: a picture that
-    stands still in spite of its noise, a vehicle that is caught, sticks that turn the other way.
+    `LimitReason.FROZEN` while postures repeat to the bit, or their noise has all but vanished: a
+    picture that stands still. `LimitReason.NO_ANSWER` where the efforts must have brought the
+    vehicle nearer, or the autopilot reports that it has turned, and the posture shows nothing of
+    it: a picture that stands still in spite of its noise, a vehicle that is caught, sticks that
+    turn the other way.
 
     Parameters
     ----------
@@ -459,7 +464,7 @@ class AnswerWatch:
             self._pushed_s = now_s
         self._effort = effort
 
-    def see(self, now_s: float, posture: Posture, state: VehicleState) -> Reason | None:
+    def see(self, now_s: float, posture: Posture, state: VehicleState) -> LimitReason | None:
         """Add a new posture; return why it cannot be used, None if it can.
 
         Parameters
@@ -474,12 +479,12 @@ class AnswerWatch:
             return None
         self._go_on(now_s, posture.yaw, state)
         if self._repeats(now_s, posture) or self._noise.vanished(posture):
-            return Reason.FROZEN
+            return LimitReason.FROZEN
         moment = _Moment(now_s, posture.range, posture.yaw, self._speed, self._way, self._heading)
         self._moments.append(moment)
         while now_s - self._moments[0].time_s > self.limits.window_s + _SLOPE_S:
             self._moments.popleft()
-        return Reason.NO_ANSWER if self._is_unanswered() else None
+        return LimitReason.NO_ANSWER if self._is_unanswered() else None
 
     def _repeats(self, now_s: float, posture: Posture) -> bool:
         """Return whether the posture has been the same to the bit while an effort was in force."""

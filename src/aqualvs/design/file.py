@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from aqualvs.control.gains_file import NotNegative, Number, Part, Positive, parse_settings
+from aqualvs.control.gains_file import parse_settings
 from aqualvs.design.settings import (
     Design,
     Goals,
     Mount,
-    NetFacts,
     Noise,
+    NominalNet,
     Tolerances,
     mount_of_laser,
     ring,
@@ -27,6 +27,7 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, StrictPart
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.plane_fit import SharedError
 from aqualvs.yamlfile import parse_yaml, read_yaml
@@ -68,7 +69,7 @@ _Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
 _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
 
 
-class CameraPart(Part):
+class CameraDesign(StrictPart):
     """Schema of `camera`: size and field of view, or a rig file with its intrinsics."""
 
     width_px: _Pixels | None = None
@@ -78,7 +79,7 @@ class CameraPart(Part):
     rig: str | None = None
 
 
-class DomePart(Part):
+class DomeDesign(StrictPart):
     """Schema of `dome`."""
 
     inner_radius_mm: _Length
@@ -86,14 +87,14 @@ class DomePart(Part):
     n_acrylic: _Index = 1.49
 
 
-class LensPart(Part):
+class LensDesign(StrictPart):
     """Schema of `lens`: nominal projection centre, and its tolerance."""
 
     position_mm: _Triple = Field(default=[0.0, 0.0, 0.0])
     centring_mm: NotNegative = 1.0
 
 
-class WaterPart(Part):
+class WaterDesign(StrictPart):
     """Schema of `water`: its index, or the values to compute it from."""
 
     n: _Index | None = None
@@ -101,7 +102,7 @@ class WaterPart(Part):
     salinity_permille: Number | None = None
 
 
-class LasersPart(Part):
+class LasersDesign(StrictPart):
     """Schema of `lasers`, evenly round the dome."""
 
     count: Annotated[int, Field(ge=1, le=8)] = 3
@@ -111,7 +112,7 @@ class LasersPart(Part):
     turn_stripes: bool = False
 
 
-class MountPart(Part):
+class MountPart(StrictPart):
     """Schema of one of `mounts`; missing angles are optimised."""
 
     name: str
@@ -121,14 +122,14 @@ class MountPart(Part):
     fan_deg: _Fan = FAN_DEG
 
 
-class NetPart(Part):
+class NetPart(StrictPart):
     """Schema of `net`."""
 
     bar_mm: _Length = 15.0
     twine_mm: _Length = 2.5
 
 
-class NoisePart(Part):
+class NoisePart(StrictPart):
     """Schema of `noise`: one sigma, see docs/hardware.md."""
 
     point_px: Positive = Noise().point
@@ -139,7 +140,7 @@ class NoisePart(Part):
     net_tilt_px: NotNegative = Noise().net.tilt_px
 
 
-class TolerancesPart(Part):
+class TolerancesPart(StrictPart):
     """Schema of `tolerances`: one sigma of the errors after calibration."""
 
     lens_mm: NotNegative = 0.03
@@ -151,23 +152,23 @@ class TolerancesPart(Part):
     laser_mm: NotNegative = 0.07
 
 
-class GoalsPart(Part):
+class GoalsPart(StrictPart):
     """Schema of `goals`."""
 
     range_percent: Positive = 0.5
     angle_deg: Positive = 0.5
 
 
-class DesignFile(Part):
+class DesignFile(StrictPart):
     """Schema of a whole design file."""
 
     aqualvs_design: int
     name: str = "design"
-    camera: CameraPart
-    dome: DomePart | None = None
-    lens: LensPart = LensPart()
-    water: WaterPart = WaterPart(n=1.3345)
-    lasers: LasersPart | None = None
+    camera: CameraDesign
+    dome: DomeDesign | None = None
+    lens: LensDesign = LensDesign()
+    water: WaterDesign = WaterDesign(n=1.3345)
+    lasers: LasersDesign | None = None
     mounts: Annotated[list[MountPart], Field(min_length=1)] | None = None
     working_range_mm: Annotated[list[_Length], Field(min_length=2, max_length=2)]
     net: NetPart = NetPart()
@@ -287,7 +288,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         centring=file.lens.centring_mm * _MM,
         noise=_noise(file.noise),
         tolerances=_tolerances(file.tolerances),
-        net=NetFacts(bar=file.net.bar_mm * _MM, twine=file.net.twine_mm * _MM),
+        net=NominalNet(bar=file.net.bar_mm * _MM, twine=file.net.twine_mm * _MM),
         goals=Goals(
             range_share=file.goals.range_percent / 100.0,
             angle=math.radians(file.goals.angle_deg),
@@ -296,7 +297,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
     )
 
 
-def _lens(camera: CameraPart, folder: Path) -> tuple[Lens, tuple[int, int]]:
+def _lens(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int]]:
     if camera.rig is not None:
         if camera.width_px or camera.height_px or camera.fov_deg:
             raise OptionError(
@@ -323,7 +324,7 @@ def _lens(camera: CameraPart, folder: Path) -> tuple[Lens, tuple[int, int]]:
     return Lens(model=model, fx=focal, fy=focal, cx=middle[0], cy=middle[1]), (width, height)
 
 
-def _water_index(water: WaterPart) -> float:
+def _water_index(water: WaterDesign) -> float:
     if water.n is not None:
         if water.temperature_c is not None or water.salinity_permille is not None:
             raise OptionError("water gives n and what it would follow from; keep one of them")

@@ -1,7 +1,7 @@
 """Predicted errors of range, pitch and yaw of a design, from noise and tolerances, and its score.
 
 The score of a choice of laser angles is the root mean square error over the working range, in
-multiples of the goals, with penalties for missing and crossing stripes (`Score`).
+multiples of the goals, with penalties for missing and crossing stripes (`AngleScore`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ _SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
+class PredictedErrors:
     """Predicted errors of a design on walls and nets square ahead, at W ranges.
 
     Attributes
@@ -67,7 +67,7 @@ class Prediction:
         return together(self.systematic)
 
 
-def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) -> Prediction:
+def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) -> PredictedErrors:
     """Predict a design's errors.
 
     Parameters
@@ -80,7 +80,7 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
     camera = design.rig.camera()
     stripes = see_stripes(camera, design.mounts, walls, index_step(camera, design.tolerances))
     solid, mesh = wall_sums(stripes, design.noise), net_sums(stripes, design)
-    return Prediction(
+    return PredictedErrors(
         ranges=walls,
         stripes=stripes,
         wall=_sigmas(posture_covariance(solid, walls)),
@@ -248,7 +248,7 @@ _NO_POSTURE = 1e4
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class AngleScore:
     """Score of a choice of angles; less is better.
 
     Attributes
@@ -319,7 +319,7 @@ class Judge:
         return Lot(stripes, (on_wall, on_net))
 
     def judge(self, lot: Lot, others: Lot) -> tuple[FloatArray, FloatArray]:
-        """Return error and total (see `Score`) of every candidate (K,) beside other lasers."""
+        """Return error and total (see `AngleScore`) of every candidate (K,) beside other lasers."""
         goals = self._design.goals
         wanted = np.array([goals.range_share, goals.angle, goals.angle])
         squares = np.zeros((len(lot), len(self._ranges)))
@@ -348,12 +348,12 @@ class Judge:
         return share
 
 
-def score(design: Design) -> Score:
+def score(design: Design) -> AngleScore:
     """Return the score of the angles of a design's mounts."""
     judge = Judge(design)
     lot = judge.trace(design.mounts)
     errors, totals = judge.judge(lot.take([0]), lot.take(range(1, len(lot))))
-    return Score(float(errors[0]), float(totals[0]))
+    return AngleScore(float(errors[0]), float(totals[0]))
 
 
 @kernel

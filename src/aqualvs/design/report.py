@@ -15,7 +15,7 @@ from rich.table import Table
 from aqualvs.check.finding import escaped
 from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost, camera_errors
 from aqualvs.design.changes import Change
-from aqualvs.design.judge import Prediction, predict, together
+from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design, Mount
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.report.figure_style import new_canvas
@@ -59,7 +59,7 @@ def summary(design: Design) -> list[str]:
     ]
 
 
-def lasers_table(design: Design, told: Prediction) -> Table:
+def lasers_table(design: Design, told: PredictedErrors) -> Table:
     """Return the table of the lasers' mounts and of the ranges at which they are in the picture."""
     table = _table("Lasers: where, at what angles, at which ranges in the picture")
     headings = ("x\nmm", "y\nmm", "z\nmm", "baseline\nmm", "stripe\ndeg", "tilt\ndeg")
@@ -91,7 +91,7 @@ def _interval(ranges: FloatArray, visible: BoolArray) -> str:
     return ", ".join(pieces) or "nowhere"
 
 
-def error_table(told: Prediction, systematic: FloatArray, title: str) -> Table:
+def error_table(told: PredictedErrors, systematic: FloatArray, title: str) -> Table:
     """Return one sigma of range, pitch and yaw by range; `systematic` (W, 3) is all of it."""
     table = _table(title, first="range\nmm", right=True)
     table.add_column("\nfrom")
@@ -209,7 +209,7 @@ def _change(share: float) -> str:
     return f"{percent:+d}" if percent else "0"
 
 
-def findings(design: Design, told: Prediction) -> list[str]:
+def findings(design: Design, told: PredictedErrors) -> list[str]:
     """Return findings: missing postures, stripes out of the picture, crossings."""
     lines = []
     if len(design.mounts) < 2:

@@ -255,7 +255,7 @@ class Tolerances:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NetFacts:
+class NominalNet:
     """Nominal net: length of a bar and diameter of its twine, in metres."""
 
     bar: float
@@ -294,7 +294,7 @@ class Design:
         Standard deviation of the lens's place before a calibration, metres.
     noise : Noise
     tolerances : Tolerances
-    net : NetFacts
+    net : NominalNet
     goals : Goals
     avoid_crossings : bool
         Whether stripes that cross in the picture count against a design.
@@ -305,7 +305,7 @@ class Design:
     centring: float = 1e-3
     noise: Noise = field(default_factory=Noise)
     tolerances: Tolerances = field(default_factory=Tolerances)
-    net: NetFacts = field(default_factory=lambda: NetFacts(bar=15e-3, twine=2.5e-3))
+    net: NominalNet = field(default_factory=lambda: NominalNet(bar=15e-3, twine=2.5e-3))
     goals: Goals = field(default_factory=Goals)
     avoid_crossings: bool = True
 

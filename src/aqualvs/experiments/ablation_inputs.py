@@ -11,9 +11,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
 from aqualvs.experiments.growth_and_sun import scene
-from aqualvs.experiments.laboratory import Dive, Laboratory, Variant, drawn, findings, series
+from aqualvs.experiments.laboratory import (
+    Laboratory,
+    RenderedDive,
+    Variant,
+    drawn,
+    findings,
+    series,
+)
 from aqualvs.experiments.tank import wall_dive
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
@@ -23,7 +36,7 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, new_figure
 from aqualvs.simulation.lasers import LaserSource, default_sources
 from aqualvs.simulation.scenario import Scenario, parse_scenario
-from aqualvs.simulation.video import Recording
+from aqualvs.simulation.video import Compression
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,22 +46,22 @@ _CRFS = (20, 26, 32, 38)
 _DEFAULT = 20
 
 
-def _run_video(laboratory: Laboratory) -> Outcome:
+def _run_video(laboratory: Laboratory) -> ExperimentResult:
     # The clear net of the growth experiment, whose H.264 at the default quality is there already.
     course = scene("clear")
-    raw = laboratory.dive(course, recording=Recording(codec="lossless"))
+    raw = laboratory.dive(course, recording=Compression(codec="lossless"))
     variants = [_variant(laboratory, raw, "uncompressed")]
     for crf in _CRFS:
-        dive = laboratory.dive(course, recording=Recording(crf=crf))
+        dive = laboratory.dive(course, recording=Compression(crf=crf))
         variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == _DEFAULT))
     first, last = variants[1], variants[-1]
-    return Outcome(
+    return ExperimentResult(
         sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
         f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} it is "
         f"{last.rms[0]:.3f} %.",
         findings=findings(variants),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="ablation_video",
                 caption="Root mean square errors on a clear net from the same pictures, "
                 "uncompressed and coded ever more coarsely.",
@@ -59,7 +72,7 @@ def _run_video(laboratory: Laboratory) -> Outcome:
     )
 
 
-def _variant(laboratory: Laboratory, dive: Dive, name: str, ours: bool = False) -> Variant:
+def _variant(laboratory: Laboratory, dive: RenderedDive, name: str, ours: bool = False) -> Variant:
     frames = dive.scenario.n_frames
     rate = 8e-6 * dive.video.stat().st_size * dive.scenario.fps / frames
     named = Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),))
@@ -96,7 +109,7 @@ def before_wall() -> Scenario:
     return parse_scenario(facts, "sheets", "sheets")
 
 
-def _run_sheets(laboratory: Laboratory) -> Outcome:
+def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
     bent = _behind_windows(laboratory.rig)
     flat = _with_best_planes(bent)
     dive = laboratory.dive(before_wall(), bent)
@@ -105,14 +118,14 @@ def _run_sheets(laboratory: Laboratory) -> Outcome:
         Variant("planes that fit them best", (laboratory.measure(dive, rig=flat),)),
     ]
     off = _off_plane_mm(bent)
-    return Outcome(
+    return ExperimentResult(
         sentence=f"Behind windows tilted by 12 to 25 degrees the light leaves its best plane by up "
         f"to {max(off):.1f} mm; taking it for planes costs {variants[1].rms[0]:.2f} % of the "
         f"range instead of {variants[0].rms[0]:.3f} %.",
         findings=(
             *findings(variants),
             *(
-                Finding(
+                ExperimentRow(
                     what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its "
                     "best plane in the working range (mm)",
                     paper="",
@@ -122,7 +135,7 @@ def _run_sheets(laboratory: Laboratory) -> Outcome:
             ),
         ),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="ablation_sheets",
                 caption="Root mean square errors before a wall with lasers behind tilted windows.",
                 figure=drawn(variants),
@@ -193,7 +206,7 @@ _WATERS = 0.007
 """From fresh to sea water (S = 35): what one who never measures the index may be off by."""
 
 
-def _run_beliefs(laboratory: Laboratory) -> Outcome:
+def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
     dive = wall_dive(laboratory)
     index = np.array([_worst(laboratory, dive, _with_index(dive.rig, d)) for d in _INDEX_STEPS])
     lens = np.array(
@@ -204,17 +217,17 @@ def _run_beliefs(laboratory: Laboratory) -> Outcome:
     )
     per_index = _slope(_INDEX_STEPS, index) * _WATERS
     per_mm = np.array([_slope(_LENS_STEPS_MM, row) for row in lens])
-    return Outcome(
+    return ExperimentResult(
         sentence=f"Sea water taken for fresh costs {per_index:.2f} % of the range through this "
         f"dome; a lens believed 1 mm from its place costs up to {per_mm.max():.1f} %.",
         findings=(
-            Finding(
+            ExperimentRow(
                 what=f"range error for an index wrong by {_WATERS} (%)",
                 paper="",
                 ours=f"{per_index:.2f}",
             ),
             *(
-                Finding(
+                ExperimentRow(
                     what=f"range error for each mm that the lens is believed too far {name} (%)",
                     paper="",
                     ours=f"{cost:.2f}",
@@ -223,7 +236,7 @@ def _run_beliefs(laboratory: Laboratory) -> Outcome:
             ),
         ),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="ablation_beliefs",
                 caption="Largest range error before the wall at the paper's four distances when "
                 "the scanner believes another index of the water (left) or another place of the "
@@ -232,11 +245,11 @@ def _run_beliefs(laboratory: Laboratory) -> Outcome:
             ),
         ),
         series=(
-            Series(
+            DataColumns(
                 name="ablation_index",
                 columns={"index_error": np.array(_INDEX_STEPS), "range_error_percent": index},
             ),
-            Series(
+            DataColumns(
                 name="ablation_lens",
                 columns={
                     "lens_error_mm": np.array(_LENS_STEPS_MM),
@@ -266,7 +279,7 @@ def _with_lens(rig: Rig, axis: int, step_mm: float) -> Rig:
     return replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, place))
 
 
-def _worst(laboratory: Laboratory, dive: Dive, rig: Rig) -> float:
+def _worst(laboratory: Laboratory, dive: RenderedDive, rig: Rig) -> float:
     """Return the range error of the place where it is largest, in percent, with its sign."""
     percent = laboratory.measure(dive, rig=rig).range_percent
     found = percent[np.isfinite(percent)]

@@ -12,9 +12,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
 from aqualvs.experiments.growth_and_sun import scene
-from aqualvs.experiments.laboratory import Dive, Laboratory, Variant, drawn, findings, series, told
+from aqualvs.experiments.laboratory import (
+    Laboratory,
+    RenderedDive,
+    Variant,
+    drawn,
+    findings,
+    series,
+    told,
+)
 from aqualvs.experiments.mesh_filter import (
     Judged,
     LitTruth,
@@ -27,26 +41,26 @@ from aqualvs.experiments.mesh_filter import (
 )
 from aqualvs.experiments.tank import wall_dive
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.paper.detector import FilteredPoints, ThresholdOptions
+from aqualvs.scanning.paper.detector import FilteredPoints
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
-from aqualvs.scanning.stripe import StripeOptions
+from aqualvs.scanning.stripe import StripeOptions, ThresholdOptions
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 
 _LEVELS = (100, 140, 180)
 _NETS = {"sun": "net in sun", "growth": "grown net"}
 
 
-def _run_stripes(laboratory: Laboratory) -> Outcome:
+def _run_stripes(laboratory: Laboratory) -> ExperimentResult:
     dives = {"wall": wall_dive(laboratory)} | {
         where: laboratory.dive(scene(name)) for name, where in _NETS.items()
     }
     variants = [one for where, dive in dives.items() for one in _variants(laboratory, dive, where)]
-    return Outcome(
+    return ExperimentResult(
         sentence=_sentence(variants, list(dives)),
         findings=findings(variants),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="ablation_stripes",
                 caption="Root mean square errors with the sub-pixel detector and with thresholds.",
                 figure=drawn(variants),
@@ -83,7 +97,7 @@ def _sentence(variants: list[Variant], places: list[str]) -> str:
     )
 
 
-def _variants(laboratory: Laboratory, dive: Dive, where: str) -> list[Variant]:
+def _variants(laboratory: Laboratory, dive: RenderedDive, where: str) -> list[Variant]:
     ours = ScannerOptions(detector=StripeOptions())
     found = [Variant(f"sub-pixel, {where}", (laboratory.measure(dive, ours),), ours=True)]
     for level in _LEVELS:
@@ -106,7 +120,7 @@ STRIPES = Experiment(
 _FITS = {"robust": FitMethod.ROBUST, "pseudo-inverse": FitMethod.PSEUDO_INVERSE}
 
 
-def _run_fits(laboratory: Laboratory) -> Outcome:
+def _run_fits(laboratory: Laboratory) -> ExperimentResult:
     dives = {
         "wall": wall_dive(laboratory),
         "net": net_dive(laboratory),
@@ -122,12 +136,12 @@ def _run_fits(laboratory: Laboratory) -> Outcome:
         for fit, method in _FITS.items()
     ]
     times = [b.rms[0] / a.rms[0] for a, b in zip(variants[::2], variants[1::2], strict=True)]
-    return Outcome(
+    return ExperimentResult(
         sentence="Fitted by the paper's pseudo-inverse to the same target points, the range error "
         f"is {told(times)} times that of the robust fit on {', '.join(dives)}.",
         findings=findings(variants),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="ablation_fits",
                 caption="Root mean square errors with the robust fit and with the pseudo-inverse "
                 "of Eq. 24, on the same points of the target.",
@@ -228,12 +242,12 @@ def nets_at_ranges(net: str) -> Scenario:
     return parse_scenario(facts, f"filters_{net}", f"filters_{net}")
 
 
-def _run_filters(laboratory: Laboratory) -> Outcome:
+def _run_filters(laboratory: Laboratory) -> ExperimentResult:
     seen = [_see(laboratory, net) for net in _FILTERS_NETS]
     rows = [_row(one, k, where) for one in seen for k, where in enumerate(_RANGES)]
     ours = [mean_judged(one.adaptive).recall for one in seen]
     named, best, centres = (max(row.paper[kind][1].recall for row in rows) for kind in _KINDS)
-    return Outcome(
+    return ExperimentResult(
         sentence=f"The adaptive filter keeps {100 * min(ours):.0f} % of a net's reflections or "
         "more without a parameter. The paper's, given every bright pixel, keeps "
         f"{100 * named:.0f} % at best with section 5.2's parameters, and {100 * best:.0f} % with "
@@ -241,7 +255,7 @@ def _run_filters(laboratory: Laboratory) -> Outcome:
         f"{100 * centres:.0f} %.",
         findings=tuple(finding for row in rows for finding in row.findings()),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="ablation_filters",
                 caption="Posture on the net of the mesh experiment with the adaptive filter, and "
                 "with a threshold and the paper's filter before the same search and fit.",
@@ -287,11 +301,11 @@ class _Row:
     adaptive: Judged
     paper: Mapping[str, tuple[_Set, Judged]]
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[ExperimentRow]:
         """Return the rows of the table."""
         what = f"{self.where}: precision, recall of net reflections"
-        return [Finding(what=f"{what}, adaptive", paper="", ours=told(self.adaptive))] + [
-            Finding(
+        return [ExperimentRow(what=f"{what}, adaptive", paper="", ours=told(self.adaptive))] + [
+            ExperimentRow(
                 what=f"{what}, {kind}",
                 paper="",
                 ours=f"{told(judged)} ({one.told})",
@@ -320,7 +334,7 @@ def _best(judged: Mapping[_Set, Judged]) -> tuple[_Set, Judged]:
     return max(judged.items(), key=worth)
 
 
-def _postures(laboratory: Laboratory, dive: Dive, rows: Sequence[_Row]) -> list[Variant]:
+def _postures(laboratory: Laboratory, dive: RenderedDive, rows: Sequence[_Row]) -> list[Variant]:
     variants = [Variant("adaptive", (laboratory.measure(dive),), ours=True)]
     sets = [one for row in rows for one, _ in row.paper.values() if row.where.startswith("diamond")]
     for one in dict.fromkeys(sets):
@@ -328,14 +342,14 @@ def _postures(laboratory: Laboratory, dive: Dive, rows: Sequence[_Row]) -> list[
     return variants
 
 
-def _series(rows: Sequence[_Row]) -> Series:
+def _series(rows: Sequence[_Row]) -> DataColumns:
     judged = {f"{row.where}, adaptive": row.adaptive for row in rows}
     judged |= {
         f"{row.where}, {kind}, {one.told}": found
         for row in rows
         for kind, (one, found) in row.paper.items()
     }
-    return Series(
+    return DataColumns(
         name="ablation_filters",
         columns={
             "filter": list(judged),

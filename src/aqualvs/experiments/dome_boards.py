@@ -19,7 +19,13 @@ from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Series, drawn
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentResult,
+    ExperimentRow,
+    drawn,
+)
 from aqualvs.experiments.laboratory import Laboratory, calibration_pictures
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotvec_from_rotation
@@ -46,7 +52,7 @@ _BAR_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class SolvedDome:
     """The two steps of a calibration, with what they were given.
 
     Attributes
@@ -85,7 +91,7 @@ class Solved:
         return self.dome.uncertainty.sigmas
 
 
-def solve_from_pictures(laboratory: Laboratory) -> Solved:
+def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
     """Solve lens and dome from rendered pictures, distances read off with 0.2 mm of error.
 
     Raises
@@ -113,7 +119,7 @@ def solve_from_pictures(laboratory: Laboratory) -> Solved:
     sets = [BoardSet(name="air", views=views, poses=given, n_medium=truth.n_air)]
     options = DomeOptions(distance_sigma=_READING_SIGMA, distance_offset_sigma=_READING_SIGMA)
     problem = dome_problem(start, sets, lens.uncertainty, options)
-    return Solved(
+    return SolvedDome(
         truth=truth,
         start=problem.bundle.start.rig,
         start_poses=problem.bundle.start.poses,
@@ -162,7 +168,7 @@ def read_with_errors(rows: Sequence[BoardPose], seed: int = _SEED) -> tuple[Boar
     )
 
 
-def start_residuals(solved: Solved) -> list[FloatArray]:
+def start_residuals(solved: SolvedDome) -> list[FloatArray]:
     """Return measured minus predicted pixels (N, 2) of every view, before the dome was solved."""
     seen = solved.start.in_water(solved.start.n_air).camera()
     return [
@@ -171,13 +177,13 @@ def start_residuals(solved: Solved) -> list[FloatArray]:
     ]
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     solved = solve_from_pictures(laboratory)
     before, after = start_residuals(solved), [fit.residuals for fit in solved.dome.views]
     before_px = rms_px(_finite(before))
     off = float(np.linalg.norm([solved.errors[name] for name in _LENS]))
     turned = float(np.linalg.norm([solved.errors[name] for name in _TURN]))
-    return Outcome(
+    return ExperimentResult(
         sentence=f"From {len(after)} boards in air the lens is found to {1e3 * off:.2f} mm and "
         f"the camera's rotation to {np.rad2deg(turned):.3f}°; corners are then "
         f"{solved.dome.rms_px:.2f} px from where they should be, {before_px:.1f} px before.",
@@ -202,21 +208,21 @@ def _run(laboratory: Laboratory) -> Outcome:
     )
 
 
-def _findings(solved: Solved, before_px: float) -> tuple[Finding, ...]:
+def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]:
     held = solved.dome.held_back
     worst = max(abs(solved.errors[n]) / solved.sigmas[n] for n in (*_LENS, *_TURN))
     found = (
         _vector("lens in the dome x, y, z (mm)", _PAPER_LENS, solved, _LENS, 1e3, 2),
         _vector("camera's rotation x, y, z (°)", _PAPER_TURN, solved, _TURN, 180.0 / np.pi, 3),
         _vector("image plane fx, fy, cx, cy (px)", _PAPER_PLANE, solved, _PLANE, 1.0, 1),
-        Finding(
+        ExperimentRow(
             what="largest error of lens and rotation, in standard deviations",
             paper="",
             ours=f"{worst:.1f}",
             bar=f"<= {_BAR_SIGMAS:g}",
             met=worst <= _BAR_SIGMAS,
         ),
-        Finding(
+        ExperimentRow(
             what="corners, rms distance before and after (px)",
             paper="",
             ours=f"{before_px:.2f} and {solved.dome.rms_px:.2f}",
@@ -226,7 +232,7 @@ def _findings(solved: Solved, before_px: float) -> tuple[Finding, ...]:
         return found
     return (
         *found,
-        Finding(
+        ExperimentRow(
             what="corners of boards held back: with the dome, and best without it (px)",
             paper="",
             ours=f"{held.dome_rms_px:.3f} and {held.bare_rms_px:.3f}",
@@ -235,14 +241,14 @@ def _findings(solved: Solved, before_px: float) -> tuple[Finding, ...]:
 
 
 def _vector(
-    what: str, paper: str, solved: Solved, names: Sequence[str], scale: float, digits: int
-) -> Finding:
+    what: str, paper: str, solved: SolvedDome, names: Sequence[str], scale: float, digits: int
+) -> ExperimentRow:
     true = scale * np.array([_numbers(solved.truth)[name] for name in names])
     off = scale * np.array([solved.errors[name] for name in names])
     sigma = scale * np.array([solved.sigmas[name] for name in names])
     found, right = (", ".join(f"{v:.{digits}f}" for v in vs) for vs in (true + off, true))
     spread = ", ".join(f"{v:.{digits}f}" for v in sigma)
-    return Finding(what=what, paper=paper, ours=f"{found} ± {spread} (truth {right})")
+    return ExperimentRow(what=what, paper=paper, ours=f"{found} ± {spread} (truth {right})")
 
 
 def _numbers(rig: Rig) -> dict[str, float]:
@@ -256,11 +262,11 @@ def _finite(residuals: Sequence[FloatArray]) -> FloatArray:
 
 
 def _series(
-    solved: Solved, before: Sequence[FloatArray], after: Sequence[FloatArray]
-) -> tuple[Series, ...]:
+    solved: SolvedDome, before: Sequence[FloatArray], after: Sequence[FloatArray]
+) -> tuple[DataColumns, ...]:
     names = (*_LENS, *_TURN, *_PLANE)
     true = _numbers(solved.truth)
-    parameters = Series(
+    parameters = DataColumns(
         name="parameters",
         columns={
             "name": list(names),
@@ -271,7 +277,7 @@ def _series(
     )
     pixels = np.concatenate([fit.view.pixels for fit in solved.dome.views])
     first, last = np.concatenate(before), np.concatenate(after)
-    corners = Series(
+    corners = DataColumns(
         name="corners",
         columns={
             "board": [fit.label for fit in solved.dome.views for _ in range(len(fit.view))],
@@ -297,13 +303,13 @@ _RESIDUALS_CAPTION = (
 )
 
 
-def _draw_boards(figure: "Figure", solved: Solved) -> None:
+def _draw_boards(figure: "Figure", solved: SolvedDome) -> None:
     side, picture = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_side(side, solved)
     _draw_picture(picture, solved)
 
 
-def _draw_side(axes: "Axes", solved: Solved) -> None:
+def _draw_side(axes: "Axes", solved: SolvedDome) -> None:
     """Draw boards, dome and lens in the dome's y-z plane, in millimetres."""
     for fit in solved.dome.views:
         x, y = fit.view.points[:, 0], fit.view.points[:, 1]
@@ -326,7 +332,7 @@ def _draw_side(axes: "Axes", solved: Solved) -> None:
     axes.set_title("boards carried away from the dome")
 
 
-def _draw_picture(axes: "Axes", solved: Solved) -> None:
+def _draw_picture(axes: "Axes", solved: SolvedDome) -> None:
     fit = solved.dome.views[len(solved.dome.views) // 3]
     axes.imshow(read_grey(solved.folder / fit.view.name), cmap="gray", vmin=0, vmax=255)
     found, said = fit.view.pixels, fit.view.pixels - fit.residuals
@@ -339,7 +345,7 @@ def _draw_picture(axes: "Axes", solved: Solved) -> None:
     axes.set_xlabel("orange rings: found; blue dots: predicted")
 
 
-def _draw_residuals(figure: "Figure", solved: Solved) -> None:
+def _draw_residuals(figure: "Figure", solved: SolvedDome) -> None:
     after = [fit.residuals for fit in solved.dome.views]
     before = start_residuals(solved)
     pixels = np.concatenate([fit.view.pixels for fit in solved.dome.views])

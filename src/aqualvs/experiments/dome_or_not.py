@@ -5,8 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
-from aqualvs.experiments.laboratory import Laboratory, Measured, calibrated_rig
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, calibrated_rig
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
@@ -72,7 +78,7 @@ def away_and_back(frames: int = _FRAMES) -> Scenario:
     return parse_scenario(facts, "dome_or_not", "dome_or_not")
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     dive = laboratory.dive(away_and_back())
     rig = calibrated_rig(laboratory)
     found = distances(laboratory.measure(dive, rig=rig), rig, level_laser(rig))
@@ -81,13 +87,13 @@ def _run(laboratory: Laboratory) -> Outcome:
     gains = [refitted[k] / _rms(found, found.dome, k) for k in range(4)]
     worst = float(np.abs(found.percent(found.dome)).max())
     bare = float(np.abs(found.percent(found.bare)).max())
-    return Outcome(
+    return ExperimentResult(
         sentence=f"From {min(PLACES_MM)} to {max(PLACES_MM)} mm and back single points are within "
         f"{worst:.2f} % of the truth with the dome model and within {bare:.1f} % without: "
         f"{min(factors):.0f} to {max(factors):.0f} times better by root mean square, where the "
         f"paper has about {_PAPER_FACTOR}.",
         findings=(
-            Finding(
+            ExperimentRow(
                 what="how many times better with the dome model, the worst of left, central, "
                 "right and average",
                 paper=f"about {_PAPER_FACTOR}",
@@ -95,19 +101,19 @@ def _run(laboratory: Laboratory) -> Outcome:
                 bar=f">= {_BAR_FACTOR:g}",
                 met=min(factors) >= _BAR_FACTOR,
             ),
-            Finding(
+            ExperimentRow(
                 what="largest error of a single point with the dome model (%)",
                 paper=f"{_PAPER_PERCENT} (at 300 mm)",
                 ours=f"{worst:.3f}",
                 bar=f"<= {_BAR_PERCENT}",
                 met=worst <= _BAR_PERCENT,
             ),
-            Finding(
+            ExperimentRow(
                 what="range of distances (mm)",
                 paper="300-1000",
                 ours=f"{1e3 * found.true.min():.0f}-{1e3 * found.true.max():.0f}",
             ),
-            Finding(
+            ExperimentRow(
                 what=f"error of the average at {max(PLACES_MM)} mm without the model (mm)",
                 paper="more than 300",
                 ours=f"{_farthest_mm(found, found.bare):+.0f}, and "
@@ -116,13 +122,13 @@ def _run(laboratory: Laboratory) -> Outcome:
             *(_row(found, k, name) for k, name in enumerate((*PICKS, "average"))),
         ),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="figure_19",
                 caption="Distance with and without the dome model from the leftmost point and "
                 "from the average of three, with straight lines through them, beside figure 19.",
                 figure=_distances_drawn(found),
             ),
-            Picture(
+            ExperimentFigure(
                 name="figure_20",
                 caption="Errors of the lines of figure 19 (lines) and of the single distances "
                 "(dots), beside figure 20; below at a finer scale those with the dome model and "
@@ -149,12 +155,12 @@ def level_laser(rig: Rig) -> int:
     return int(np.argmax([abs(laser.plane.normal[2]) for laser in rig.lasers]))
 
 
-def distances(measured: Measured, rig: Rig, laser: int) -> Distances:
+def distances(measured: MeasuredDive, rig: Rig, laser: int) -> Distances:
     """Return the distances of a wall that is square to the vehicle, from one laser's stripe.
 
     Parameters
     ----------
-    measured : Measured
+    measured : MeasuredDive
         With the dome model.
     rig : Rig
         As the scanner believed it.
@@ -216,10 +222,10 @@ def _farthest_mm(found: Distances, which: FloatArray) -> float:
     return float(1e3 * (which[row, 3] - found.true[row]))
 
 
-def _row(found: Distances, pick: int, name: str) -> Finding:
+def _row(found: Distances, pick: int, name: str) -> ExperimentRow:
     slope = np.polyfit(found.true, found.dome[:, pick], 1)[0]
     bare = np.polyfit(found.true, found.bare[:, pick], 1)[0]
-    return Finding(
+    return ExperimentRow(
         what=f"{name}: root mean square error with, without the model (%); slope of the lines",
         paper="",
         ours=f"{_rms(found, found.dome, pick):.3f}, {_rms(found, found.bare, pick):.2f}; "
@@ -227,13 +233,13 @@ def _row(found: Distances, pick: int, name: str) -> Finding:
     )
 
 
-def _series(found: Distances) -> Series:
+def _series(found: Distances) -> DataColumns:
     columns = {"true_range_m": found.true}
     for k, name in enumerate((*PICKS, "average")):
         columns[f"dome_{name}_m"] = found.dome[:, k]
         columns[f"no_dome_{name}_m"] = found.bare[:, k]
         columns[f"no_dome_refitted_{name}_m"] = found.refitted[:, k]
-    return Series(name="dome_or_not", columns=columns)
+    return DataColumns(name="dome_or_not", columns=columns)
 
 
 def _distances_drawn(found: Distances) -> "Figure":

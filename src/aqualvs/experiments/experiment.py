@@ -24,7 +24,7 @@ Column: TypeAlias = FloatArray | IntArray | list[str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class ExperimentRow:
     """One row of an experiment's table.
 
     Attributes
@@ -49,7 +49,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
+class ExperimentFigure:
     """A figure to print.
 
     Attributes
@@ -68,7 +68,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Series:
+class DataColumns:
     """The numbers behind a picture, for a CSV: columns of one length with units in their names."""
 
     name: str
@@ -76,24 +76,24 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class ExperimentResult:
     """Results of an experiment.
 
     Attributes
     ----------
     sentence : str
         The result in one sentence, with its numbers.
-    findings : tuple of Finding
-    pictures : tuple of Picture
-    series : tuple of Series
+    findings : tuple of ExperimentRow
+    pictures : tuple of ExperimentFigure
+    series : tuple of DataColumns
     notes : tuple of str
         What a reader must know to judge it: where it differs from the paper's setting, and why.
     """
 
     sentence: str
-    findings: tuple[Finding, ...]
-    pictures: tuple[Picture, ...] = ()
-    series: tuple[Series, ...] = ()
+    findings: tuple[ExperimentRow, ...]
+    pictures: tuple[ExperimentFigure, ...] = ()
+    series: tuple[DataColumns, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
 
@@ -119,16 +119,18 @@ class Experiment:
     title: str
     paper: str
     about: str
-    run: "Callable[[Laboratory], Outcome]"
+    run: "Callable[[Laboratory], ExperimentResult]"
 
 
-def drawn(name: str, caption: str, height_in: float, draw: "Callable[[Figure], None]") -> Picture:
+def drawn(
+    name: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
+) -> ExperimentFigure:
     """Return a picture of a page's width.
 
     Parameters
     ----------
     name, caption : str
-        As in `Picture`.
+        As in `ExperimentFigure`.
     height_in : float
         Height in inches.
     draw : callable
@@ -139,7 +141,7 @@ def drawn(name: str, caption: str, height_in: float, draw: "Callable[[Figure], N
     with rc_context(dict(STYLE)):
         figure = new_figure(height_in)
         draw(figure)
-    return Picture(name=name, caption=caption, figure=figure)
+    return ExperimentFigure(name=name, caption=caption, figure=figure)
 
 
 _PACKAGE = "aqualvs.experiments"

@@ -11,15 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
-from aqualvs.experiments.laboratory import Dive, Laboratory, Measured, frames_of
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.report.figure_style import BLUE, GREEN, ORANGE, STYLE, new_figure
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.paper.detector import ThresholdOptions
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.simulation.benchmark import CONTRAST_LIMIT, VISIBLE_LIMIT, render_with_visible
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario, parse_scenario
@@ -33,7 +39,7 @@ ENOUGH = VISIBLE_LIMIT
 """Visible stripe points from which on a posture can be asked for."""
 
 
-def visible_points(laboratory: Laboratory, dive: Dive) -> FloatArray:
+def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
     """Return the number of stripe points on the target that stand out, for each frame.
 
     See `aqualvs.simulation.benchmark` for what stands out. The numbers are kept beside the dive.
@@ -42,7 +48,7 @@ def visible_points(laboratory: Laboratory, dive: Dive) -> FloatArray:
     ----------
     laboratory : Laboratory
         Counts the frames, which are rendered once more for this.
-    dive : Dive
+    dive : RenderedDive
     """
     path = dive.folder / _FILE
     if not path.exists():
@@ -94,12 +100,12 @@ _NAMES = ("range", "pitch", "yaw")
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class MeasuredScene:
     """One scene: its dive, what we and the paper's way made of it, and who could have."""
 
-    dive: Dive
-    ours: Measured
-    papers: Measured
+    dive: RenderedDive
+    ours: MeasuredDive
+    papers: MeasuredDive
     visible: FloatArray
 
     @property
@@ -107,7 +113,7 @@ class Seen:
         """Frames in which stripe enough can be seen, shape (N,)."""
         return np.asarray(self.visible >= ENOUGH)
 
-    def valid_percent(self, measured: Measured) -> float:
+    def valid_percent(self, measured: MeasuredDive) -> float:
         """Return the share of those frames that have a posture."""
         return 100.0 * float(np.mean(measured.valid[self.asked])) if self.asked.any() else np.nan
 
@@ -140,18 +146,18 @@ def scene(name: str) -> Scenario:
     return parse_scenario(facts, f"failures_{name}", f"failures_{name}")
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     seen = {name: _seen(laboratory, name) for name in _SCENES}
     valid = {name: one.valid_percent(one.ours) for name, one in seen.items()}
     papers = {name: one.valid_percent(one.papers) for name, one in seen.items()}
-    return Outcome(
+    return ExperimentResult(
         sentence=f"With growth on 60 % of the net {valid['growth']:.0f} %, in sunlight "
         f"{valid['sun']:.0f} % of the frames have a posture, where the paper's filter gives "
         f"{papers['growth']:.0f} and {papers['sun']:.0f} %; range within "
         f"{seen['growth'].rms[0]:.2f} and {seen['sun'].rms[0]:.2f} % root mean square.",
         findings=tuple(row for name in _SCENES for row in _findings(name, seen)),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="figure_24",
                 caption="A frame of each scene and the errors of every frame, with two stated "
                 "standard deviations, beside figure 24.",
@@ -168,9 +174,9 @@ def _run(laboratory: Laboratory) -> Outcome:
     )
 
 
-def _seen(laboratory: Laboratory, name: str) -> Seen:
+def _seen(laboratory: Laboratory, name: str) -> MeasuredScene:
     dive = laboratory.dive(scene(name))
-    return Seen(
+    return MeasuredScene(
         dive,
         laboratory.measure(dive),
         laboratory.measure(dive, PAPERS_WAY),
@@ -178,12 +184,12 @@ def _seen(laboratory: Laboratory, name: str) -> Seen:
     )
 
 
-def _findings(name: str, seen: Mapping[str, Seen]) -> list[Finding]:
+def _findings(name: str, seen: Mapping[str, MeasuredScene]) -> list[ExperimentRow]:
     one, clear = seen[name], seen["clear"]
     valid, judged = one.valid_percent(one.ours), name != "clear"
     limits = np.array(_CLEAR_LIMITS) * (2.0 if judged else 1.0)
     return [
-        Finding(
+        ExperimentRow(
             what=f"{name}: frames with a posture (%)",
             paper="not applicable" if judged else "",
             ours=f"{valid:.0f} (of {int(one.asked.sum())}; the paper's way "
@@ -191,20 +197,20 @@ def _findings(name: str, seen: Mapping[str, Seen]) -> list[Finding]:
             bar=f">= {_BAR_VALID:g}" if judged else "",
             met=valid >= _BAR_VALID if judged else None,
         ),
-        Finding(
+        ExperimentRow(
             what=f"{name}: largest error of range (%), pitch, yaw (degrees)",
             paper="",
             ours=_told(one.largest),
             bar="<= " + ", ".join(f"{limit:g}" for limit in limits),
             met=bool(np.all(one.largest <= limits)),
         ),
-        Finding(
+        ExperimentRow(
             what=f"{name}: root mean square error, and as many times the clear scene's",
             paper="",
             ours=_told(one.rms)
             + (f"; {', '.join(f'{x:.1f}' for x in one.rms / clear.rms)}" if judged else ""),
         ),
-        Finding(
+        ExperimentRow(
             what=f"{name}: stated sigma (median)",
             paper="",
             ours=_told(one.sigmas),
@@ -216,17 +222,17 @@ def _told(values: FloatArray) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
-def _series(name: str, one: Seen) -> Series:
+def _series(name: str, one: MeasuredScene) -> DataColumns:
     columns: dict[str, FloatArray] = {"time_s": one.ours.time_s, "visible_points": one.visible}
     for k, what in enumerate(_NAMES):
         unit, scale = ("m", 1.0) if k == 0 else ("deg", 180.0 / np.pi)
         columns[f"true_{what}_{unit}"] = scale * one.ours.truth[:, k]
         columns[f"{what}_{unit}"] = scale * one.ours.values[:, k]
         columns[f"sigma_{what}_{unit}"] = scale * one.ours.sigmas[:, k]
-    return Series(name=f"failures_{name}", columns=columns)
+    return DataColumns(name=f"failures_{name}", columns=columns)
 
 
-def _drawn(seen: Mapping[str, Seen]) -> "Figure":
+def _drawn(seen: Mapping[str, MeasuredScene]) -> "Figure":
     from matplotlib import rc_context
 
     with rc_context(dict(STYLE)):

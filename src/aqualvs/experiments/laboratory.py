@@ -19,7 +19,7 @@ import numpy as np
 from aqualvs.calibrate.camera import CameraRequest, calibrate_camera
 from aqualvs.calibrate.dome import DomeRequest, calibrate_dome
 from aqualvs.calibrate.lasers import LasersRequest, calibrate_lasers
-from aqualvs.experiments.experiment import Finding, Series
+from aqualvs.experiments.experiment import DataColumns, ExperimentRow
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping, save_rig
@@ -32,7 +32,7 @@ from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simula
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.video import Recording
+from aqualvs.simulation.video import Compression
 from aqualvs.sources import open_source
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Dive:
+class RenderedDive:
     """A rendered dive on disk.
 
     Attributes
@@ -74,7 +74,7 @@ class Dive:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredDive:
     """Dive as one scanner measured it, frame by frame, N of them, beside the truth.
 
     Attributes
@@ -153,7 +153,7 @@ class Laboratory:
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
         self._work = work
         self._tick = tick or (lambda _n: None)
-        self._measured: dict[tuple[str, str], Measured] = {}
+        self._measured: dict[tuple[str, str], MeasuredDive] = {}
         self.frame_s: list[float] = []
 
     @cached_property
@@ -176,9 +176,9 @@ class Laboratory:
         scenario: Scenario,
         rig: Rig | None = None,
         *,
-        recording: Recording | None = None,
+        recording: Compression | None = None,
         point_frames: tuple[int, ...] = (),
-    ) -> Dive:
+    ) -> RenderedDive:
         """Return a dive with its truth, rendered where it has not been yet.
 
         Parameters
@@ -194,7 +194,7 @@ class Laboratory:
         facts = {
             "scenario": repr(scenario),
             "rig": rig_to_mapping(rig),
-            "video": [repr(recording or Recording()), list(point_frames)],
+            "video": [repr(recording or Compression()), list(point_frames)],
         }
         digest = _digest(facts)
         folder = self._work / "dives" / f"{scenario.name}-{digest}"
@@ -209,21 +209,21 @@ class Laboratory:
             )
             save_rig(rig, folder / _RIG)
             (folder / _READY).write_text(json.dumps(facts, default=str), encoding="utf-8")
-        return Dive(folder.name, folder, rig, scenario)
+        return RenderedDive(folder.name, folder, rig, scenario)
 
     def measure(
         self,
-        dive: Dive,
+        dive: RenderedDive,
         options: ScannerOptions | None = None,
         *,
         rig: Rig | None = None,
         no_dome: bool = False,
-    ) -> Measured:
+    ) -> MeasuredDive:
         """Measure every frame of a dive.
 
         Parameters
         ----------
-        dive : Dive
+        dive : RenderedDive
         options : ScannerOptions, optional
         rig : Rig, optional
             What the scanner believes; the true rig by default.
@@ -241,13 +241,13 @@ class Laboratory:
         return self._measured[key]
 
 
-def frames_of(dive: Dive) -> list[Frame]:
+def frames_of(dive: RenderedDive) -> list[Frame]:
     """Return the decoded frames of a dive."""
     with open_source(str(dive.video)) as source:
         return list(source)
 
 
-def _measured(dive: Dive, scanner: Scanner, frame_s: list[float]) -> Measured:
+def _measured(dive: RenderedDive, scanner: Scanner, frame_s: list[float]) -> MeasuredDive:
     scans = []
     with open_source(str(dive.video)) as source:
         for frame in source:
@@ -260,7 +260,7 @@ def _measured(dive: Dive, scanner: Scanner, frame_s: list[float]) -> Measured:
         if scan.index in truth:
             metres, pitch_deg, yaw_deg = truth[scan.index]
             rows[i] = metres, np.deg2rad(pitch_deg), np.deg2rad(yaw_deg)
-    return Measured(scans, rows)
+    return MeasuredDive(scans, rows)
 
 
 def _digest(facts: Mapping[str, Any] | list[Any]) -> str:
@@ -279,13 +279,13 @@ class Variant:
     Attributes
     ----------
     name : str
-    measured : tuple of Measured
+    measured : tuple of MeasuredDive
     ours : bool
         Whether this is what `aqualvs` does by default.
     """
 
     name: str
-    measured: tuple[Measured, ...]
+    measured: tuple[MeasuredDive, ...]
     ours: bool = False
 
     @property
@@ -305,10 +305,10 @@ class Variant:
         return np.asarray(np.sqrt(np.mean(found**2, axis=0))) if len(found) else np.full(3, np.nan)
 
 
-def findings(variants: Sequence[Variant]) -> tuple[Finding, ...]:
+def findings(variants: Sequence[Variant]) -> tuple[ExperimentRow, ...]:
     """Return a row for each variant: root mean square errors, and frames with a posture."""
     return tuple(
-        Finding(
+        ExperimentRow(
             what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
             paper="",
             ours=f"{told(one.rms)}; {one.valid_percent:.0f} %",
@@ -322,14 +322,14 @@ def told(values: Sequence[float] | FloatArray) -> str:
     return ", ".join("-" if not np.isfinite(x) else f"{x:.3g}" for x in values)
 
 
-def series(name: str, variants: Sequence[Variant]) -> Series:
+def series(name: str, variants: Sequence[Variant]) -> DataColumns:
     """Return what `drawn` shows as columns."""
     rms = np.array([one.rms for one in variants])
     columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
     for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
         columns[what] = rms[:, k]
     columns["valid_percent"] = np.array([one.valid_percent for one in variants])
-    return Series(name=name, columns=columns)
+    return DataColumns(name=name, columns=columns)
 
 
 def drawn(variants: Sequence[Variant]) -> "Figure":

@@ -17,7 +17,13 @@ from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.errors import CalibrationError
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Series, drawn
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentResult,
+    ExperimentRow,
+    drawn,
+)
 from aqualvs.experiments.laboratory import Laboratory, calibration_pictures, rig_without_lasers
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
@@ -159,7 +165,7 @@ def _solve(laboratory: Laboratory) -> tuple[LaserCalibration, LaserView]:
     return result, views[0]
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     truth = laboratory.rig
     result, first = _solve(laboratory)
     figures = matched(result.lasers, truth.lasers)
@@ -167,7 +173,7 @@ def _run(laboratory: Laboratory) -> Outcome:
     found = _noted(result, figures, laboratory)
     left = remaining(truth, found)
     angle, offset = max(e.angle for e in errors), max(abs(e.offset) for e in errors)
-    return Outcome(
+    return ExperimentResult(
         sentence=f"{len(result.views)} pictures of the box tell the laser planes to "
         f"{np.rad2deg(angle):.3f}° and {1e3 * offset:.2f} mm; the range error that the whole "
         f"calibration leaves is {np.abs(left.percent).max():.3f} % at most, from 0.3 to 1 m.",
@@ -201,9 +207,9 @@ def _noted(
 
 def _plane_findings(
     truth: Rig, figures: Sequence[LaserFigures], errors: Sequence[PlaneError]
-) -> tuple[Finding, ...]:
+) -> tuple[ExperimentRow, ...]:
     rows = [
-        Finding(
+        ExperimentRow(
             what=f"laser '{laser.name}': normal off by (°), offset off by (mm)",
             paper=f"its way: {np.rad2deg(e.paper_angle):.3f}°, {1e3 * e.paper_offset:+.2f} mm",
             ours=f"{np.rad2deg(e.angle):.3f} ± {np.rad2deg(e.sigma_angle):.3f}°, "
@@ -214,7 +220,7 @@ def _plane_findings(
     worst = max(max(e.angle / e.sigma_angle, abs(e.offset) / e.sigma_offset) for e in errors)
     return (
         *rows,
-        Finding(
+        ExperimentRow(
             what="largest error of a plane, in standard deviations",
             paper="",
             ours=f"{worst:.1f}",
@@ -224,18 +230,18 @@ def _plane_findings(
     )
 
 
-def _left_findings(left: Remaining) -> tuple[Finding, ...]:
+def _left_findings(left: Remaining) -> tuple[ExperimentRow, ...]:
     percent = float(np.abs(left.percent).max())
     degrees = float(np.rad2deg(np.abs(left.errors[:, 1:])).max())
     return (
-        Finding(
+        ExperimentRow(
             what="range error that remains, 0.3 to 1 m, largest (%)",
             paper="",
             ours=f"{percent:.3f}",
             bar=f"<= {_BAR_PERCENT}",
             met=percent <= _BAR_PERCENT,
         ),
-        Finding(
+        ExperimentRow(
             what="pitch and yaw error that remains, largest (°)",
             paper="",
             ours=f"{degrees:.3f}",
@@ -245,8 +251,8 @@ def _left_findings(left: Remaining) -> tuple[Finding, ...]:
     )
 
 
-def _series(truth: Rig, errors: Sequence[PlaneError], left: Remaining) -> tuple[Series, ...]:
-    planes = Series(
+def _series(truth: Rig, errors: Sequence[PlaneError], left: Remaining) -> tuple[DataColumns, ...]:
+    planes = DataColumns(
         name="planes",
         columns={
             "laser": [laser.name for laser in truth.lasers],
@@ -259,7 +265,7 @@ def _series(truth: Rig, errors: Sequence[PlaneError], left: Remaining) -> tuple[
         },
     )
     degrees, sigmas = np.rad2deg(left.errors), np.rad2deg(left.sigmas)
-    remains = Series(
+    remains = DataColumns(
         name="remaining",
         columns={
             "range_m": left.ranges,

@@ -17,17 +17,23 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from aqualvs.experiments.dome_or_not import level_laser
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture
-from aqualvs.experiments.laboratory import Dive, Laboratory, Measured, frames_of, told
+from aqualvs.experiments.experiment import (
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of, told
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.report.figure_style import OURS, PINK, STYLE, new_figure
 from aqualvs.report.mesh_figures import Reflections, drawn_figures
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import plan_searches
-from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
 from aqualvs.scanning.scan import Frame, Label, Scan, ScanPoints
+from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 
 if TYPE_CHECKING:
@@ -35,7 +41,7 @@ if TYPE_CHECKING:
 
 
 def papers_pixels(
-    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions, level: int | None = None
+    laboratory: Laboratory, dive: RenderedDive, options: MeshFilterOptions, level: int | None = None
 ) -> list[FilteredPoints]:
     """Return the bright pixels of every frame, and what the paper's filter keeps of them.
 
@@ -45,7 +51,7 @@ def papers_pixels(
     Parameters
     ----------
     laboratory : Laboratory
-    dive : Dive
+    dive : RenderedDive
     options : MeshFilterOptions
         Of the filter; by default those of section 5.2.
     level : int, optional
@@ -57,7 +63,7 @@ def papers_pixels(
 
 
 def papers_centres(
-    laboratory: Laboratory, dive: Dive, options: MeshFilterOptions
+    laboratory: Laboratory, dive: RenderedDive, options: MeshFilterOptions
 ) -> list[FilteredPoints]:
     """Return the pixels of every frame, on the mesh where the paper's filter keeps their return.
 
@@ -277,17 +283,17 @@ def net_before_wall() -> Scenario:
     return parse_scenario(facts, "mesh", "mesh")
 
 
-def net_dive(laboratory: Laboratory) -> Dive:
+def net_dive(laboratory: Laboratory) -> RenderedDive:
     """Return the dive before the net, shared with those who compare filters."""
     return laboratory.dive(net_before_wall(), point_frames=_JUDGED)
 
 
-def truth_of(dive: Dive) -> list[tuple[int, LitTruth]]:
+def truth_of(dive: RenderedDive) -> list[tuple[int, LitTruth]]:
     """Return the frames whose true points are known, with these."""
     return [(i, LitTruth.read(dive.folder / f"points_{i:04d}.npz")) for i in _JUDGED]
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     dive = net_dive(laboratory)
     measured, frames, truth = laboratory.measure(dive), frames_of(dive), truth_of(dive)
     papers = papers_pixels(laboratory, dive, MeshFilterOptions())
@@ -296,7 +302,7 @@ def _run(laboratory: Laboratory) -> Outcome:
     whole = mean_judged([judge_reflections(adaptive[i], lit) for i, lit in truth])
     theirs = mean_judged([_judge_each(papers[i], lit) for i, lit in truth])
     their_whole = mean_judged([judge_reflections(papers[i], lit) for i, lit in truth])
-    return Outcome(
+    return ExperimentResult(
         sentence=f"Of what the adaptive filter calls net {100 * mine.precision:.1f} % is net, and "
         f"it keeps {100 * whole.recall:.0f} % of the net's reflections, with no parameter given; "
         "a threshold and the paper's filter with its own parameters, given every bright pixel, "
@@ -318,32 +324,32 @@ def _judge_each(found: FilteredPoints, lit: LitTruth) -> Judged:
 
 
 def _findings(
-    mine: Judged, whole: Judged, theirs: Judged, their_whole: Judged, measured: Measured
-) -> tuple[Finding, ...]:
+    mine: Judged, whole: Judged, theirs: Judged, their_whole: Judged, measured: MeasuredDive
+) -> tuple[ExperimentRow, ...]:
     worst = float(np.nanmax(np.abs(measured.range_percent)))
     return (
-        Finding(
+        ExperimentRow(
             what="precision of net points",
             paper="all other reflections rejected",
             ours=f"{mine.precision:.3f}",
             bar=f">= {_BAR_PRECISION}",
             met=mine.precision >= _BAR_PRECISION,
         ),
-        Finding(
+        ExperimentRow(
             what="recall of net points",
             paper="",
             ours=f"{mine.recall:.3f}",
             bar=f">= {_BAR_RECALL}",
             met=mine.recall >= _BAR_RECALL,
         ),
-        Finding(what="precision and recall of net reflections", paper="", ours=told(whole)),
-        Finding(
+        ExperimentRow(what="precision and recall of net reflections", paper="", ours=told(whole)),
+        ExperimentRow(
             what="threshold and paper's filter, section 5.2's parameters: of net pixels",
             paper="",
             ours=told(theirs),
         ),
-        Finding(what="the same of net reflections", paper="", ours=told(their_whole)),
-        Finding(
+        ExperimentRow(what="the same of net reflections", paper="", ours=told(their_whole)),
+        ExperimentRow(
             what="largest error of the range to the net (%)",
             paper="",
             ours=f"{worst:.3f}",
@@ -353,29 +359,31 @@ def _findings(
     )
 
 
-def _pictures(frame: Frame, scan: Scan, papers: FilteredPoints, rig: Rig) -> tuple[Picture, ...]:
+def _pictures(
+    frame: Frame, scan: Scan, papers: FilteredPoints, rig: Rig
+) -> tuple[ExperimentFigure, ...]:
     laser = level_laser(rig)
     reflections = _reflections(papers, scan, rig, laser)
     drawn = drawn_figures(reflections, MeshFilterOptions())
     return (
-        Picture(
+        ExperimentFigure(
             name="figure_12",
             caption="The net as the camera sees it, and the picture above a threshold, beside "
             "figure 12.",
             figure=_seen(frame),
         ),
-        Picture(
+        ExperimentFigure(
             name="figure_13",
             caption="All reflections of the level laser in its plane, beside figure 13.",
             figure=drawn["figure_13"],
         ),
-        Picture(
+        ExperimentFigure(
             name="figure_14",
             caption="What is taken for net, beside figure 14: sub-pixel returns and the adaptive "
             "filter (left), a threshold and the paper's filter (right).",
             figure=_filtered(papers, scan, rig, laser),
         ),
-        Picture(
+        ExperimentFigure(
             name="laser_plane_image",
             caption="The paper's laser-plane image with its structuring elements, beside figure 9.",
             figure=drawn["laser_plane_image"],

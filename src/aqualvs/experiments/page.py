@@ -15,7 +15,6 @@ embedded, and link to the files beside the page. The folder holds
 ==================  ========================================================================
 """
 
-import base64
 import csv
 import hashlib
 import json
@@ -34,10 +33,17 @@ from typing import Any
 import numpy as np
 
 from aqualvs import __version__
-from aqualvs.experiments.experiment import Column, Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.experiment import (
+    Column,
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
 from aqualvs.report import html
 from aqualvs.report.figure_style import STYLE
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.results.files import writing
 
 RESULTS, TIMES, FIGURES, SERIES, WORK = "results.json", "times.json", "figures", "series", "work"
@@ -54,7 +60,7 @@ _DIGITS = 7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shown:
+class PrintedFigure:
     """A figure on disk: stem of its files in `figures/`, its caption, and its width in inches."""
 
     file: str
@@ -71,8 +77,8 @@ class Record:
     name, title, paper, about : str
         As in `Experiment`.
     sentence : str
-    findings : tuple of Finding
-    pictures : tuple of Shown
+    findings : tuple of ExperimentRow
+    pictures : tuple of PrintedFigure
     series : tuple of str
         Files in `series/`.
     notes : tuple of str
@@ -85,14 +91,14 @@ class Record:
     paper: str
     about: str
     sentence: str = ""
-    findings: tuple[Finding, ...] = ()
-    pictures: tuple[Shown, ...] = ()
+    findings: tuple[ExperimentRow, ...] = ()
+    pictures: tuple[PrintedFigure, ...] = ()
     series: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     failure: str = ""
 
 
-def save_outcome(experiment: Experiment, outcome: Outcome, folder: Path) -> Record:
+def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path) -> Record:
     """Write the figures and series of an outcome and return its record.
 
     Raises
@@ -197,15 +203,15 @@ def _record(content: Mapping[str, Any]) -> Record:
     texts = {key: str(content[key]) for key in ("name", "title", "paper", "about", "sentence")}
     return Record(
         **texts,
-        findings=tuple(Finding(**one) for one in content["findings"]),
-        pictures=tuple(Shown(**one) for one in content["pictures"]),
+        findings=tuple(ExperimentRow(**one) for one in content["findings"]),
+        pictures=tuple(PrintedFigure(**one) for one in content["pictures"]),
         series=tuple(content["series"]),
         notes=tuple(content["notes"]),
         failure=str(content["failure"]),
     )
 
 
-def _save_picture(name: str, picture: Picture, folder: Path) -> Shown:
+def _save_picture(name: str, picture: ExperimentFigure, folder: Path) -> PrintedFigure:
     import matplotlib as mpl
 
     stem = f"{name}_{picture.name}"
@@ -216,10 +222,10 @@ def _save_picture(name: str, picture: Picture, folder: Path) -> Shown:
         for kind, metadata in _FORMATS.items():
             picture.figure.savefig(place / f"{stem}.{kind}", metadata=dict(metadata))
     width = round(float(picture.figure.get_figwidth()), 2)
-    return Shown(file=stem, caption=picture.caption, width_in=width)
+    return PrintedFigure(file=stem, caption=picture.caption, width_in=width)
 
 
-def _save_series(name: str, series: Series, folder: Path) -> str:
+def _save_series(name: str, series: DataColumns, folder: Path) -> str:
     file = f"{name}_{series.name}.csv"
     columns = [[_cell(value) for value in _plain(column)] for column in series.columns.values()]
     rows = list(zip(*columns, strict=True))
@@ -300,20 +306,22 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
         If a figure cannot be read.
     """
     return html.page(
+        "reproduce.html",
         {
-            "version": html.text(__version__),
+            "title": "The paper’s experiments, beside ours",
+            "version": __version__,
             "doi": DOI,
+            "results": RESULTS,
+        },
+        {
             "cards": html.cards(_cards(records, seconds)),
-            "notice": _notice(records),
+            "warnings": _notice(records),
             "bars": _bars(records),
             "contents": _contents(records),
             "sections": "\n".join(
                 _section(record, seconds.get(record.name), folder) for record in records
             ),
-            "results": RESULTS,
-            "css": html.asset("report.css") + html.asset("reproduce.css"),
         },
-        "reproduce.html",
     )
 
 
@@ -339,7 +347,7 @@ def _notice(records: Sequence[Record]) -> str:
     return html.notice(said) if said else ""
 
 
-def _with_bar(records: Sequence[Record]) -> list[tuple[Record, Finding]]:
+def _with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
     return [
         (record, finding)
         for record in records
@@ -404,7 +412,7 @@ def _origin(record: Record, seconds: float | None) -> Iterator[str]:
     yield f"<code>aqualvs reproduce {escape(record.name)}</code>"
 
 
-def _cells(finding: Finding) -> tuple[str, ...]:
+def _cells(finding: ExperimentRow) -> tuple[str, ...]:
     return (
         finding.what,
         finding.paper or _DASH,
@@ -426,7 +434,7 @@ def _mark(met: bool | None) -> str:
     return html.Raw(f'<span class="{kind}">{words}</span>')
 
 
-def _figure(picture: Shown, folder: Path) -> str:
+def _figure(picture: PrintedFigure, folder: Path) -> str:
     stem = folder / FIGURES / picture.file
     drawing = stem.with_name(f"{stem.name}.svg")
     if drawing.stat().st_size <= _LARGEST_SVG:
@@ -439,10 +447,9 @@ def _figure(picture: Shown, folder: Path) -> str:
     )
     caption = escape(picture.caption)
     width = f'style="max-width: {_PX_PER_INCH * picture.width_in:.0f}px"'
-    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     return (
-        f'<figure><img {width} src="{source}" alt="{caption}"><figcaption>{caption} '
-        f'<span class="files">{files}</span></figcaption></figure>'
+        f'<figure><img {width} src="{html.data_url(data, kind)}" alt="{caption}">'
+        f'<figcaption>{caption} <span class="files">{files}</span></figcaption></figure>'
     )
 
 

@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from aqualvs.errors import RigError
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Series, drawn
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentResult,
+    ExperimentRow,
+    drawn,
+)
 from aqualvs.experiments.laboratory import Laboratory, frames_of
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import rotvec_from_rotation
@@ -112,7 +118,7 @@ def one_frame() -> Scenario:
     return parse_scenario(facts, "rig", "rig")
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     rig = laboratory.rig
     width, height = rig.size_px
     rows = np.array(_ROWS) * (height - 1)
@@ -121,7 +127,7 @@ def _run(laboratory: Laboratory) -> Outcome:
     everywhere = bending(rig, grid.reshape(-1, 2))
     bent = float(np.rad2deg(everywhere.bent.max()))
     missed = 1e3 * float(everywhere.missed_at(_FAR).max())
-    return Outcome(
+    return ExperimentResult(
         sentence=f"The rig stands in for the paper's: its lens sits "
         f"{1e3 * float(np.linalg.norm(traced.lens)):.1f} mm off the dome's centre, so that rays "
         f"bend by up to {bent:.1f}° on their way into the water, and a point 1 m ahead would be "
@@ -141,7 +147,7 @@ def _run(laboratory: Laboratory) -> Outcome:
     )
 
 
-def _findings(rig: Rig, bent: float, missed: float) -> tuple[Finding, ...]:
+def _findings(rig: Rig, bent: float, missed: float) -> tuple[ExperimentRow, ...]:
     assert rig.dome is not None
     lens, shell = rig.lens, rig.dome
     turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T)
@@ -166,14 +172,14 @@ def _findings(rig: Rig, bent: float, missed: float) -> tuple[Finding, ...]:
         ("rays bend by up to (°)", "", f"{bent:.1f}"),
         ("a point 1 m ahead, off by without refraction (mm)", "", f"{missed:.0f}"),
     )
-    return tuple(Finding(what=what, paper=paper, ours=ours) for what, paper, ours in rows)
+    return tuple(ExperimentRow(what=what, paper=paper, ours=ours) for what, paper, ours in rows)
 
 
 def _listed(values: FloatArray, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
-def _series(traced: Bending) -> Series:
+def _series(traced: Bending) -> DataColumns:
     columns = {
         "bent_deg": np.rad2deg(traced.bent),
         "missed_at_1_m_mm": 1e3 * traced.missed_at(_FAR),
@@ -182,7 +188,7 @@ def _series(traced: Bending) -> Series:
         columns.update({f"{name}_{axis}_mm": 1e3 * points[:, i] for i, axis in enumerate("xyz")})
     for name, way in (("air", traced.straight), ("water", traced.water)):
         columns.update({f"{name}_{axis}": way[:, i] for i, axis in enumerate("xyz")})
-    return Series(name="rays", columns=columns)
+    return DataColumns(name="rays", columns=columns)
 
 
 def _draw(figure: "Figure", laboratory: Laboratory, traced: Bending) -> None:

@@ -13,7 +13,13 @@ import numpy as np
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import Guidance, Stage
 from aqualvs.control.vehicle import Setpoint, VehicleState
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.follow.case import SimCase, Trials, sea, vehicle_model
 from aqualvs.follow.log import HoldMeasures, LoopLog, StepMeasures
@@ -38,12 +44,12 @@ _COLUMNS = ("range", "measured_range", "wanted_range", "forward")
 _ANGLES = ("yaw", "measured_yaw", "wanted_yaw")
 
 
-def _run_control(laboratory: Laboratory) -> Outcome:  # noqa: ARG001
+def _run_control(laboratory: Laboratory) -> ExperimentResult:  # noqa: ARG001
     held = {name: _trials(name).hold_and_step() for name in _VEHICLES}
     followed = {name: _trials(name).follow() for name in _VEHICLES}
     worst = max(1e3 * hold.range_rms for _, hold, _ in held.values())
     yaw = max(math.degrees(hold.yaw_rms) for _, hold, _ in held.values())
-    return Outcome(
+    return ExperimentResult(
         sentence=f"In a current of 0.3 m/s and waves both BlueROV2 keep their distance within "
         f"{worst:.0f} mm and their yaw within {yaw:.1f} degrees (rms).",
         findings=tuple(
@@ -55,7 +61,7 @@ def _run_control(laboratory: Laboratory) -> Outcome:  # noqa: ARG001
             )
         ),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="figure_23",
                 caption="Setpoint, measurement and command of both controllers (BlueROV2): hold, "
                 "then a step of the range, beside figure 23.",
@@ -77,17 +83,17 @@ def _trials(name: str) -> Trials:
     return Trials(model, load_gains(model.name), rendered=False, fps=25.0, seed=_SEED)
 
 
-def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[Finding, ...]:
+def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[ExperimentRow, ...]:
     range_mm, yaw_deg = 1e3 * hold.range_rms, math.degrees(hold.yaw_rms)
     return (
-        Finding(
+        ExperimentRow(
             what=f"{vehicle}, hold: rms of range (mm), yaw (degrees)",
             paper="",
             ours=f"{range_mm:.1f}, {yaw_deg:.2f}",
             bar=f"<= {_BAR_RANGE_MM:g}, {_BAR_YAW_DEG:g}",
             met=range_mm <= _BAR_RANGE_MM and yaw_deg <= _BAR_YAW_DEG,
         ),
-        Finding(
+        ExperimentRow(
             what=f"{vehicle}, step of 0.2 m: settling (s), overshoot (%)",
             paper="",
             ours=f"{step.settling:.1f}, {100.0 * step.overshoot:.0f}",
@@ -97,12 +103,12 @@ def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[Fi
     )
 
 
-def _follow_rows(vehicle: str, log: LoopLog, follow: HoldMeasures) -> tuple[Finding, ...]:
+def _follow_rows(vehicle: str, log: LoopLog, follow: HoldMeasures) -> tuple[ExperimentRow, ...]:
     range_mm, yaw_deg = 1e3 * follow.range_rms, math.degrees(follow.yaw_rms)
     free = follow.least_clearance > 0.0 and follow.n_lost == 0
     along = log.column("along")
     return (
-        Finding(
+        ExperimentRow(
             what=f"{vehicle}, following a curved, moving net over {along[-1] - along[0]:.0f} m: "
             "rms of range (mm), yaw (degrees)",
             paper="",
@@ -113,14 +119,14 @@ def _follow_rows(vehicle: str, log: LoopLog, follow: HoldMeasures) -> tuple[Find
     )
 
 
-def _series(name: str, log: LoopLog) -> Series:
+def _series(name: str, log: LoopLog) -> DataColumns:
     columns = {"time_s": log.column("time_s")}
     for column in _COLUMNS:
         columns[column if column == "forward" else f"{column}_m"] = log.column(column)
     for column in _ANGLES:
         columns[f"{column}_deg"] = np.degrees(log.column(column))
     columns["turn"] = log.column("turn")
-    return Series(name=f"control_{name.replace('-', '_')}", columns=columns)
+    return DataColumns(name=f"control_{name.replace('-', '_')}", columns=columns)
 
 
 CONTROL = Experiment(
@@ -188,7 +194,7 @@ class _Watched:
         return self.steering.look(world_from_dome, time_s)
 
 
-def _run_sea(laboratory: Laboratory) -> Outcome:
+def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     eye, log = _dive(laboratory)
     time_s = np.array([t for t, _, _ in eye.seen])
     valid = np.array([bool(posture) for _, posture, _ in eye.seen])
@@ -197,40 +203,40 @@ def _run_sea(laboratory: Laboratory) -> Outcome:
     rms = np.sqrt(np.mean(found**2, axis=0))
     share = 100.0 * float(valid.mean())
     depth = log.column("depth")
-    return Outcome(
+    return ExperimentResult(
         sentence=f"Sinking from {depth[0]:.1f} to {depth[-1]:.1f} m along a net that moves, range "
         f"is told within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in {share:.0f} % "
         "of the pictures.",
         findings=(
-            Finding(
+            ExperimentRow(
                 what="pictures with a posture (%)",
                 paper="",
                 ours=f"{share:.0f} of {len(valid)}",
                 bar=f">= {_BAR_VALID:g}",
                 met=share >= _BAR_VALID,
             ),
-            Finding(
+            ExperimentRow(
                 what="rms error of the range (%)",
                 paper="",
                 ours=f"{rms[0]:.3f}",
                 bar=f"<= {_BAR_PERCENT}",
                 met=bool(rms[0] <= _BAR_PERCENT),
             ),
-            Finding(
+            ExperimentRow(
                 what="rms error of pitch, yaw (degrees)",
                 paper="",
                 ours=f"{rms[1]:.3f}, {rms[2]:.3f}",
                 bar=f"<= {_BAR_DEG}",
                 met=bool(rms[1:].max() <= _BAR_DEG),
             ),
-            Finding(
+            ExperimentRow(
                 what="correlation of heading and target yaw",
                 paper="some",
                 ours=f"{_correlation(log):+.2f}",
             ),
         ),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="figure_22",
                 caption="Depth, range, heading and yaw of the net over the dive, beside figure "
                 "22. Dots: measured in rendered pictures; lines: truth.",
@@ -308,7 +314,7 @@ def _measured(eye: _Watched) -> FloatArray:
     )
 
 
-def _sea_series(eye: _Watched, time_s: FloatArray) -> Series:
+def _sea_series(eye: _Watched, time_s: FloatArray) -> DataColumns:
     measured = _measured(eye)
     truth = [(t.range, math.degrees(t.pitch), math.degrees(t.yaw)) for _, _, t in eye.seen]
     names = ("range_m", "pitch_deg", "yaw_deg")
@@ -316,7 +322,7 @@ def _sea_series(eye: _Watched, time_s: FloatArray) -> Series:
     for k, name in enumerate(names):
         columns[f"true_{name}"] = np.array(truth)[:, k]
         columns[name] = measured[:, k]
-    return Series(name="sea", columns=columns)
+    return DataColumns(name="sea", columns=columns)
 
 
 def _drawn(eye: _Watched, log: LoopLog, valid: FloatArray) -> "Figure":

@@ -7,8 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series
-from aqualvs.experiments.laboratory import Dive, Laboratory, Measured, calibrated_rig
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, calibrated_rig
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report.figure_style import DARK, GREY, OURS, PAPER, STYLE, TRUTH, new_figure
 from aqualvs.simulation.scenario import Scenario, parse_scenario
@@ -39,17 +45,17 @@ def swing(name: str) -> Scenario:
     return parse_scenario(facts, f"angles_{name}", f"angles_{name}")
 
 
-def _run_angles(laboratory: Laboratory) -> Outcome:
+def _run_angles(laboratory: Laboratory) -> ExperimentResult:
     rig = calibrated_rig(laboratory)
     seen = {name: laboratory.measure(laboratory.dive(swing(name)), rig=rig) for name in _ANGLES}
     worst = {name: _largest_deg(seen[name], name) for name in _ANGLES}
-    return Outcome(
+    return ExperimentResult(
         sentence=f"Through swings of {_SWING_DEG:g} degrees to either side pitch stays within "
         f"{worst['pitch']:.2f} and yaw within {worst['yaw']:.2f} degrees of the truth; the paper "
         f"is within {_PAPER_PERCENT} % of its compass.",
         findings=tuple(row for name in _ANGLES for row in _findings(name, seen[name])),
         pictures=tuple(
-            Picture(
+            ExperimentFigure(
                 name=f"figure_{number}",
                 caption=f"{name.capitalize()} while it swings, and its error with two stated "
                 f"standard deviations, beside figure {number}. The truth stands in for the "
@@ -67,23 +73,23 @@ def _run_angles(laboratory: Laboratory) -> Outcome:
     )
 
 
-def _findings(name: str, measured: Measured) -> list[Finding]:
+def _findings(name: str, measured: MeasuredDive) -> list[ExperimentRow]:
     worst = _largest_deg(measured, name)
     valid = bool(measured.valid.all())
     return [
-        Finding(
+        ExperimentRow(
             what=f"largest error of {name} (degrees)",
             paper="",
             ours=f"{worst:.3f}",
             bar=f"<= {_BAR_DEG}",
             met=valid and worst <= _BAR_DEG,
         ),
-        Finding(
+        ExperimentRow(
             what=f"error of {name} in percent of the swing",
             paper=f"{_PAPER_PERCENT}",
             ours=f"{100.0 * worst / _SWING_DEG:.1f}",
         ),
-        Finding(
+        ExperimentRow(
             what=f"{name}: root mean square error (degrees)",
             paper="",
             ours=f"{np.sqrt(np.nanmean(_errors_deg(measured, name) ** 2)):.3f}",
@@ -91,17 +97,17 @@ def _findings(name: str, measured: Measured) -> list[Finding]:
     ]
 
 
-def _errors_deg(measured: Measured, name: str) -> FloatArray:
+def _errors_deg(measured: MeasuredDive, name: str) -> FloatArray:
     return np.asarray(np.degrees(measured.errors[:, _ANGLES[name][0]]))
 
 
-def _largest_deg(measured: Measured, name: str) -> float:
+def _largest_deg(measured: MeasuredDive, name: str) -> float:
     return float(np.nanmax(np.abs(_errors_deg(measured, name))))
 
 
-def _series(name: str, measured: Measured) -> Series:
+def _series(name: str, measured: MeasuredDive) -> DataColumns:
     column = _ANGLES[name][0]
-    return Series(
+    return DataColumns(
         name=f"angles_{name}",
         columns={
             "time_s": measured.time_s,
@@ -112,7 +118,7 @@ def _series(name: str, measured: Measured) -> Series:
     )
 
 
-def _drawn(measured: Measured, name: str) -> "Figure":
+def _drawn(measured: MeasuredDive, name: str) -> "Figure":
     from matplotlib import rc_context
 
     column = _ANGLES[name][0]
@@ -172,47 +178,47 @@ def wall_at_places(frames: int = _FRAMES) -> Scenario:
     return parse_scenario(facts, "distance", "distance")
 
 
-def wall_dive(laboratory: Laboratory) -> Dive:
+def wall_dive(laboratory: Laboratory) -> RenderedDive:
     """Return the dive before the wall, shared with those who ask what our choices are worth."""
     return laboratory.dive(wall_at_places())
 
 
-def _run_distance(laboratory: Laboratory) -> Outcome:
+def _run_distance(laboratory: Laboratory) -> ExperimentResult:
     dive = wall_dive(laboratory)
     calibrated = laboratory.measure(dive, rig=calibrated_rig(laboratory))
     true = laboratory.measure(dive)
     worst, worst_true = _largest(calibrated), _largest(true)
     valid = bool(calibrated.valid.all())
-    return Outcome(
+    return ExperimentResult(
         sentence=f"At {_listed(PLACES_MM)} mm every distance is within {worst:.3f} % of the truth "
         f"({worst_true:.3f} % with the rig known exactly), where the paper has "
         f"{_DISTANCE_PAPER_PERCENT} %.",
         findings=(
-            Finding(
+            ExperimentRow(
                 what="largest error of the distance, rig calibrated from pictures (%)",
                 paper=f"{_DISTANCE_PAPER_PERCENT}",
                 ours=f"{worst:.3f}",
                 bar=f"<= {_BAR_PERCENT}",
                 met=valid and worst <= _BAR_PERCENT,
             ),
-            Finding(
+            ExperimentRow(
                 what="largest error of the distance, true rig (%)",
                 paper="",
                 ours=f"{worst_true:.3f}",
             ),
-            Finding(
+            ExperimentRow(
                 what="spread between frames at one place (%)",
                 paper="",
                 ours=f"{_spread(calibrated):.4f}",
             ),
-            Finding(
+            ExperimentRow(
                 what="frames with a posture",
                 paper="",
                 ours=f"{np.count_nonzero(calibrated.valid)} of {len(calibrated.scans)}",
             ),
         ),
         pictures=(
-            Picture(
+            ExperimentFigure(
                 name="figure_15",
                 caption="Error of the distance at the paper's four places, at the paper's scale "
                 "(left) and at ours (right), beside figure 15. Every dot is a frame, bars are two "
@@ -228,11 +234,11 @@ def _run_distance(laboratory: Laboratory) -> Outcome:
     )
 
 
-def _largest(measured: Measured) -> float:
+def _largest(measured: MeasuredDive) -> float:
     return float(np.nanmax(np.abs(measured.range_percent)))
 
 
-def _spread(measured: Measured) -> float:
+def _spread(measured: MeasuredDive) -> float:
     """Return the largest standard deviation between the frames of one place."""
     place = np.round(1e3 * measured.truth[:, 0])
     return max(float(np.nanstd(measured.range_percent[place == p])) for p in np.unique(place))
@@ -242,8 +248,8 @@ def _listed(values: tuple[int, ...]) -> str:
     return ", ".join(map(str, values[:-1])) + f" and {values[-1]}"
 
 
-def _distance_series(calibrated: Measured, true: Measured) -> Series:
-    return Series(
+def _distance_series(calibrated: MeasuredDive, true: MeasuredDive) -> DataColumns:
+    return DataColumns(
         name="distance",
         columns={
             "true_range_m": calibrated.truth[:, 0],
@@ -254,7 +260,7 @@ def _distance_series(calibrated: Measured, true: Measured) -> Series:
     )
 
 
-def _distance_drawn(calibrated: Measured, true: Measured) -> "Figure":
+def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> "Figure":
     from matplotlib import rc_context
 
     with rc_context(dict(STYLE)):
@@ -280,7 +286,7 @@ def _distance_drawn(calibrated: Measured, true: Measured) -> "Figure":
     return figure
 
 
-def _dots(axes: "Axes", measured: Measured, colour: str, label: str, aside_mm: float) -> None:
+def _dots(axes: "Axes", measured: MeasuredDive, colour: str, label: str, aside_mm: float) -> None:
     """Draw the frames of a place side by side, so that they can be told apart."""
     at = 1e3 * measured.truth[:, 0] + aside_mm + _fanned(measured.truth[:, 0])
     bars = 200.0 * measured.sigmas[:, 0] / measured.truth[:, 0]

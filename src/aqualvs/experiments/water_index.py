@@ -17,7 +17,14 @@ from aqualvs.calibration.targets.targets import MarkerSet, View
 from aqualvs.calibration.water_index.estimator import IndexEstimator, calibrate_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexStep
 from aqualvs.errors import CalibrationError
-from aqualvs.experiments.experiment import Experiment, Finding, Outcome, Picture, Series, drawn
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    Experiment,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+    drawn,
+)
 from aqualvs.experiments.laboratory import Laboratory, calibrated_rig
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
@@ -77,7 +84,7 @@ class Decentred:
     observable: BoolArray
 
 
-def index_picture(wet: Numbers, n_each: int) -> Picture:
+def index_picture(wet: Numbers, n_each: int) -> ExperimentFigure:
     """Return the estimates in the waters, `n_each` frames of each."""
     return drawn(
         "index",
@@ -91,7 +98,7 @@ def index_picture(wet: Numbers, n_each: int) -> Picture:
 
 def target_picture(
     example: "NDArray[np.uint8]", spread: Decentred, largest_sigma: float
-) -> Picture:
+) -> ExperimentFigure:
     """Return the target in view, and the standard deviation by the lens's place."""
     return drawn(
         "figure_5",
@@ -318,13 +325,13 @@ def _projected(rig: Rig) -> list[View]:
     ]
 
 
-def _run(laboratory: Laboratory) -> Outcome:
+def _run(laboratory: Laboratory) -> ExperimentResult:
     taken = cruise(laboratory)
     numbers, alarms = follow(calibrated_rig(laboratory), taken)
     spread = decentred(laboratory.rig)
     last = numbers.after(2 * _FRAMES - 1, _FRAMES)
     worst, by_paper = (float(np.abs(n - last.truth).max()) for n in (last.ours, last.paper))
-    return Outcome(
+    return ExperimentResult(
         sentence=f"From {WATERS[0]} to {WATERS[-1]} the index is told to {worst:.4f} at worst, "
         f"within {_in_sigmas(last).max():.1f} standard deviations everywhere; the paper's way is "
         f"off by up to {by_paper:.4f} on the same frames.",
@@ -355,9 +362,9 @@ def _in_sigmas(last: Numbers) -> FloatArray:
 
 def _findings(
     last: Numbers, wet: Numbers, alarms: Sequence[IndexStep], spread: Decentred
-) -> tuple[Finding, ...]:
+) -> tuple[ExperimentRow, ...]:
     rows = [
-        Finding(
+        ExperimentRow(
             what=f"index in water of {n:.4f}",
             paper=f"its way: {by_paper:.4f}",
             ours=f"{ours:.4f} ± {sigma:.4f}",
@@ -371,26 +378,26 @@ def _findings(
     noticed, n_waters = sum(step.by_medium for step in alarms), len(last.truth)
     return (
         *rows,
-        Finding(
+        ExperimentRow(
             what="largest error, in standard deviations",
             paper="",
             ours=f"{worst:.1f}",
             bar=f"<= {_BAR_SIGMAS:g}",
             met=worst <= _BAR_SIGMAS,
         ),
-        Finding(
+        ExperimentRow(
             what="scatter from frame to frame, the paper's way",
             paper="",
             ours=f"{float(np.sqrt(in_each.var(axis=1).mean())):.5f}",
         ),
-        Finding(
+        ExperimentRow(
             what="changes of the medium noticed as such, the dive into the water among them",
             paper="",
             ours=f"{noticed} of {n_waters}, {len(alarms) - noticed} false",
             bar="all, none false",
             met=noticed == len(alarms) == n_waters,
         ),
-        Finding(
+        ExperimentRow(
             what="index with the lens at the dome's centre",
             paper="",
             ours="told" if spread.observable[0] else "refused as unobservable",
@@ -400,8 +407,8 @@ def _findings(
     )
 
 
-def _series(numbers: Numbers, spread: Decentred) -> tuple[Series, ...]:
-    frames = Series(
+def _series(numbers: Numbers, spread: Decentred) -> tuple[DataColumns, ...]:
+    frames = DataColumns(
         name="frames",
         columns={
             "frame": np.arange(len(numbers.truth)),
@@ -411,7 +418,7 @@ def _series(numbers: Numbers, spread: Decentred) -> tuple[Series, ...]:
             "n_paper": numbers.paper,
         },
     )
-    lens = Series(
+    lens = DataColumns(
         name="decentred",
         columns={
             "lens_mm": spread.lens_mm,

@@ -19,7 +19,7 @@ from aqualvs.control.autopilot import Decision
 from aqualvs.control.follow_log import FollowLog
 from aqualvs.control.missions import HoldMission, Mission, Stage
 from aqualvs.control.plan import load_plan
-from aqualvs.control.safety import Reason, SafetyLimits
+from aqualvs.control.safety import LimitReason, SafetyLimits
 from aqualvs.control.tune import usable_gains
 from aqualvs.control.vehicle import Setpoint, SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
@@ -27,7 +27,7 @@ from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.follow.log import write_log
 from aqualvs.follow.loop import Eye, SimulatedLoop, Timing
 from aqualvs.follow.report import FIGURE_FILES, PAGE, RunFacts, summary_lines, write_report
-from aqualvs.follow.sensor_model import Blind, Loss, RenderedEye, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, RenderedEye, SampledEye
 from aqualvs.live.options import serve_page
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import PilotReport
@@ -185,7 +185,7 @@ class RunWatch:
             return False
         if self._over_s == math.inf and self._is_over():
             self._over_s = now_s
-            self._tell(f"at {now_s:.1f} s: {Reason.MISSION_OVER.words}")
+            self._tell(f"at {now_s:.1f} s: {LimitReason.MISSION_OVER.words}")
         stopped = self._stop.caught is not None and now_s >= _LEAST_S
         return not stopped and now_s < self._over_s + _HOLDS_ON_S
 
@@ -353,7 +353,7 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
     with Claim("follow", files, overwrite=request.overwrite):
         rng = np.random.default_rng([request.seed, 53])
         freeze_s = math.inf if request.freeze is None else request.freeze
-        frozen = (Blind(freeze_s, math.inf, Loss.FROZEN),)
+        frozen = (Blind(freeze_s, math.inf, LossOfSight.FROZEN),)
         eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
         if request.rendered:
             camera = simulated_camera(request.camera or "ideal")

@@ -20,7 +20,7 @@ from aqualvs.follow.log import (
     safety_measures,
 )
 from aqualvs.follow.loop import Timing
-from aqualvs.follow.sensor_model import Blind, Loss, PostureNoise, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledEye
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.scenarios import bluerov2_rig
 from aqualvs.simulation.vehicle.models import VehicleModel
@@ -81,7 +81,7 @@ class DiveResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spread:
+class DiveSpread:
     """Widths of the distributions that dives are drawn from.
 
     Attributes
@@ -103,10 +103,10 @@ class Spread:
 
 
 def random_dive(
-    model: VehicleModel, gains: ControlGains, seed: int, spread: Spread | None = None
+    model: VehicleModel, gains: ControlGains, seed: int, spread: DiveSpread | None = None
 ) -> RandomDive:
     """Draw a dive; the same seed gives the same dive."""
-    spread = spread or Spread()
+    spread = spread or DiveSpread()
     rng = np.random.default_rng([seed, 47])
     true = model.scaled(
         mass=rng.uniform(1.0 - spread.mass, 1.0 + spread.mass),
@@ -155,7 +155,7 @@ def random_dives(
     gains: ControlGains,
     seeds: Iterable[int],
     *,
-    spread: Spread | None = None,
+    spread: DiveSpread | None = None,
     workers: int = 1,
 ) -> Iterator[DiveResult]:
     """Run dives, in other processes where there is more than one worker; yields in order."""
@@ -185,7 +185,7 @@ def _blind(rng: np.random.Generator) -> tuple[Blind, ...]:
     start_s = _FIRST_LOSS_S + rng.exponential(3.0)
     while start_s < SECONDS - 2.0:
         end_s = start_s + rng.uniform(0.04, _GREATEST_LOSS_S)
-        loss = Loss.TARGET if rng.uniform() < 0.5 else Loss.STREAM
+        loss = LossOfSight.TARGET if rng.uniform() < 0.5 else LossOfSight.STREAM
         stretches.append(Blind(start_s, end_s, loss))
         start_s = end_s + 2.0 + rng.exponential(6.0)
     return tuple(stretches)

@@ -5,10 +5,10 @@ The figures follow figures 22 and 23 of the paper (Constantinou, Georgiades and 
 is needed.
 """
 
-import html
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from aqualvs.follow.log import JUMP, LoopLog, effort_measures, hold_measures, safety_measures
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.report import html
 from aqualvs.report.figure_style import new_canvas
 from aqualvs.results.files import replace_text, writing
 
@@ -265,36 +266,23 @@ def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
         figures = draw_follow_figures(log, out)
     path = out / PAGE
     with writing(path):
-        replace_text(path, _page(log, facts, [figure.name for figure in figures]))
+        replace_text(path, _page(log, facts, figures))
     return path
 
 
-def _page(log: LoopLog, facts: RunFacts, figures: list[str]) -> str:
-    cells = "".join(
-        f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
-        for name, value in summary(log)
+def _page(log: LoopLog, facts: RunFacts, figures: Sequence[Path]) -> str:
+    texts = {"title": "Hold and follow, simulated", "subtitle": facts.words}
+    shown = "\n".join(
+        f'<figure><img src="{html.data_url(figure.read_bytes(), "png")}" '
+        f'alt="{escape(_CAPTIONS[figure.name])}">'
+        f"<figcaption>{escape(_CAPTIONS[figure.name])}</figcaption></figure>"
+        for figure in figures
     )
-    pictures = "".join(
-        f'<figure><img src="{name}" alt="{html.escape(_CAPTIONS[name])}">'
-        f"<figcaption>{html.escape(_CAPTIONS[name])}</figcaption></figure>"
-        for name in figures
-    )
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width">'
-        f"<title>aqualvs follow</title><style>{_REPORT_STYLE}</style></head><body>"
-        f"<h1>Hold and follow, simulated</h1><p>{html.escape(facts.words)}</p>"
-        f"<table>{cells}</table>{pictures}</body></html>\n"
-    )
+    parts = {"facts": html.fact_table(summary(log)), "figures": shown}
+    return html.page("follow.html", texts, parts)
 
 
 _CAPTIONS = {
     "figure_22.png": "Depth, range, heading and target yaw over time.",
     "figure_23.png": "The controllers on range and yaw: setpoint, measured, true, and the command.",
 }
-_REPORT_STYLE = (
-    "body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;"
-    "color:#23272e}table{border-collapse:collapse}th{text-align:left;font-weight:400;"
-    "padding-right:2rem}td{font-variant-numeric:tabular-nums}th,td{border-bottom:1px solid #ddd}"
-    "figure{margin:2rem 0}img{max-width:100%}figcaption{color:#5a6069}"
-)

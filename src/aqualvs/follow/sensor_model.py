@@ -107,7 +107,7 @@ _N_POINTS = 400
 _GREATEST_ANGLE = math.radians(60.0)
 
 
-class Loss(StrEnum):
+class LossOfSight(StrEnum):
     """Kind of loss of sight."""
 
     TARGET = "target"
@@ -128,12 +128,12 @@ class Blind:
     ----------
     start_s, end_s : float
         Of the exposures, in seconds.
-    loss : Loss
+    loss : LossOfSight
     """
 
     start_s: float
     end_s: float
-    loss: Loss = Loss.TARGET
+    loss: LossOfSight = LossOfSight.TARGET
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,11 +198,11 @@ class SampledEye:
         wild = self._rng.uniform() < self._noise.outliers
         blind = next((one for one in self._blind if one.start_s <= time_s < one.end_s), None)
         if blind is not None:
-            if blind.loss is Loss.STREAM:
+            if blind.loss is LossOfSight.STREAM:
                 return None
-            if blind.loss is Loss.TARGET:
+            if blind.loss is LossOfSight.TARGET:
                 return Refusal(Reason.TOO_FEW_POINTS)
-            if blind.loss is Loss.FROZEN and self._last is not None:
+            if blind.loss is LossOfSight.FROZEN and self._last is not None:
                 return self._last
             if self._stuck is None or self._stuck[0] is not blind:
                 self._stuck = blind, truth

@@ -65,6 +65,23 @@ def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str
     files = (_cache_file(value) for value in function.__globals__.values())
     stamps = {stamp for file in files if file is not None for stamp in file._source_stamp}
     own._source_stamp = tuple(sorted(stamps | {own._source_stamp, options}, key=repr))
+    own._load_index = _forgiving(own._load_index)
+
+
+def _forgiving(load_index: Callable[[], Any]) -> Callable[[], Any]:
+    """Have an index of machine code be empty if it names classes that are gone.
+
+    Numba reads the index before it compares stamps, and the index holds the types of arguments: one
+    from before an upgrade that renamed such a class would end every run with a traceback.
+    """
+
+    def load() -> Any:
+        try:
+            return load_index()
+        except (AttributeError, ImportError):
+            return {}
+
+    return load
 
 
 def _cache_file(compiled: Any) -> Any:

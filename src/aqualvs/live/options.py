@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from aqualvs.control.gains_file import Part, Positive, load_settings
+from aqualvs.control.gains_file import load_settings
 from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub import ArduSubOptions
@@ -24,6 +24,7 @@ from aqualvs.live.mavlink.link import LinkOptions
 from aqualvs.live.mavlink.peers import load_key
 from aqualvs.live.outputs.base import Output
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigschema import Positive, StrictPart
 from aqualvs.recording import RecorderSwitch
 
 VERSION = 1
@@ -33,7 +34,7 @@ _KEY = "aqualvs_vehicle"
 SystemId = Annotated[int, Field(ge=1, le=255)]
 
 
-class VehicleFile(Part):
+class VehicleFile(StrictPart):
     """A whole vehicle file."""
 
     aqualvs_vehicle: int

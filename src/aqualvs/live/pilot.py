@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from aqualvs.control.autopilot import Decision, Motion, NetPilot
 from aqualvs.control.missions import Guidance, HoldMission
-from aqualvs.control.safety import Reason
+from aqualvs.control.safety import LimitReason
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, SetpointHolder, VehicleLink, VehicleState
 from aqualvs.errors import OptionError
@@ -109,11 +109,11 @@ class Watchdog:
 
 
 _TELL_MODE = (
-    Reason.PILOT_MODE,
-    Reason.NO_STATION,
-    Reason.IGNORED,
-    Reason.CONFLICT,
-    Reason.UNKNOWN_MODE,
+    LimitReason.PILOT_MODE,
+    LimitReason.NO_STATION,
+    LimitReason.IGNORED,
+    LimitReason.CONFLICT,
+    LimitReason.UNKNOWN_MODE,
 )
 
 
@@ -131,7 +131,7 @@ class PilotReport:
         Whether efforts go out.
     effort : Effort
         What was sent; neutral where nothing was.
-    reason : Reason or None
+    reason : LimitReason or None
         Why it is not what the controller asked for.
     guidance : Guidance
         What the mission wants.
@@ -143,7 +143,7 @@ class PilotReport:
     frame: int
     engaged: bool
     effort: Effort
-    reason: Reason | None
+    reason: LimitReason | None
     guidance: Guidance
     state: VehicleState
 
@@ -161,10 +161,10 @@ class PilotReport:
         return State.WARN if self.reason or self.state.doubt else State.OK
 
 
-def words_of(reason: Reason, state: VehicleState) -> str:
+def words_of(reason: LimitReason, state: VehicleState) -> str:
     """Return the reason why efforts do not pass, with the vehicle's report of it."""
     told = state.mode_name if reason in _TELL_MODE else ""
-    if reason is Reason.CONFLICT and state.mode is not Mode.CONFLICT:
+    if reason is LimitReason.CONFLICT and state.mode is not Mode.CONFLICT:
         told = state.rival
     return f"{reason.words} ({told})" if told else reason.words
 
@@ -219,7 +219,7 @@ class Pilot:
         self._fault = ""
         self._unsent = ""
         self._n_unsent = 0
-        self._told: tuple[bool, Reason | None, str] = (False, Reason.NOT_ENGAGED, "")
+        self._told: tuple[bool, LimitReason | None, str] = (False, LimitReason.NOT_ENGAGED, "")
 
     @property
     def engaged(self) -> bool:
@@ -241,7 +241,7 @@ class Pilot:
         """
         with self._stepping:
             if self._takes_setpoint() and not self._setpoint_known():
-                raise OptionError(f"pilot: {Reason.NO_SETPOINT.words}; choose one first")
+                raise OptionError(f"pilot: {LimitReason.NO_SETPOINT.words}; choose one first")
             refused, state = self._begin()
             if refused is not None:
                 raise OptionError(f"pilot: not engaged: {words_of(refused, state)}")
@@ -255,7 +255,7 @@ class Pilot:
             if not self._steering.engaged:
                 return
             self._steering.disengage()
-            self._told = (False, Reason.NOT_ENGAGED, "")
+            self._told = (False, LimitReason.NOT_ENGAGED, "")
             self._goodbyes = _GOODBYES
             self._send(NEUTRAL)
         _log.info("pilot: disengaged")
@@ -289,7 +289,7 @@ class Pilot:
             return PartHealth(self.name, State.FAULT, trouble, self._n_unsent)
         latest = self._latest
         if latest is None or latest.engaged is not self.engaged:
-            words = "engaged" if self.engaged else Reason.NOT_ENGAGED.words
+            words = "engaged" if self.engaged else LimitReason.NOT_ENGAGED.words
             return PartHealth(
                 self.name, State.OK if self.engaged else State.OFF, words, self._n_unsent
             )
@@ -301,7 +301,7 @@ class Pilot:
         self._watchdog.close()
         self._vehicle.close()
 
-    def _begin(self) -> tuple[Reason | None, VehicleState]:
+    def _begin(self) -> tuple[LimitReason | None, VehicleState]:
         """Start control; return the reason if it cannot start, and the vehicle's state."""
         try:
             state = self._vehicle.state()
@@ -338,7 +338,7 @@ class Pilot:
             self._goodbyes = -1
             return self._send(decision.effort)
         if self._goodbyes < 0:
-            by_sticks = decision.reason is Reason.PILOT_STICKS
+            by_sticks = decision.reason is LimitReason.PILOT_STICKS
             self._goodbyes = _GOODBYES_TO_STICKS if by_sticks else _GOODBYES
         if self._goodbyes > 0:
             self._goodbyes -= 1
@@ -363,10 +363,10 @@ class Pilot:
             _log.exception("pilot: %s", words)
         self._fault = words
         self._steering.disengage()
-        self._told = (False, Reason.NOT_ENGAGED, "")
+        self._told = (False, LimitReason.NOT_ENGAGED, "")
         if self._latest is not None:
             self._latest = replace(
-                self._latest, engaged=False, effort=NEUTRAL, reason=Reason.NOT_ENGAGED
+                self._latest, engaged=False, effort=NEUTRAL, reason=LimitReason.NOT_ENGAGED
             )
         if self._goodbyes < 0:
             self._goodbyes = _GOODBYES

@@ -42,7 +42,7 @@ _MOST_SHIFTS = 40_000
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class SurveyShift:
     """Offset added to a dive's places to align them with those of the first dive.
 
     Attributes
@@ -62,13 +62,13 @@ class Shift:
     by_holes: bool = False
 
     @classmethod
-    def first(cls) -> "Shift":
+    def first(cls) -> "SurveyShift":
         """Return that of the dive on which the others are laid."""
         return cls(np.zeros(2), np.zeros(2), np.ones(2, np.bool_))
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class ShiftGrid:
     """Grid of the shifts that are tried.
 
     Attributes
@@ -92,7 +92,7 @@ def align(
     later: PlacedSurvey,
     earlier: Sequence[PlacedSurvey],
     frame: WallFrame,
-) -> Shift:
+) -> SurveyShift:
     """Return the shift that lays a dive on earlier ones, which are laid already."""
     sigma = prior_sigma(frame)
     grid = _grid(later, earlier, frame)
@@ -114,17 +114,17 @@ def align(
         value[axis] = marginal[inside] @ shifts[inside] / mass
         variance = marginal[inside] @ (shifts[inside] - value[axis]) ** 2 / mass
         spread[axis] = np.sqrt(variance + STEP**2 / 4.0)
-    return Shift(value, spread, told, bool(pattern.max() > 0.0), bool(holes.max() > 0.0))
+    return SurveyShift(value, spread, told, bool(pattern.max() > 0.0), bool(holes.max() > 0.0))
 
 
-def shifted(one: PlacedSurvey, shift: Shift) -> PlacedSurvey:
+def shifted(one: PlacedSurvey, shift: SurveyShift) -> PlacedSurvey:
     """Return a dive with its places shifted; what the shift leaves open is not in its sigma."""
     return PlacedSurvey(
         one.survey, one.rows, one.outline + shift.value, one.holes + shift.value, one.sigma
     )
 
 
-def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> Grid:
+def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> ShiftGrid:
     sigma = prior_sigma(frame)
     reach = np.minimum(_REACH * sigma, 0.5 * frame.period)
     centre = 0.0
@@ -140,11 +140,11 @@ def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
     log_prior = -0.5 * (STEP * depths / sigma[1]) ** 2 + np.zeros((len(across), 1))
     if frame.round:
         log_prior -= 0.5 * (STEP * across[:, None] / sigma[0]) ** 2
-    return Grid((across, depths), log_prior)
+    return ShiftGrid((across, depths), log_prior)
 
 
 def _pattern_gain(
-    later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame, grid: Grid
+    later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame, grid: ShiftGrid
 ) -> FloatArray:
     """Return by how much each shift explains the growth better than none; 0 if by chance only."""
     nothing = np.zeros(grid.log_prior.shape)
@@ -256,7 +256,7 @@ def _memory(values: FloatArray, pairs: IntArray) -> float:
 
 
 def _holes_gain(
-    later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame, grid: Grid
+    later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame, grid: ShiftGrid
 ) -> FloatArray:
     """Return by how much each shift explains the later holes better than if all were new."""
     gain = np.zeros(grid.log_prior.shape)

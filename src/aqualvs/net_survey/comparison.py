@@ -6,7 +6,7 @@ from datetime import date
 
 import numpy as np
 
-from aqualvs.net_survey.alignment import Shift, align, shifted
+from aqualvs.net_survey.alignment import SurveyShift, align, shifted
 from aqualvs.net_survey.frames import (
     PlacedSurvey,
     WallFrame,
@@ -41,7 +41,7 @@ class OnWall:
     frame : WallFrame
     placed : list of PlacedSurvey
         Dives in the common frame, shifted.
-    shifts : list of Shift
+    shifts : list of SurveyShift
         Theirs.
     history : WallHistory
     cells : list of CellChange
@@ -55,7 +55,7 @@ class OnWall:
 
     frame: WallFrame
     placed: list[PlacedSurvey]
-    shifts: list[Shift]
+    shifts: list[SurveyShift]
     history: WallHistory
     cells: list[CellChange]
     growth: Growth | None
@@ -117,14 +117,14 @@ def _on_wall(
     surveys: Sequence[Survey], frame: WallFrame, cell: float
 ) -> tuple[OnWall | None, list[str]]:
     placed: list[PlacedSurvey] = []
-    shifts: list[Shift] = []
+    shifts: list[SurveyShift] = []
     warnings = []
     for survey in surveys:
         one = place_survey(survey, frame)
         if not has_places(survey) or not len(one.rows):
             warnings.append(f"{survey.folder}: has no places on the net and is left out of the map")
             continue
-        shift = align(one, placed, frame) if placed else Shift.first()
+        shift = align(one, placed, frame) if placed else SurveyShift.first()
         if not frame.round and not shift.told[0]:
             warnings.append(
                 f"{survey.folder}: growth and holes do not tell how it lies along the net beside "
@@ -151,7 +151,7 @@ def _on_wall(
     ), warnings
 
 
-def _not_aligned(survey: Survey, shift: Shift, frame: WallFrame) -> str:
+def _not_aligned(survey: Survey, shift: SurveyShift, frame: WallFrame) -> str:
     parts = []
     if not shift.told[0]:
         parts.append(f"bearing (± {np.rad2deg(shift.sigma[0] / frame.radius):.0f}°)")

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse, stats
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.net_survey.alignment import Shift
+from aqualvs.net_survey.alignment import SurveyShift
 from aqualvs.net_survey.frames import PlacedSurvey, Raster, WallFrame, spread_over
 
 SIGMA_SCALE = 1.4
@@ -146,7 +146,7 @@ class WallHistory:
 
 
 def history(
-    placed: Sequence[PlacedSurvey], shifts: Sequence[Shift], frame: WallFrame, cell: float
+    placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame, cell: float
 ) -> WallHistory:
     """Lay dives, already shifted, over cells.
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import optimize, sparse, stats
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.net_survey.alignment import Shift
+from aqualvs.net_survey.alignment import SurveyShift
 from aqualvs.net_survey.frames import PlacedSurvey, Raster, WallFrame, looked_at, wrapped
 
 # Two holes are one if their places differ by no more than chance makes in all but one of 1000.
@@ -84,7 +84,7 @@ class Site:
 
 
 def find_sites(
-    placed: Sequence[PlacedSurvey], shifts: Sequence[Shift], frame: WallFrame
+    placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
 ) -> list[Site]:
     """Bring holes of dives, already shifted, together.
 
@@ -198,7 +198,7 @@ class _Looks:
 
     @classmethod
     def of(
-        cls, placed: Sequence[PlacedSurvey], shifts: Sequence[Shift], frame: WallFrame
+        cls, placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
     ) -> "_Looks":
         corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
         low, high = corners.min(axis=0), corners.max(axis=0)

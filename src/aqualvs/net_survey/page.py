@@ -4,14 +4,11 @@ The map shows growth by colour and holes by what became of them. Matplotlib is i
 map is drawn; no display is needed.
 """
 
-import base64
 import math
 import re
 from collections.abc import Mapping
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +29,7 @@ from aqualvs.net_survey.tables import (
     verdict,
 )
 from aqualvs.report import html
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text
 from aqualvs.results.run_request import now
 from aqualvs.text import signed
@@ -327,23 +324,22 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
         As the system says it.
     """
     first, last = result.dates[0], result.dates[-1]
-    template = files("aqualvs.net_survey").joinpath("assets", "net_change.html")
     lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]
+    texts = {
+        "title": f"The net from {first} to {last}",
+        "subtitle": f"{len(result.surveys)} dives on {len(result.dates)} dates",
+        "footer": f"Written {now()} by aqualvs {__version__}.",
+    }
     parts = {
-        "css": html.asset("report.css"),
-        "title": escape(f"The net from {first} to {last}"),
-        "subtitle": escape(f"{len(result.surveys)} dives on {len(result.dates)} dates"),
         "cards": html.cards(_cards(result)),
         "warnings": html.notice([_sentence(one) for one in result.warnings]),
         "sentences": "\n".join(_paragraph(line) for line in lines),
-        "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
+        "picture": html.data_url(picture.read_bytes(), "png"),
         "holes": _holes(result),
         "dates": _table_of_dates(result),
         "dives": _dives(result, origins),
-        "footer": escape(f"Written {now()} by aqualvs {__version__}."),
     }
-    text = Template(template.read_text(encoding="utf-8")).substitute(parts)
-    replace_text(path, text)
+    replace_text(path, html.page("net_change.html", texts, parts))
 
 
 def _cards(result: Comparison) -> list[Card]:

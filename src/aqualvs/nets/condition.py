@@ -20,7 +20,7 @@ from aqualvs.nets.lattice import (
     LatticeFitter,
     NetLattice,
     NetTrack,
-    Start,
+    TrackStart,
     find_lattice,
 )
 from aqualvs.nets.lit_intervals import LineState, NetReader, NetSignal
@@ -295,7 +295,7 @@ class NetCondition:
         self._map.update(lattice)
         return laid
 
-    def _start(self, fitter: LatticeFitter, seen: _Seen, first: int) -> Start | None:
+    def _start(self, fitter: LatticeFitter, seen: _Seen, first: int) -> TrackStart | None:
         """Fit the start of a track to the next frames, unless a sensor gives the velocity."""
         if seen.velocities[first] is not None:
             return None

@@ -245,7 +245,7 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class LatticeShift:
     """Place of the lattice in one frame, with its information.
 
     Attributes
@@ -262,13 +262,13 @@ class Shift:
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class TrackStart:
     """Start of a track: place and velocity common to some consecutive frames.
 
     Attributes
     ----------
     place : array, shape (2,)
-        Place of the lattice in the first frame, as `Shift.place`.
+        Place of the lattice in the first frame, as `LatticeShift.place`.
     velocity : array, shape (2,)
         Of the vehicle along the net, in m/s.
     """
@@ -298,7 +298,7 @@ class LatticeFitter:
         crossings: Crossings,
         expected: FloatArray | None = None,
         precision: FloatArray | None = None,
-    ) -> Shift | None:
+    ) -> LatticeShift | None:
         """Find the place of the lattice in a frame; None if its crossings do not determine it.
 
         Parameters
@@ -326,9 +326,9 @@ class LatticeFitter:
         full = len(crossings.place) * float(np.sum(self._amplitude**2))
         if match < max(_LEAST_SHARE * full, _LEAST_DEVIATIONS * np.sqrt(0.5 * full)):
             return None
-        return Shift(place, information)
+        return LatticeShift(place, information)
 
-    def start(self, crossings: Sequence[Crossings], times_s: FloatArray) -> Start | None:
+    def start(self, crossings: Sequence[Crossings], times_s: FloatArray) -> TrackStart | None:
         """Find the place and velocity common to some frames; None where they are too few.
 
         A single frame may be off, and from frame to frame the net may move by nearly half a mesh:
@@ -359,7 +359,7 @@ class LatticeFitter:
         near = np.hypot(*(velocity - velocity[slowest]).T) < _SAME_VELOCITY
         best = int(np.argmax(np.where(near, score, -np.inf)))
         match = (self._swings[:, longest] @ total[best]).real
-        return Start(self._away[np.argmax(match)], velocity[best])
+        return TrackStart(self._away[np.argmax(match)], velocity[best])
 
     def _about(
         self, sums: NDArray[np.complex128], place: FloatArray
@@ -485,8 +485,8 @@ class NetTrack:
         crossings: Crossings,
         time_s: float,
         velocity: FloatArray | None = None,
-        start: Start | None = None,
-    ) -> Shift | None:
+        start: TrackStart | None = None,
+    ) -> LatticeShift | None:
         """Add the next frame; return None where it does not determine the place of the net.
 
         Parameters
@@ -499,7 +499,7 @@ class NetTrack:
             Of the frame.
         velocity : array, shape (2,), optional
             Of the vehicle along the net, right and up, if another sensor measures it.
-        start : Start, optional
+        start : TrackStart, optional
             Place and velocity common to this frame and the next, where the track begins.
         """
         state, covariance = self._ahead(time_s, velocity)
@@ -541,8 +541,8 @@ class NetTrack:
         crossings: Crossings,
         time_s: float,
         state: FloatArray,
-        start: Start | None,
-    ) -> Shift | None:
+        start: TrackStart | None,
+    ) -> LatticeShift | None:
         """Begin a piece of track, from the predicted state if the last piece ended recently."""
         if start is None:
             shift = fitter.shift(crossings)

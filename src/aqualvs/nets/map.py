@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.nets.tables import METRES_PER_DEGREE, NetWall, fouling_of
+from aqualvs.nets.tables import METRES_PER_DEGREE, UnrolledNet, fouling_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,12 +54,12 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def draw_map(wall: NetWall, paths: Sequence[Path]) -> None:
+def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
     """Draw the map of a net.
 
     Parameters
     ----------
-    wall : NetWall
+    wall : UnrolledNet
         Net to draw; without a stretch the picture says so.
     paths : sequence of Path
         Files to write; the suffix (`.png`, `.svg`, `.pdf`) selects the format.
@@ -79,7 +79,7 @@ def draw_map(wall: NetWall, paths: Sequence[Path]) -> None:
             figure.savefig(path, dpi=_DPI, metadata={dated: None} if dated else None)
 
 
-def _figure(wall: NetWall) -> "Figure":
+def _figure(wall: UnrolledNet) -> "Figure":
     from matplotlib.figure import Figure
 
     if not wall.outlines:
@@ -113,7 +113,7 @@ def _figure(wall: NetWall) -> "Figure":
     return figure
 
 
-def _extent(wall: NetWall) -> tuple[FloatArray, FloatArray]:
+def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
     """Return the corners of the drawing, with a margin."""
     corners = np.concatenate([*wall.outlines, *wall.path])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -128,7 +128,7 @@ def _rows(size: FloatArray) -> int:
     return min(max(math.ceil(_LEAST_RATIO * float(size[0] / size[1])), 1), _MOST_ROWS)
 
 
-def _shades(wall: NetWall) -> "ScalarMappable":
+def _shades(wall: UnrolledNet) -> "ScalarMappable":
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -138,7 +138,7 @@ def _shades(wall: NetWall) -> "ScalarMappable":
     return ScalarMappable(Normalize(0.0, top), _COLOURS)
 
 
-def _draw(axes: "Axes", wall: NetWall, shades: "ScalarMappable") -> None:
+def _draw(axes: "Axes", wall: UnrolledNet, shades: "ScalarMappable") -> None:
     from matplotlib.patches import Ellipse, Polygon
 
     axes.set_facecolor(_SEA)
@@ -164,13 +164,13 @@ def _draw(axes: "Axes", wall: NetWall, shades: "ScalarMappable") -> None:
         )
 
 
-def _drawn_size(wall: NetWall, extent: tuple[float, float]) -> tuple[float, float]:
+def _drawn_size(wall: UnrolledNet, extent: tuple[float, float]) -> tuple[float, float]:
     """Return width and height of a hole in the units of the axes."""
     width = extent[0] / METRES_PER_DEGREE if wall.by_bearing else extent[0]
     return width, extent[1]
 
 
-def _label_axes(axes: "Axes", wall: NetWall, *, last: bool) -> None:
+def _label_axes(axes: "Axes", wall: UnrolledNet, *, last: bool) -> None:
     if not wall.by_bearing:
         axes.set_aspect("equal")
     if wall.by_depth:
@@ -186,7 +186,7 @@ def _label_axes(axes: "Axes", wall: NetWall, *, last: bool) -> None:
     axes.set_axisbelow(True)
 
 
-def _label_holes(axes: "Axes", wall: NetWall) -> None:
+def _label_holes(axes: "Axes", wall: UnrolledNet) -> None:
     """Write the holes' sizes beside the band that they lie in, by turns above and below it."""
     begins = np.array([one.begin_s for one in wall.stretches])
     for i, (hole, middle) in enumerate(zip(wall.holes, wall.holes_xy, strict=True)):
@@ -218,7 +218,7 @@ def _to_the_edge(band: FloatArray, middle: FloatArray, sign: float) -> float:
     return float((sign * (height - middle[1])).max(initial=0.0))
 
 
-def _mark_bearings(axes: "Axes", wall: NetWall, *, name: bool) -> None:
+def _mark_bearings(axes: "Axes", wall: UnrolledNet, *, name: bool) -> None:
     """Put the net's bearing above the axes, where it grows or falls all along."""
     places = [one for one in wall.places.middle if one.bearing is not None]
     if wall.by_bearing or len(places) < 2 or _single_bearing(wall) is not None:
@@ -237,7 +237,7 @@ def _mark_bearings(axes: "Axes", wall: NetWall, *, name: bool) -> None:
     top.tick_params(labelsize=8, color="#8796a0")
 
 
-def _single_bearing(wall: NetWall) -> float | None:
+def _single_bearing(wall: UnrolledNet) -> float | None:
     """Return the bearing of a net that faces one way, in degrees."""
     known = [one.bearing for one in wall.places.middle if one.bearing is not None]
     if not known:
@@ -246,7 +246,7 @@ def _single_bearing(wall: NetWall) -> float | None:
     return float(np.mean(turned)) % 360.0 if np.ptp(turned) < _ONE_BEARING else None
 
 
-def _scale_bar(axes: "Axes", wall: NetWall, length: float) -> None:
+def _scale_bar(axes: "Axes", wall: UnrolledNet, length: float) -> None:
     if wall.by_bearing:
         return
     step = 10.0 ** math.floor(math.log10(length / 5.0))
@@ -271,13 +271,13 @@ def _scale_bar(axes: "Axes", wall: NetWall, length: float) -> None:
     )
 
 
-def _title(wall: NetWall) -> str:
+def _title(wall: UnrolledNet) -> str:
     bearing = _single_bearing(wall)
     faces = "" if bearing is None else f", facing {bearing:.0f}°"
     return f"Net wall unrolled{faces}, as seen from the vehicle"
 
 
-def _legend(figure: "Figure", wall: NetWall) -> None:
+def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

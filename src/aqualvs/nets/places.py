@@ -5,8 +5,8 @@ breaks, its pieces have nothing in common. The log has depth and heading all the
 So the track gives the places within a piece, and the log positions the pieces: depth fixes their
 height, the bearing of the net their place along a round cage (`place_net`).
 
-`open_log` and `lay_log` read the log beside a dive and align it with the dive's clock; `Seen` gives
-depth, bearing and heading at the moments of the dive's postures.
+`open_log` and `lay_log` read the log beside a dive and align it with the dive's clock;
+`ViewedPlaces` gives depth, bearing and heading at the moments of the dive's postures.
 """
 
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ class DivePostures:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ViewedPlaces:
     """Depth and bearing of the net at the times of a dive's postures; NaN where not known.
 
     Attributes
@@ -89,7 +89,7 @@ class Seen:
     lean: FloatArray
 
     @classmethod
-    def of(cls, postures: DivePostures, vehicle: VehiclePlaces | None) -> "Seen":
+    def of(cls, postures: DivePostures, vehicle: VehiclePlaces | None) -> "ViewedPlaces":
         """Look a dive's postures up in the log."""
         normals = postures.normals()
         level = np.arctan2(normals[:, 2], np.hypot(normals[:, 0], normals[:, 1]))
@@ -357,7 +357,7 @@ def place_net(
     """
     if not stretches:
         return NetPlaces([], [], [], [], 0.0)
-    seen = Seen.of(postures, vehicle)
+    seen = ViewedPlaces.of(postures, vehicle)
     nodes = _Nodes.of(stretches, seen)
     ends = [nodes.place(i, seen) for i in range(len(nodes.time_s))]
     middles = [
@@ -414,7 +414,7 @@ class _Nodes:
     placed_by: list[PlacedBy]
 
     @classmethod
-    def of(cls, stretches: Sequence[NetStretch], seen: Seen) -> "_Nodes":
+    def of(cls, stretches: Sequence[NetStretch], seen: ViewedPlaces) -> "_Nodes":
         """Join the pieces of track."""
         time_s = np.array([stretches[0].begin_s, *(one.end_s for one in stretches)])
         raw = np.array([stretches[0].begin_place, *(one.place for one in stretches)])
@@ -434,7 +434,7 @@ class _Nodes:
         depth = _pinned(time_s, up, run, seen.depths(time_s))
         return cls(time_s, along, up, raw, piece, run, upright, depth, placed_by)
 
-    def slip(self, seen: Seen) -> float:
+    def slip(self, seen: ViewedPlaces) -> float:
         """Return the largest height difference of track and log within a run (`NetPlaces`)."""
         off = seen.depths(self.time_s) + self.up
         known = np.isfinite(off)
@@ -442,7 +442,7 @@ class _Nodes:
         most = float(max(spread, default=0.0))
         return most if most > _LEAST_SLIP else 0.0
 
-    def place(self, i: int, seen: Seen) -> NetPlace:
+    def place(self, i: int, seen: ViewedPlaces) -> NetPlace:
         """Return the place of a node."""
         return NetPlace(
             along=float(self.along[i]),
@@ -453,7 +453,7 @@ class _Nodes:
             placed_by=self.placed_by[i],
         )
 
-    def place_hole(self, hole: Hole, seen: Seen) -> NetPlace:
+    def place_hole(self, hole: Hole, seen: ViewedPlaces) -> NetPlace:
         """Return the place of a hole, relative to the nearest node in time of its piece of track.
 
         A piece that was lost before its first stretch ended has no node; then the hole is placed

@@ -1,8 +1,9 @@
 """Tables and texts of a net's condition: `net.csv`, `holes.csv`, `net.geojson`, the summary.
 
-The map and `net.geojson` use coordinates of the unrolled net (`NetWall`): x is metres along the net
-to the right, as seen from the vehicle, from where the dive began; y is minus the depth in metres,
-or, without a log, metres above the start. Without a track, x is the bearing of the net in degrees.
+The map and `net.geojson` use coordinates of the unrolled net (`UnrolledNet`): x is metres along the
+net to the right, as seen from the vehicle, from where the dive began; y is minus the depth in
+metres, or, without a log, metres above the start. Without a track, x is the bearing of the net in
+degrees.
 """
 
 import csv
@@ -34,7 +35,7 @@ METRES_PER_DEGREE = 0.17
 
 
 @dataclass(frozen=True, slots=True)
-class NetWall:
+class UnrolledNet:
     """Stretches and holes on the unrolled net.
 
     Attributes
@@ -67,7 +68,7 @@ class NetWall:
 
 def unroll(
     stretches: Sequence[NetStretch], holes: Sequence[Hole], places: NetPlaces, rig: Rig
-) -> NetWall:
+) -> UnrolledNet:
     """Project stretches and holes to the plane of the unrolled net.
 
     Parameters
@@ -95,7 +96,7 @@ def unroll(
     half = 0.5 * np.array(rig.size_px) / rig.focal_px * ranges[:, None]
     if by_bearing:
         half[:, 0] /= METRES_PER_DEGREE
-    return NetWall(
+    return UnrolledNet(
         stretches=stretches,
         holes=holes,
         places=places,
@@ -196,7 +197,7 @@ _DIGITS = {"s": 3, "m": 3, "deg": 1, "mm": 2}
 _SHARE_DIGITS = 4
 
 
-def stretch_rows(wall: NetWall) -> list[dict[str, Cell]]:
+def stretch_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
     """Return the rows of `net.csv`."""
     return [
         _rounded(_stretch(i, one, place))
@@ -204,7 +205,7 @@ def stretch_rows(wall: NetWall) -> list[dict[str, Cell]]:
     ]
 
 
-def hole_rows(wall: NetWall) -> list[dict[str, Cell]]:
+def hole_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
     """Return the rows of `holes.csv`."""
     return [
         _rounded(_hole(i, hole, place))
@@ -236,14 +237,14 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     path.write_text(text.getvalue(), encoding="utf-8", newline="")
 
 
-def write_geojson(path: Path, wall: NetWall, facts: Mapping[str, Any]) -> None:
+def write_geojson(path: Path, wall: UnrolledNet, facts: Mapping[str, Any]) -> None:
     """Write stretches (Polygon) and holes (Point) in the plane of the unrolled net.
 
     Parameters
     ----------
     path : Path
         A FeatureCollection as in RFC 7946, but for its coordinates: they are local.
-    wall : NetWall
+    wall : UnrolledNet
         What to write; properties are the columns of the tables.
     facts : mapping
         What else belongs to it, for the foreign member `aqualvs_net`.
@@ -261,7 +262,7 @@ def write_geojson(path: Path, wall: NetWall, facts: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def coordinates(wall: NetWall) -> dict[str, str]:
+def coordinates(wall: UnrolledNet) -> dict[str, str]:
     """Return what the coordinates in `net.geojson` are."""
     return {
         "system": "local: the net wall unrolled into a plane, as seen from the vehicle; "
@@ -324,13 +325,13 @@ def _round(name: str, cell: Cell) -> Cell:
     return round(float(cell), _DIGITS.get(name.rsplit("_", 1)[-1], _SHARE_DIGITS)) + 0.0
 
 
-def _polygons(wall: NetWall) -> Iterator[dict[str, Any]]:
+def _polygons(wall: UnrolledNet) -> Iterator[dict[str, Any]]:
     for row, outline in zip(stretch_rows(wall), wall.outlines, strict=True):
         ring = _corners(np.concatenate([outline, outline[:1]]))
         yield _feature("stretch", row, {"type": "Polygon", "coordinates": [ring]})
 
 
-def _points(wall: NetWall) -> Iterator[dict[str, Any]]:
+def _points(wall: UnrolledNet) -> Iterator[dict[str, Any]]:
     for row, middle in zip(hole_rows(wall), wall.holes_xy, strict=True):
         yield _feature("hole", row, {"type": "Point", "coordinates": _corners(middle[None])[0]})
 
@@ -351,12 +352,12 @@ def _corners(places: FloatArray) -> list[list[float]]:
 _MOST_LISTED = 20
 
 
-def net_facts(wall: NetWall, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
+def net_facts(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
     """Return the numbers that sum a dive up; None where not measured.
 
     Parameters
     ----------
-    wall : NetWall
+    wall : UnrolledNet
         What was found.
     area : float
         Looked at for holes, in square metres.
@@ -386,7 +387,7 @@ def net_facts(wall: NetWall, area: float, n_frames: int, n_net_frames: int) -> d
     }
 
 
-def net_lines(wall: NetWall, area: float, n_frames: int) -> list[str]:
+def net_lines(wall: UnrolledNet, area: float, n_frames: int) -> list[str]:
     """Return the summary in words, line by line."""
     if not wall.stretches:
         return [f"no net was seen in {n_frames} frames"]
@@ -428,7 +429,7 @@ def _mesh_line(facts: dict[str, Any]) -> str:
     return words if facts["twine_mm"] is None else f"{words}, twine {facts['twine_mm']:.1f} mm"
 
 
-def _fouling_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
+def _fouling_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     if facts["fouling"] is None:
         return ["solidity: not measured in any stretch"]
     clean = facts["solidity"] - facts["fouling"]
@@ -441,7 +442,7 @@ def _fouling_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _hole_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
+def _hole_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     n = len(wall.holes)
     seen = (
         f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {hole_count(n)}"
@@ -457,7 +458,7 @@ def _hole_lines(wall: NetWall, facts: dict[str, Any]) -> list[str]:
     return [seen, *lines]
 
 
-def _way(wall: NetWall) -> float:
+def _way(wall: UnrolledNet) -> float:
     """Return how far the vehicle moved along the net, in metres."""
     pairs = zip(wall.places.begin, wall.places.end, strict=True)
     return float(sum(np.hypot(b.along - a.along, b.up - a.up) for a, b in pairs))

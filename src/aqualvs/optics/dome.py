@@ -182,7 +182,7 @@ _TINY = 1e-300
 _SLICES = 32
 
 
-class Surfaces(NamedTuple):
+class AngleSines(NamedTuple):
     """Sines of the five angles per unit of b: 1 / (n * radius), in the order of theta(alpha)."""
 
     q1: float
@@ -193,9 +193,9 @@ class Surfaces(NamedTuple):
 
 
 @inline_kernel
-def surfaces_at(camera: CameraParams, inverse_rho: float) -> Surfaces:
+def surfaces_at(camera: CameraParams, inverse_rho: float) -> AngleSines:
     """Return the sines per unit of b for a point at distance 1 / inverse_rho from the centre."""
-    return Surfaces(
+    return AngleSines(
         1.0 / (camera.n_air * camera.inner_radius),
         1.0 / (camera.n_acrylic * camera.inner_radius),
         1.0 / (camera.n_acrylic * camera.outer_radius),
@@ -212,7 +212,7 @@ def cosine_of(sine_per_b: float, b: float) -> float:
 
 
 @inline_kernel
-def deflection(s: Surfaces, b: float) -> tuple[float, float, float, float]:
+def deflection(s: AngleSines, b: float) -> tuple[float, float, float, float]:
     """Return (cos D, sin D / b, p, q) of the angle D(b) = theta - alpha; dD/db is p / q."""
     c1, c2, c3 = cosine_of(s.q1, b), cosine_of(s.q2, b), cosine_of(s.q3, b)
     c4, c5 = cosine_of(s.q4, b), cosine_of(s.q5, b)
@@ -231,7 +231,7 @@ def deflection(s: Surfaces, b: float) -> tuple[float, float, float, float]:
 
 @inline_kernel
 def newton_step(
-    s: Surfaces,
+    s: AngleSines,
     n_l: float,
     cos_target: float,
     sin_target: float,
@@ -266,7 +266,7 @@ def newton_step(
 
 @inline_kernel
 def paraxial_start(
-    s: Surfaces, n_l: float, cos_target: float, sin_target: float
+    s: AngleSines, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[float, float]:
     """Return (cos, sin) of alpha for the straight line from the lens's image to the point.
 
@@ -281,7 +281,7 @@ def paraxial_start(
 
 @inline_kernel
 def three_steps(
-    s: Surfaces, n_l: float, cos_target: float, sin_target: float, c: float, k: float
+    s: AngleSines, n_l: float, cos_target: float, sin_target: float, c: float, k: float
 ) -> tuple[float, float, bool]:
     """Return (cos alpha, sin alpha, solved) after three steps from (c, k), without branches."""
     c, k, _ = newton_step(s, n_l, cos_target, sin_target, c, k)
@@ -292,7 +292,7 @@ def three_steps(
 
 @kernel
 def solve_guarded(
-    s: Surfaces, n_l: float, cos_target: float, sin_target: float
+    s: AngleSines, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[bool, float, float]:
     """Solve theta(alpha) = target by bracketing; return (found, cos alpha, sin alpha).
 
@@ -321,20 +321,20 @@ def solve_guarded(
 
 
 @inline_kernel
-def steepest(s: Surfaces) -> float:
+def steepest(s: AngleSines) -> float:
     """Return the largest sine per unit of b: the surface that reflects totally first."""
     return max(max(s.q1, s.q2), max(max(s.q3, s.q4), s.q5))
 
 
 @inline_kernel
-def _theta(s: Surfaces, n_l: float, alpha: float) -> float:
+def _theta(s: AngleSines, n_l: float, alpha: float) -> float:
     cos_d, sin_d_per_b, _, _ = deflection(s, n_l * math.sin(alpha))
     return alpha + math.atan2(n_l * math.sin(alpha) * sin_d_per_b, cos_d)
 
 
 @inline_kernel
 def solve_alpha(
-    s: Surfaces, n_l: float, cos_target: float, sin_target: float
+    s: AngleSines, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[bool, float, float]:
     """Solve theta(alpha) = target; return (found, cos alpha, sin alpha)."""
     c, k = paraxial_start(s, n_l, cos_target, sin_target)
@@ -477,7 +477,7 @@ def across_axis(axis: Vector, e: Vector, spare: Vector) -> Vector:
 @inline_kernel
 def back_derivative(
     camera: CameraParams,
-    s: Surfaces,
+    s: AngleSines,
     target: tuple[float, float, float],
     e: Vector,
     solution: tuple[float, float],
@@ -487,7 +487,7 @@ def back_derivative(
     Parameters
     ----------
     camera : CameraParams
-    s : Surfaces
+    s : AngleSines
         Of the point.
     target : (float, float, float)
         1/rho, cos and sin of the point as `polar_angle` gives them.

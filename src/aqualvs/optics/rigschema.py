@@ -6,6 +6,7 @@ the rig as a whole (the lens inside the dome, say) are checked in `aqualvs.optic
 
 import difflib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -30,18 +31,20 @@ LASER_NM_REMEDY = "write the wavelength in nanometres, 380 to 780, for example 5
 LaserWavelength = Annotated[float, Field(ge=LASER_NM[0], le=LASER_NM[1], allow_inf_nan=False)]
 
 
-class _Part(BaseModel):
+class StrictPart(BaseModel):
+    """A mapping of known keys; anything else is refused."""
+
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class ImagePart(_Part):
+class ImagePart(StrictPart):
     """`image`: size of the pictures."""
 
     width_px: Pixels
     height_px: Pixels
 
 
-class CameraPart(_Part):
+class CameraPart(StrictPart):
     """`camera`: intrinsics, calibrated in air without the dome, and place in the dome."""
 
     model: Literal["opencv", "fisheye"] = "opencv"
@@ -54,7 +57,7 @@ class CameraPart(_Part):
     rotation_deg: Triple = [0.0, 0.0, 0.0]
 
 
-class DomePart(_Part):
+class DomePart(StrictPart):
     """`dome`: two concentric spheres and the material between them."""
 
     inner_radius_mm: Positive
@@ -62,7 +65,7 @@ class DomePart(_Part):
     n_acrylic: Index
 
 
-class WaterPart(_Part):
+class WaterPart(StrictPart):
     """`water`: its index, or the temperature and salinity that determine it."""
 
     n: Index | None = None
@@ -71,7 +74,7 @@ class WaterPart(_Part):
     wavelength_nm: Number | None = None
 
 
-class WindowPart(_Part):
+class WindowPart(StrictPart):
     """`window` of a laser: its outer face in `dome`, and the light source."""
 
     normal: Triple
@@ -79,7 +82,7 @@ class WindowPart(_Part):
     source_mm: Triple
 
 
-class LaserPart(_Part):
+class LaserPart(StrictPart):
     """One of `lasers`: a plane in `dome`; `offset_mm` belongs to the unit normal."""
 
     name: Name
@@ -89,7 +92,7 @@ class LaserPart(_Part):
     window: WindowPart | None = None
 
 
-class RigFile(_Part):
+class RigFile(StrictPart):
     """A whole rig file."""
 
     aqualvs_rig: int
@@ -128,7 +131,7 @@ def parse_rig(content: object, source_name: str) -> RigFile:
     try:
         return RigFile.model_validate(dict(content))
     except ValidationError as error:
-        raise RigError(f"{source_name}: {_first_fault(error)}") from None
+        raise RigError(f"{source_name}: {_WORDS.first_fault(error, RigFile)}") from None
 
 
 def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
@@ -145,40 +148,12 @@ def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
         )
 
 
-def _first_fault(error: ValidationError) -> str:
-    """Return one line on the fault to mend first; a misspelt key explains the missing one."""
-    faults = error.errors(include_url=False)
-    unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
-    return _sentence((unknown or faults)[0])
-
-
-def _sentence(fault: ErrorDetails) -> str:
-    place, kind = _place(fault["loc"]), fault["type"]
-    if kind == "extra_forbidden":
-        return f"{place} is not a key of a rig file; {_closest(fault['loc'])}"
-    if kind == "missing":
-        return f"{place} is missing; add it, for example '{_example(fault['loc'])}'"
-    if kind == "literal_error":
-        return f"{place} is {_shown(fault['input'])}; write {fault['ctx']['expected']}"
-    return f"{place} is {_shown(fault['input'])}; {_remedy(fault)}"
-
-
-def _remedy(fault: ErrorDetails) -> str:
-    limits = fault.get("ctx", {})
-    if fault["loc"][0] == "lasers" and fault["loc"][-1] == "wavelength_nm":
-        return LASER_NM_REMEDY
-    if fault["type"] in _LIMITS:
-        return _LIMITS[fault["type"]].format(**limits)
-    if fault["type"] in _TYPES:
-        return f"write {_TYPES[fault['type']]}, for example '{_example(fault['loc'])}'"
-    return fault["msg"]
-
-
 _TYPES = {
     "float_type": "a plain number",
     "int_type": "a whole number",
+    "bool_type": "true or false",
     "string_type": "a word",
-    "list_type": "a list in square brackets",
+    "list_type": "a list",
     "model_type": "keys and values",
     "model_attributes_type": "keys and values",
     "dict_type": "keys and values",
@@ -192,6 +167,83 @@ _LIMITS = {
     "too_long": "write {max_length} values",
     "string_too_short": "give it a name",
 }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemaWords:
+    """Messages on the faults of one kind of file.
+
+    Attributes
+    ----------
+    file : str
+        Kind of the file, such as "a rig file".
+    parts : mapping
+        Schemas below the top, by their key.
+    examples : mapping
+        A line that is right, by its key.
+    first_line : str
+        The example for any other key.
+    a_list : str
+        What to write where a list is missing.
+    """
+
+    file: str
+    parts: Mapping[str, type[BaseModel]]
+    examples: Mapping[str, str]
+    first_line: str
+    a_list: str = "a list"
+
+    def first_fault(self, error: ValidationError, model: type[BaseModel]) -> str:
+        """Return one line on the fault to mend first; a misspelt key explains the missing one."""
+        faults = error.errors(include_url=False)
+        unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
+        return self._sentence((unknown or faults)[0], model)
+
+    def _sentence(self, fault: ErrorDetails, model: type[BaseModel]) -> str:
+        place, kind = _place(fault["loc"]), fault["type"]
+        if kind == "extra_forbidden":
+            return f"{place} is not a key of {self.file}; {self._closest(fault['loc'], model)}"
+        if kind == "missing":
+            return f"{place} is missing; add it, for example '{self._example(fault['loc'])}'"
+        shown = f"{place} is {_shown(fault['input'])}"
+        if kind == "literal_error":
+            return f"{shown}; write {fault['ctx']['expected']}"
+        return f"{shown}; {self._remedy(fault)}"
+
+    def _remedy(self, fault: ErrorDetails) -> str:
+        kind, place = fault["type"], fault["loc"]
+        if place[0] == "lasers" and place[-1] == "wavelength_nm":
+            return LASER_NM_REMEDY
+        if kind in _LIMITS:
+            return _LIMITS[kind].format(**fault.get("ctx", {}))
+        if kind in _TYPES:
+            wanted = self.a_list if kind == "list_type" else _TYPES[kind]
+            return f"write {wanted}, for example '{self._example(place)}'"
+        return fault["msg"]
+
+    def _example(self, place: tuple[int | str, ...]) -> str:
+        known = [self.examples[str(step)] for step in place if step in self.examples]
+        return known[-1] if known else self.first_line
+
+    def _closest(self, place: tuple[int | str, ...], model: type[BaseModel]) -> str:
+        for step in place[:-1]:
+            model = self.parts.get(str(step), model)
+        known = list(model.model_fields)
+        close = difflib.get_close_matches(str(place[-1]), known, n=1, cutoff=0.5)
+        return f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    text = ""
+    for part in loc:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def _shown(value: object) -> str:
+    text = "empty" if value is None else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
 
 _EXAMPLES: dict[str, str] = {
     "image": "image: {width_px: 720, height_px: 576}",
@@ -225,30 +277,6 @@ _EXAMPLES: dict[str, str] = {
     "solved_from": "solved_from: {views: 14}",
 }
 
-
-def _example(loc: tuple[int | str, ...]) -> str:
-    words = [part for part in loc if isinstance(part, str) and part in _EXAMPLES]
-    return _EXAMPLES[words[-1]] if words else "aqualvs_rig: 1"
-
-
-def _place(loc: tuple[int | str, ...]) -> str:
-    text = ""
-    for part in loc:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
-def _closest(loc: tuple[int | str, ...]) -> str:
-    part: type[BaseModel] = RigFile
-    for word in loc[:-1]:
-        part = _PARTS.get(str(word), part)
-    known = list(part.model_fields)
-    close = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
-    if close:
-        return f"did you mean '{close[0]}'?"
-    return f"allowed here: {', '.join(known)}"
-
-
 _PARTS: dict[str, type[BaseModel]] = {
     "image": ImagePart,
     "camera": CameraPart,
@@ -259,6 +287,10 @@ _PARTS: dict[str, type[BaseModel]] = {
 }
 
 
-def _shown(value: object) -> str:
-    text = "empty" if value is None else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+_WORDS = SchemaWords(
+    file="a rig file",
+    parts=_PARTS,
+    examples=_EXAMPLES,
+    first_line="aqualvs_rig: 1",
+    a_list="a list in square brackets",
+)

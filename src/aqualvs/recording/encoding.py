@@ -316,7 +316,7 @@ _HEADER = "std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class RecordedTopic:
     """A topic.
 
     Attributes
@@ -487,22 +487,22 @@ string format
 uint8[] data
 """
 
-POSTURE = Topic(
+POSTURE = RecordedTopic(
     1, "/aqualvs/posture", "aqualvs_msgs/msg/Posture", _definition(_POSTURE, _HEADER, _TIME)
 )
-STRIPES = Topic(
+STRIPES = RecordedTopic(
     2,
     "/aqualvs/stripes",
     "aqualvs_msgs/msg/Stripes",
     _definition(_STRIPES, _HEADER, _TIME, ("aqualvs_msgs/Returns", _RETURNS)),
 )
-POINTS = Topic(
+POINTS = RecordedTopic(
     3,
     "/aqualvs/points",
     "sensor_msgs/msg/PointCloud2",
     _definition(_POINTS, _HEADER, _TIME, ("sensor_msgs/PointField", _FIELD)),
 )
-HEALTH = Topic(
+HEALTH = RecordedTopic(
     4,
     "/aqualvs/health",
     "aqualvs_msgs/msg/Health",
@@ -510,14 +510,14 @@ HEALTH = Topic(
         _HEALTH, _HEADER, _TIME, ("aqualvs_msgs/Part", _PART), ("aqualvs_msgs/Delay", _DELAY)
     ),
 )
-RIG = Topic(5, "/aqualvs/rig", "aqualvs_msgs/msg/Rig", _definition(_RIG, _HEADER, _TIME))
-PICTURE = Topic(
+RIG = RecordedTopic(5, "/aqualvs/rig", "aqualvs_msgs/msg/Rig", _definition(_RIG, _HEADER, _TIME))
+PICTURE = RecordedTopic(
     6,
     "/aqualvs/picture",
     "sensor_msgs/msg/CompressedImage",
     _definition(_IMAGE, _HEADER, _TIME),
 )
-CHROMA = Topic(
+CHROMA = RecordedTopic(
     7,
     "/aqualvs/picture/chroma",
     "sensor_msgs/msg/CompressedImage",

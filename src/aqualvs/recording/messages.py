@@ -26,7 +26,7 @@ from aqualvs.recording.encoding import (
     CdrReader,
     CdrWriter,
     PictureFormat,
-    Topic,
+    RecordedTopic,
     jpeg_of,
     options_text,
     png_of,
@@ -322,7 +322,7 @@ class SampleEncoder:
         self._rig_wait_ns = self._rig_from_ns = 0
         self._health_from_ns = self._points_from_ns = 0
 
-    def messages(self, sample: LiveSample, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+    def messages(self, sample: LiveSample, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         """Yield topic and content; pictures come before the stripes that belong to them."""
         yield from self.rig_messages(sample.rig, stamp_ns)
         if sample.frame is not None:
@@ -336,7 +336,7 @@ class SampleEncoder:
             self._health_from_ns = stamp_ns + _HEALTH_EVERY_NS
             yield HEALTH, health_message(sample.health, stamp_ns)
 
-    def rig_messages(self, rig: Rig, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+    def rig_messages(self, rig: Rig, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         """Yield the rig if it is not the one before, or due again; its water is in every frame."""
         if self._is_new(rig):
             self._rig, self._exact = rig, rig_exact(rig)
@@ -349,7 +349,7 @@ class SampleEncoder:
         self._rig_from_ns = stamp_ns + self._rig_wait_ns
         yield from self.rig_again(stamp_ns)
 
-    def rig_again(self, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+    def rig_again(self, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         """Yield the last recorded rig once more, bit for bit."""
         if self._rig_texts is not None:
             yield RIG, rig_message(self._rig_texts, stamp_ns)
@@ -361,7 +361,7 @@ class SampleEncoder:
             rig if self._rig is None else rig.in_water(self._rig.n_water)
         )
 
-    def _pictures(self, frame: Frame, stamp_ns: int) -> Iterator[tuple[Topic, bytes]]:
+    def _pictures(self, frame: Frame, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         kind = self._options.pictures
         if kind is PictureFormat.JPEG:
             data = jpeg_of(frame, self._options.jpeg_quality)

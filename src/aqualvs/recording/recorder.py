@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from aqualvs import __version__
 from aqualvs.errors import OutputError
-from aqualvs.recording.encoding import RIG, TOPICS, Topic
+from aqualvs.recording.encoding import RIG, TOPICS, RecordedTopic
 from aqualvs.recording.growing_file import Chunk, ChunkBuilder, GrowingFile
 from aqualvs.recording.messages import RecordClock, RecorderOptions, SampleEncoder
 from aqualvs.recording.sample import LiveSample
@@ -68,7 +68,7 @@ class SampleChunks:
             stamp_ns = self._clock.last_ns
             self._add(self._encoder.rig_again(stamp_ns), stamp_ns)
 
-    def _add(self, messages: Iterable[tuple[Topic, bytes]], stamp_ns: int) -> None:
+    def _add(self, messages: Iterable[tuple[RecordedTopic, bytes]], stamp_ns: int) -> None:
         for topic, data in messages:
             self._holds_rig = self._holds_rig or topic is RIG
             self._builder.add(topic.number, self._sequence, stamp_ns, self._publish_ns, data)

@@ -1,8 +1,8 @@
 """Content of a calibration's page, as plain values that the calibration commands fill in.
 
-`Page` is the whole page; the functions below it make the parts that all steps share. Units are
-those of the page, as the suffixes of the names say. An unknown number is NaN, or None where the
-type allows it; the page shows a dash for it. Every part of a page may be empty.
+`CalibrationPage` is the whole page; the functions below it make the parts that all steps share.
+Units are those of the page, as the suffixes of the names say. An unknown number is NaN, or None
+where the type allows it; the page shows a dash for it. Every part of a page may be empty.
 """
 
 import math
@@ -22,7 +22,7 @@ from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.expected_error import expected_posture_errors
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty
 from aqualvs.optics.solved import completed_uncertainty
-from aqualvs.report.findings import Card
+from aqualvs.report.html import Card
 from aqualvs.scanning.scan import ImagePlane
 
 MarkKind: TypeAlias = Literal["cross", "dot", "circle"]
@@ -42,7 +42,7 @@ class ResidualMap:
     residuals : array, shape (N, 2)
         Measured minus predicted, in pixels.
     view_index : int array, shape (N,)
-        Row of the view in `Page.views`.
+        Row of the view in `CalibrationPage.views`.
     inliers : bool array, shape (N,)
         False for points that the solution did not use.
     """
@@ -230,7 +230,7 @@ class PictureShot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Page:
+class CalibrationPage:
     """The page of one calibration.
 
     Attributes

@@ -15,10 +15,10 @@ from aqualvs.report import html
 from aqualvs.report import svg as draw
 from aqualvs.report.calibration_charts import N_VECTORS, picture_view, residual_view
 from aqualvs.report.calibration_material import (
+    CalibrationPage,
     ExpectationRow,
     LaserRow,
     Overlay,
-    Page,
     ParameterRow,
     PictureShot,
     ResidualMap,
@@ -261,10 +261,10 @@ def _expectation_words(rows: Sequence[ExpectationRow]) -> str:
 
 
 __all__ = [
+    "CalibrationPage",
     "ExpectationRow",
     "LaserRow",
     "Overlay",
-    "Page",
     "ParameterRow",
     "PictureShot",
     "ResidualMap",
@@ -278,12 +278,12 @@ __all__ = [
 _ALL_VECTORS = 7500
 
 
-def write_page(page: Page, path: Path) -> Path:
+def write_page(page: CalibrationPage, path: Path) -> Path:
     """Write the report of a calibration.
 
     Parameters
     ----------
-    page : Page
+    page : CalibrationPage
     path : Path
         The file to write.
 
@@ -304,24 +304,22 @@ def write_page(page: Page, path: Path) -> Path:
     return path
 
 
-def page_html(page: Page) -> str:
+def page_html(page: CalibrationPage) -> str:
     """Return the report of a calibration as HTML."""
     return html.page(
+        "calibration.html",
+        {"title": page.title, "subtitle": page.subtitle},
         {
-            "title": html.text(page.title),
-            "subtitle": html.text(page.subtitle),
             "summary": _summary(page),
             "sections": "\n".join(
                 f'<section id="{name}">\n<h2>{heading}</h2>\n{body}\n</section>'
                 for name, heading, body in _sections(page)
             ),
-            "css": html.asset("report.css") + html.asset("calibration.css"),
         },
-        "calibration.html",
     )
 
 
-def _summary(page: Page) -> str:
+def _summary(page: CalibrationPage) -> str:
     parts = [html.notice(page.warnings)]
     if page.cards:
         parts.insert(0, f'<div class="cards">{html.cards(page.cards)}</div>')
@@ -333,7 +331,7 @@ def _summary(page: Page) -> str:
     return "\n".join(parts)
 
 
-def _sections(page: Page) -> Iterator[tuple[str, str, str]]:
+def _sections(page: CalibrationPage) -> Iterator[tuple[str, str, str]]:
     """Yield name, heading and content of the parts that are not empty."""
     if page.expectations:
         body = expectation_view(page.expectations)
@@ -354,14 +352,14 @@ def _sections(page: Page) -> Iterator[tuple[str, str, str]]:
         yield "facts", "Command, files and versions", html.fact_table(page.facts)
 
 
-def _series(page: Page) -> str:
+def _series(page: CalibrationPage) -> str:
     return "\n".join(
         f'<div class="whole"><h3>{escape(series.title)}</h3>{line_chart(series)}</div>'
         for series in page.series
     )
 
 
-def _residuals(page: Page) -> str:
+def _residuals(page: CalibrationPage) -> str:
     names = [view.name for view in page.views]
     share = min(N_VECTORS, _ALL_VECTORS // len(page.residual_maps))
     return "\n".join(

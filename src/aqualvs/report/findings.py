@@ -1,14 +1,14 @@
 """Headline numbers and warnings of a run's report, in plain words."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report.charts import stretch_end_s, stretch_words, stretches
-from aqualvs.report.frames import Picture
+from aqualvs.report.frames import SampleFrame
+from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import Track
 from aqualvs.text import clock, signed
@@ -18,15 +18,6 @@ _FEW_POINTS = 60
 _LOOSE = 0.02
 _WATER_STEP = 5e-4
 _MOST_GAPS = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Card:
-    """One number of the headline: its name, the number, and a line below it."""
-
-    name: str
-    value: str
-    note: str
 
 
 def headline(track: Track) -> list[Card]:
@@ -57,7 +48,7 @@ def duration_s(track: Track) -> float:
 def warnings_of(
     track: Track,
     points: PointSummary | None,
-    pictures: Mapping[int, Picture],
+    pictures: Mapping[int, SampleFrame],
     run: Mapping[str, Any],
     working_range: tuple[float, float] | None,
     names: list[str],
@@ -192,7 +183,7 @@ def _laser_warnings(points: PointSummary, names: list[str]) -> Iterator[str]:
             yield f"Laser “{name}” gave only {100 * share:.1f} % of the target points."
 
 
-def _picture_warnings(pictures: Mapping[int, Picture]) -> Iterator[str]:
+def _picture_warnings(pictures: Mapping[int, SampleFrame]) -> Iterator[str]:
     shares = np.array([picture.saturated for picture in pictures.values()])
     shares = shares[np.isfinite(shares)]
     if len(shares) and np.median(shares) > 0.5:

@@ -39,7 +39,7 @@ _SATURATED = 250
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class SampleFrame:
     """A sample frame ready for the page.
 
     Attributes
@@ -111,7 +111,7 @@ def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, Imag
         return {row: picture for pictures in found for row, picture in pictures.items()}
 
 
-def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
+def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
     """Draw the points of a frame into its picture and compress it for the page."""
     scale = min(1.0, _WIDTH_PX / image.shape[1])
     small = image
@@ -124,7 +124,7 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> Picture:
         small = draw_points(small, points.laser, pixels, points.used)
     _, jpeg = cv2.imencode(".jpg", small, _JPEG)
     text = base64.b64encode(jpeg.tobytes()).decode("ascii")
-    return Picture(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
+    return SampleFrame(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
 
 
 def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from aqualvs.report.findings import Card
-from aqualvs.report.html import Raw, table, text
+from aqualvs.report.html import Card, Raw, table, text
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
 from aqualvs.text import clock, signed

@@ -7,17 +7,18 @@
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
-from plotly.offline import get_plotlyjs
+import numpy as np
 
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report import charts, html
-from aqualvs.report.findings import headline, warnings_of
+from aqualvs.report.findings import errors_against, headline, warnings_of
 from aqualvs.report.frames import (
-    Picture,
+    SampleFrame,
     choose_pictures,
     choose_samples,
     decode_frames,
@@ -29,6 +30,7 @@ from aqualvs.report.run_data import (
     LaserFacts,
     Track,
     dome_radius_mm,
+    facts,
     lasers_of,
     read_bare,
     read_run_file,
@@ -38,8 +40,8 @@ from aqualvs.report.run_data import (
 )
 from aqualvs.results.files import replace_text
 from aqualvs.results.folder import check_run_files
-from aqualvs.scanning.scan import ImagePlane
-from aqualvs.text import clock
+from aqualvs.scanning.scan import ImagePlane, Label
+from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, signed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +80,7 @@ class Material:
     lasers: list[LaserFacts]
     picture_rows: list[int]
     sample_rows: list[int]
-    pictures: dict[int, Picture]
+    pictures: dict[int, SampleFrame]
     no_pictures: str
     net: NetTables | None
     warnings: list[str]
@@ -196,7 +198,7 @@ def _pictures(
     decoded: "Future[dict[int, ImagePlane]]",
     track: Track,
     points: PointSummary | None,
-) -> tuple[dict[int, Picture], str]:
+) -> tuple[dict[int, SampleFrame], str]:
     if isinstance(source, str):
         return {}, source
     try:
@@ -239,7 +241,7 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
         If the page cannot be written.
     """
     material = gather(run_dir, truth)
-    text = html.page(_parts(material) | _machinery(material))
+    text = html.page("report.html", _texts(material), _parts(material))
     path = out or run_dir / "report.html"
     try:
         replace_text(path, text)
@@ -251,33 +253,29 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
     return path
 
 
-def _parts(m: Material) -> dict[str, str]:
-    """Return the visible parts of the page, in its order."""
-    planes_known = any(laser.known for laser in m.lasers)
+def _texts(m: Material) -> dict[str, str]:
     return {
-        "title": html.text(m.title),
-        "subtitle": html.subtitle(m.run),
-        "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
-        "warnings": html.notice(m.warnings),
-        "posture_lead": html.posture_lead(m.track, m.truth),
-        "truth": html.truth_view(m.track, m.truth),
-        "net": net_view(m.net),
-        "planes": html.plane_view(m.lasers, m.points is not None),
-        "cloud": html.cloud_view(m.points, planes_known),
-        "pictures": html.picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
-        "quality": html.quality_view(m.track, m.points, m.names),
-        "bare": html.bare_view(m.track, m.bare, m.truth),
-        "rig": html.rig_view(m.run, m.lasers),
-        "footer": html.footer(m.run, m.track),
+        "title": m.title,
+        "subtitle": _subtitle(m.run),
+        "posture_lead": _posture_lead(m.track, m.truth),
+        "footer": _footer(m.run, m.track),
     }
 
 
-def _machinery(m: Material) -> dict[str, str]:
-    """Return style, scripts and the numbers that they draw."""
+def _parts(m: Material) -> dict[str, str]:
+    """Return the parts of the page, in its order, and the numbers that its script draws."""
+    planes_known = any(laser.known for laser in m.lasers)
     return {
-        "css": html.asset("report.css"),
-        "plotly": get_plotlyjs(),
-        "script": html.asset("report.js"),
+        "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
+        "warnings": html.notice(m.warnings),
+        "truth": _truth_view(m.track, m.truth),
+        "net": net_view(m.net),
+        "planes": _plane_view(m.lasers, m.points is not None),
+        "cloud": _cloud_view(m.points, planes_known),
+        "pictures": _picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
+        "quality": _quality_view(m.track, m.points, m.names),
+        "bare": _bare_view(m.track, m.bare, m.truth),
+        "rig": _rig_view(m.run, m.lasers),
         "data": html.embedded_json(_data(m)),
     }
 
@@ -309,3 +307,256 @@ def _captions(m: Material) -> dict[int, tuple[str, str, bool]]:
         )
         for row in m.picture_rows
     }
+
+
+_MARKS = ("●", "■", "▲", "★", "□", "✕", "◆", "○")
+
+
+def _subtitle(run: Mapping[str, Any]) -> str:
+    """Return the rig's name, the source and its picture size, as far as they are known."""
+    rig, source = run.get("rig"), run.get("source")
+    said = []
+    if isinstance(rig, dict) and rig.get("name"):
+        said.append(f"Rig “{rig['name']}”")
+    if isinstance(source, dict):
+        said.append(f"source {source.get('path') or source.get('name') or 'unknown'}")
+        size = source.get("size_px") or [source.get("width_px"), source.get("height_px")]
+        if isinstance(size, list) and all(size):
+            said.append(f"{' × '.join(map(str, size))} px")
+    return ", ".join(said)
+
+
+def _posture_lead(track: Track, truth: FloatArray | None) -> str:
+    """Return the line above the posture's charts."""
+    words = "Bands: one and two standard deviations."
+    if not track.valid.all():
+        words += " Grey: no posture; point at it for the reason."
+    if truth is not None:
+        words += " Dashed: truth."
+    return words
+
+
+def _truth_view(track: Track, truth: FloatArray | None) -> str:
+    """Return the errors against truth and the place of their chart; nothing without truth."""
+    if truth is None:
+        return ""
+    rms, worst, count = errors_against(truth, track.posture)
+    if not count:
+        return '<p class="note">No frame has both a posture and truth.</p>'
+    scale = (1e3, 1.0, 1.0)
+    rows = [
+        (f"{name}, {unit}", f"{s * r:.{digits}f}", f"{s * w:.{digits}f}")
+        for name, unit, digits, s, r, w in zip(
+            ("range", "pitch", "yaw"), ("mm", "°", "°"), (2, 3, 3), scale, rms, worst, strict=True
+        )
+    ]
+    relative = np.abs(track.posture[:, 0] / truth[:, 0] - 1.0)
+    relative = 100.0 * relative[np.isfinite(relative)]
+    rows.append(("range, %", f"{np.sqrt((relative**2).mean()):.3f}", f"{relative.max():.3f}"))
+    heading = f"<h3>Error against truth, {count} frames</h3>"
+    return (
+        heading
+        + html.table(("", "rms", "greatest"), rows)
+        + '<p class="note">Bands: one and two standard deviations as the run states them.</p>\n'
+        '<div class="chart" id="chart-error"></div>'
+    )
+
+
+def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
+    """Return the slider and a place for each laser's chart, or why there is none."""
+    if not has_points:
+        return '<p class="note">The run left no points.</p>'
+    known = [index for index, laser in enumerate(lasers) if laser.known]
+    if not known:
+        return '<p class="note">The laser planes are unknown, so there is no such view.</p>'
+    places = "\n".join(f'<div class="chart" id="chart-plane-{index}"></div>' for index in known)
+    return (
+        '<p class="lead">Each laser’s points in its own plane, seen from the side to which its '
+        "normal points: y leads forward, away from the dome. The dotted line is the target plane "
+        "of the posture.</p>\n"
+        '<div class="controls"><button type="button" id="plane-back" aria-label="previous frame">'
+        '‹</button><input type="range" id="plane-slider" min="0" max="0" step="1" '
+        'aria-label="sample frame"><button type="button" id="plane-next" aria-label="next frame">'
+        f'›</button></div>\n<p id="plane-words"></p>\n{_label_legend()}\n'
+        f'<div class="grid" id="plane-grid">{places}</div>'
+    )
+
+
+def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
+    """Return the place of the cloud, or why there is none."""
+    if points is None or not len(points.cloud_in_dome):
+        return '<p class="note">The run left no points on the target.</p>'
+    total = int(points.on_target.sum())
+    shown = len(points.cloud_in_dome)
+    amount = f"All {total:,}" if shown == total else f"A random {shown:,} of {total:,}"
+    buttons = ""
+    if planes_known:
+        buttons = (
+            '<div class="controls"><button type="button" data-cloud="dive">whole dive</button>'
+            '<button type="button" data-cloud="frame">the frame chosen above</button></div>'
+        )
+    return (
+        f'<p class="lead">{amount} target points, as seen from the vehicle (x right, y forward, z '
+        "up; the dome is the small black hemisphere). Drag to turn, scroll or pinch to zoom.</p>\n"
+        f'{buttons}<div class="chart screen" id="chart-cloud"></div>'
+        '<img class="paper" id="cloud-paper" alt="the same view, for paper">'
+    )
+
+
+def _picture_view(
+    captions: Mapping[int, tuple[str, str, bool]],
+    pictures: Mapping[int, SampleFrame],
+    missing: str,
+    names: list[str],
+) -> str:
+    """Return the sample frames.
+
+    Parameters
+    ----------
+    captions : mapping
+        Row to (heading, posture or refusal in words, whether there is a posture).
+    missing : str
+        Why pictures are absent.
+    """
+    shots = "\n".join(
+        f"<figure>{_image(pictures.get(row), missing, heading)}"
+        f"<figcaption><b>{escape(heading)}</b><br>"
+        f"{_verdict(words, fine)}</figcaption></figure>"
+        for row, (heading, words, fine) in captions.items()
+    )
+    lead = "Full marks: points on the target. Faint crosses: points that were rejected."
+    if not pictures:
+        return f'<p class="lead">{escape(missing)}</p>\n<div class="shots">{shots}</div>'
+    return (
+        f'<p class="lead">{lead}</p>\n{html.laser_legend(names)}\n<div class="shots">{shots}</div>'
+    )
+
+
+def _quality_view(track: Track, points: PointSummary | None, names: list[str]) -> str:
+    """Return the tables and the places of the charts on data quality."""
+    counted = [("with a posture", int(track.valid.sum())), *charts.reason_counts(track)]
+    rows = [(words, f"{count:,}", f"{100 * count / len(track):.1f} %") for words, count in counted]
+    reasons = f"<div><h3>Frames</h3>{html.table(('', 'frames', 'share'), rows)}</div>"
+    if points is None:
+        return reasons
+    lasers = f"<div><h3>Points</h3>{_laser_counts(points, names)}</div>"
+    places = [
+        ("chart-counts", "Target points per frame and laser", points.on_target.any()),
+        ("chart-rms", "Residuals over time", points.n_squares.any()),
+        ("chart-residual", "Residuals by laser", points.residual.any()),
+        ("chart-quality", "Stripe quality of target points", points.quality.any()),
+    ]
+    shown = "\n".join(
+        f'<div><h3>{title}</h3><div class="chart" id="{name}"></div></div>'
+        for name, title, known in places
+        if known
+    )
+    return (
+        f'<div class="grid two tables">{reasons}{lasers}</div>\n'
+        f'{html.laser_legend(names)}<div class="grid two">{shown}</div>'
+    )
+
+
+def _bare_view(track: Track, bare: FloatArray | None, truth: FloatArray | None) -> str:
+    """Return the section on what ignoring the dome would cost; nothing without the comparison."""
+    if bare is None:
+        return ""
+    percent = 100.0 * (bare[:, 0] / track.posture[:, 0] - 1.0)
+    percent = percent[np.isfinite(percent)]
+    if not len(percent):
+        words = '<p class="note">No frame has a posture both ways.</p>'
+        return f'<section id="bare"><h2>With and without the dome</h2>{words}</section>'
+    low, middle, high = percent.min(), np.median(percent), percent.max()
+    rows = [
+        ("range without, relative to with", *(signed(f"{v:+.2f} %") for v in (low, middle, high)))
+    ]
+    text = html.table(("", "least", "median", "greatest"), rows)
+    if truth is not None:
+        text += _both_errors(track.posture, bare, truth)
+    return (
+        '<section id="bare"><h2>With and without the dome</h2>\n<p class="lead">The same stripe '
+        "pixels, read once through the dome’s refraction and once as if the camera looked "
+        f"straight into the water ({len(percent)} frames).</p>\n"
+        f'<div class="chart" id="chart-bare"></div>\n{text}\n</section>'
+    )
+
+
+def _rig_view(run: Mapping[str, Any], lasers: list[LaserFacts]) -> str:
+    """Return lasers, rig, options and versions as tables."""
+    head = ("laser", "normal x", "normal y", "normal z", "offset from the dome's centre, mm")
+    rows = [_laser_row(i, laser) for i, laser in enumerate(lasers)]
+    lasers_table = html.table(head, rows) if rows else ""
+    blocks = []
+    for title, key, skip in (
+        ("Rig", "rig", ("lasers", "solved_from", "points", "history")),
+        ("Source", "source", ()),
+        ("Options", "options", ()),
+        ("Versions", "versions", ()),
+        ("Summary", "summary", ("warnings",)),
+    ):
+        content = run.get(key)
+        if isinstance(content, dict) and content:
+            blocks.append(f"<div><h3>{title}</h3>{html.fact_table(facts(content, skip))}</div>")
+    if not lasers and not blocks:
+        return '<p class="note">run.yaml does not say.</p>'
+    columns = "\n".join(blocks)
+    return f'{lasers_table}<div class="facts-columns">{columns}</div>'
+
+
+def _verdict(words: str, fine: bool) -> str:
+    kind = "" if fine else ' class="refused"'
+    return f"<span{kind}>{escape(words)}</span>"
+
+
+def _label_legend() -> str:
+    items = "".join(
+        f'<li><span class="mark" style="color:{LABEL_COLOURS[label]}">{_MARKS[label]}</span>'
+        f"{LABEL_WORDS[label]}</li>"
+        for label in Label
+    )
+    return f'<ul class="legend">{items}</ul>'
+
+
+def _image(picture: SampleFrame | None, missing: str, heading: str) -> str:
+    if picture is None:
+        return f'<div class="missing">{escape(missing)}</div>'
+    width, height = picture.size_px
+    return (
+        f'<img src="data:image/jpeg;base64,{picture.jpeg_base64}" width="{width}" '
+        f'height="{height}" alt="{escape(heading)}">'
+    )
+
+
+def _laser_counts(points: PointSummary, names: list[str]) -> str:
+    head = ("laser", "in the posture", *(LABEL_WORDS[label] for label in Label))
+    used = points.on_target.sum(axis=0)
+    counts = np.column_stack([used, points.labels])
+    rows = [
+        (html.Raw(html.swatch(index) + escape(name)), *(f"{count:,}" for count in counts[index]))
+        for index, name in enumerate(names)
+    ]
+    return html.table(head, rows)
+
+
+def _both_errors(dome: FloatArray, bare: FloatArray, truth: FloatArray) -> str:
+    rows = []
+    for name, posture in (("with the dome", dome), ("without it", bare)):
+        rms, worst, count = errors_against(truth, posture)
+        if count:
+            rows.append((name, f"{1e3 * rms[0]:.2f} mm", f"{1e3 * worst[0]:.2f} mm", f"{count}"))
+    return html.table(("range error against truth", "rms", "greatest", "frames"), rows)
+
+
+def _laser_row(index: int, laser: LaserFacts) -> tuple[str, ...]:
+    bent = " (bent sheet; the plane that fits it)" if laser.bent else ""
+    name = html.Raw(html.swatch(index) + escape(laser.name + bent))
+    if not np.isfinite(laser.offset):
+        return name, "–", "–", "–", "–"
+    return name, *(signed(f"{v:+.5f}") for v in laser.normal), signed(f"{1e3 * laser.offset:.2f}")
+
+
+def _footer(run: Mapping[str, Any], track: Track) -> str:
+    """Return when the run took place and what made the page."""
+    when = " to ".join(str(run[key]) for key in ("started", "ended") if run.get(key))
+    said = f"Run from {when}. " if when else ""
+    return f"{said}{len(track):,} frames over {clock(float(np.ptp(track.time_s)))}."

@@ -44,7 +44,7 @@ from aqualvs.scanning.scan import Label, Scan, ScanPoints
 
 if TYPE_CHECKING:
     from aqualvs.nets.places import LaidLog
-    from aqualvs.nets.tables import NetWall
+    from aqualvs.nets.tables import UnrolledNet
 
 
 # Least share of net among the inliers for the posture to be that of a net.
@@ -57,7 +57,7 @@ class NetResult:
 
     Attributes
     ----------
-    wall : NetWall
+    wall : UnrolledNet
         Stretches and holes on the unrolled net.
     summary : dict
         The same in numbers, as `net.geojson` has it.
@@ -67,7 +67,7 @@ class NetResult:
         The vehicle's log.
     """
 
-    wall: "NetWall"
+    wall: "UnrolledNet"
     summary: dict[str, Any]
     lines: list[str]
     log: "LaidLog | None"
@@ -152,7 +152,7 @@ class NetPass:
         return NetResult(wall, summary, lines, log)
 
 
-def write_net_files(folder: Path, wall: "NetWall", facts: dict[str, Any]) -> None:
+def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) -> None:
     """Write tables first, pictures last.
 
     Raises

@@ -5,6 +5,7 @@ peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -23,7 +24,6 @@ from aqualvs.scanning.laser_colour import (
     learn_paint,
     useful_height,
 )
-from aqualvs.scanning.paper.detector import ThresholdDetector, ThresholdOptions
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
@@ -34,8 +34,12 @@ from aqualvs.scanning.stripe import (
     Returns,
     SearchImage,
     StripeOptions,
+    ThresholdOptions,
     U8Array,
 )
+
+if TYPE_CHECKING:
+    from aqualvs.scanning.paper.detector import ThresholdDetector
 
 
 class SearchLines:
@@ -191,17 +195,23 @@ class FrameDetector:
         self._line = np.empty(len(self._finders) * self._room, np.int64)
         self._table = np.empty((N_MEASURES, len(self._line) + _CACHE_LINE))
         self._threshold = (
-            {
-                axis: ThresholdDetector(axis, size_px, *band, options)
-                for axis, band in self._bands.items()
-            }
-            if isinstance(options, ThresholdOptions)
-            else {}
+            {} if isinstance(options, StripeOptions) else self._threshold_detectors(options)
         )
         width, height = size_px
         self._lines = {axis: SearchLines(size_px, axis, self._line_px) for axis in self._bands}
         self._luma = np.empty((height, width), np.uint8)
         self._chroma = np.empty((2, -(-height // 2), -(-width // 2)), np.uint8)
+
+    def _threshold_detectors(
+        self, options: ThresholdOptions
+    ) -> Mapping[SearchAxis, "ThresholdDetector"]:
+        # Only for comparisons with the paper.
+        from aqualvs.scanning.paper.detector import ThresholdDetector
+
+        return {
+            axis: ThresholdDetector(axis, self._size_px, *band, options)
+            for axis, band in self._bands.items()
+        }
 
     def _finder(self, axis: SearchAxis, options: StripeOptions) -> PeakFinder:
         width, height = self._size_px
@@ -237,13 +247,13 @@ class FrameDetector:
             raise ValueError(f"frame is {width} x {height} but the rig's image is {self._size_px}")
         if not self._bands:
             return {}
-        if isinstance(self._options, ThresholdOptions):
-            np.copyto(self._luma, frame.luma)
-            return {
-                axis: detector.detect(self._lines[axis].of(self._luma))
-                for axis, detector in self._threshold.items()
-            }
-        return self._find_stripes(frame, self._options)
+        if isinstance(self._options, StripeOptions):
+            return self._find_stripes(frame, self._options)
+        np.copyto(self._luma, frame.luma)
+        return {
+            axis: detector.detect(self._lines[axis].of(self._luma))
+            for axis, detector in self._threshold.items()
+        }
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, Returns]:
         luma = self._brightest(frame)

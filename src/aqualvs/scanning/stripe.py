@@ -80,6 +80,30 @@ class StripeOptions:
             raise OptionError(f"reach_share is {self.reach_share}; use 0 to 0.5 of the width")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThresholdOptions:
+    """Options of the threshold detector.
+
+    Attributes
+    ----------
+    level : int
+        Pixels at least this bright are laser light, in grey levels.
+    max_returns, max_pixels : int
+        Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where
+        there are more, the lowest higher level is used at which there are not; if even white is
+        too much, the frame has no returns.
+    """
+
+    level: int = 140
+    max_returns: int = 16384
+    max_pixels: int = 131072
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if not 1 <= self.level <= 255:
+            raise OptionError(f"threshold level is {self.level}; use 1 to 255 grey levels")
+
+
 @dataclass(frozen=True, slots=True)
 class Returns:
     """Stripe peaks (returns) of one search direction, ordered by search line, then by position.

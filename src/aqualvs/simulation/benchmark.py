@@ -31,7 +31,7 @@ from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.scene import Label, Scene
+from aqualvs.simulation.scene import Scene, SurfaceKind
 from aqualvs.simulation.truth import LitPoints, visible_fit
 from aqualvs.simulation.video import VideoWriter
 
@@ -112,7 +112,7 @@ def visible_points(lit: LitPoints, label: int, contrast: NDArray[np.float32]) ->
     lit : LitPoints
         Of the frame.
     label : int
-        `Label` of the target.
+        `SurfaceKind` of the target.
     contrast : array, shape (height, width)
         From `stripe_contrast`.
 
@@ -391,7 +391,7 @@ no plane, they are those of the target's own plane, and the residual is empty. T
 always hold the latter: the axes of a net's twine, without folds. All are empty without a target.
 """
 
-_LABELS = {"net": Label.NET, "wall": Label.WALL, "none": Label.NONE}
+_LABELS = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL, "none": SurfaceKind.NONE}
 # Least number of points of a visible laser line.
 _POINTS_OF_A_LINE = 5
 

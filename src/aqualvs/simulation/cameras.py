@@ -13,23 +13,25 @@ before the lens, output the grey levels of the file.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.optics.camera import Camera
 from aqualvs.simulation.lasers import COLOUR_BALANCED, LUMA, ColourFilters
-from aqualvs.simulation.scene import Scene, Sensor, Vector, WaterOptics
-from aqualvs.simulation.video import Recording
+from aqualvs.simulation.scene import CameraSensor, Scene, Vector, WaterOptics
+from aqualvs.simulation.video import Compression
 
 # Reduction of the picture on which the wide halo, which has no detail, is computed.
 _SHRINK = 4
 
 
 def spread(
-    radiance: NDArray[np.float32], water: WaterOptics, sensor: Sensor
+    radiance: NDArray[np.float32], water: WaterOptics, sensor: CameraSensor
 ) -> NDArray[np.float32]:
     """Blur by the lens, and send the forward-scattered fraction into a wide halo.
 
@@ -52,7 +54,7 @@ def spread(
 
 
 def expose(
-    radiance: NDArray[np.float32], sensor: Sensor, rng: np.random.Generator | None
+    radiance: NDArray[np.float32], sensor: CameraSensor, rng: np.random.Generator | None
 ) -> NDArray[np.uint8]:
     """Apply gain, noise, full scale, gamma and 8 bits; without `rng` there is no noise."""
     signal = radiance * np.float32(sensor.gain)
@@ -190,7 +192,7 @@ class Development:
         rng : Generator or None
             None leaves noise out.
         """
-        lens = Sensor(defocus_px=self.defocus_px)
+        lens = CameraSensor(defocus_px=self.defocus_px)
         light = spread(radiance, water, lens)
         flare = WaterOptics(forward_scatter=self.flare, halo_px=self.flare_px)
         light = spread(light, flare, replace(lens, defocus_px=0.0))
@@ -253,8 +255,8 @@ class SimulatedCamera:
     filters : ColourFilters
         Response of its sensor to daylight and lasers.
     development : Development or None
-        None uses the scene's own `Sensor` only.
-    recording : Recording
+        None uses the scene's own `CameraSensor` only.
+    recording : Compression
         Compression of its videos.
     still_quality : int or None
         JPEG quality (0 to 100) of its single pictures; None writes them as PNG.
@@ -264,7 +266,7 @@ class SimulatedCamera:
     about: str
     filters: ColourFilters = COLOUR_BALANCED
     development: Development | None = None
-    recording: Recording = field(default_factory=Recording)
+    recording: Compression = field(default_factory=Compression)
     still_quality: int | None = None
 
     def light(self, scene: Scene) -> Scene:
@@ -279,7 +281,7 @@ class SimulatedCamera:
         self,
         radiance: Rgb,
         water: WaterOptics,
-        sensor: Sensor,
+        sensor: CameraSensor,
         t: float = 0.0,
         rng: np.random.Generator | None = None,
     ) -> NDArray[np.uint8]:
@@ -291,7 +293,7 @@ class SimulatedCamera:
             Radiance before the lens, rendered with this camera's `filters`.
         water : WaterOptics
             Its halo.
-        sensor : Sensor
+        sensor : CameraSensor
             The scene's; used by the ideal camera only.
         t : float
             Time in seconds.
@@ -355,7 +357,7 @@ WEBCAM = SimulatedCamera(
         sharpening_px=(1.2, 1.2),
         chroma_px=(1.0, 1.0),
     ),
-    recording=Recording(codec="mjpeg", jpeg_quality=80),
+    recording=Compression(codec="mjpeg", jpeg_quality=80),
     still_quality=80,
 )
 
@@ -381,7 +383,7 @@ ACTION = SimulatedCamera(
         sharpening_px=(0.9, 0.9),
         chroma_px=(0.8, 0.8),
     ),
-    recording=Recording(crf=28),
+    recording=Compression(crf=28),
     still_quality=85,
 )
 
@@ -407,7 +409,7 @@ PAL = SimulatedCamera(
         sharpening_px=(1.6, 0.0),
         chroma_px=(3.0, 0.7),
     ),
-    recording=Recording(crf=23),
+    recording=Compression(crf=23),
     still_quality=92,
 )
 
@@ -432,3 +434,29 @@ def simulated_camera(name: str) -> SimulatedCamera:
     if name not in _CAMERAS:
         raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(_CAMERAS)}")
     return _CAMERAS[name]
+
+
+class CornerRays(NamedTuple):
+    """Rays through the corners of the pixels, shape (height + 1, width + 1, ...)."""
+
+    origins: FloatArray
+    directions: FloatArray
+    valid: BoolArray
+
+    def only(self, where: BoolArray) -> "CornerRays":
+        """Return the same rays, valid only at the corners of some pixels (height, width)."""
+        wanted = np.zeros_like(self.valid)
+        for rows in (slice(None, -1), slice(1, None)):
+            for columns in (slice(None, -1), slice(1, None)):
+                wanted[rows, columns] |= where
+        return self._replace(valid=self.valid & wanted)
+
+
+def corner_rays(camera: Camera) -> CornerRays:
+    """Trace the corners of all pixels through the housing, if there is one."""
+    width, height = camera.size_px
+    x, y = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
+    rays = camera.rays(np.stack([x, y], axis=-1))
+    return CornerRays(
+        np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions), rays.valid
+    )

@@ -20,9 +20,9 @@ from aqualvs.optics.rig import Rig
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario
-from aqualvs.simulation.scene import Label
+from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import TRUTH_COLUMNS, LitPoints, truth_row
-from aqualvs.simulation.video import Recording, VideoWriter
+from aqualvs.simulation.video import Compression, VideoWriter
 
 NET_BEARING = float(np.deg2rad(65.0))
 """Compass bearing of the view to the net, in radians."""
@@ -145,7 +145,7 @@ def simulate_dive(
     progress: Callable[[int, int], None] | None = None,
     point_frames: Collection[int] = (),
     camera: SimulatedCamera = IDEAL,
-    recording: Recording | None = None,
+    recording: Compression | None = None,
     threads: int | None = None,
 ) -> DiveFiles:
     """Render a scenario with a rig and write `dive.mp4`, `truth.csv` and, if asked, lit points.
@@ -168,7 +168,7 @@ def simulate_dive(
         `label` (index into `labels`) and `labels`.
     camera : SimulatedCamera
         Sensor and processing; see `aqualvs.simulation.cameras`.
-    recording : Recording, optional
+    recording : Compression, optional
         Compression of the video; by default the camera's.
     threads : int, optional
         Number of threads; by default one a core. The pictures do not depend on it.
@@ -228,7 +228,7 @@ def _write_points(path: Path, lit: LitPoints) -> Path:
             px=lit.pixels,
             laser=lit.laser,
             label=lit.label,
-            labels=np.array([label.name.lower() for label in Label]),
+            labels=np.array([label.name.lower() for label in SurfaceKind]),
         )
     except OSError as error:
         raise OutputError(

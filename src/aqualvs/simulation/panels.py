@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.geometry.linear_algebra import Vec, along, combine, dot, minus, row3, unit
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
+from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
 from aqualvs.simulation.lasers import (
     COLOUR,
     COLOUR_BALANCED,
@@ -34,7 +34,7 @@ from aqualvs.simulation.lasers import (
     peak_irradiance,
     sheet_coordinates,
 )
-from aqualvs.simulation.scene import Sensor, Vector, WaterOptics
+from aqualvs.simulation.scene import CameraSensor, Vector, WaterOptics
 from aqualvs.simulation.textures import Texture
 
 _ZERO = (0.0, 0.0, 0.0)
@@ -70,14 +70,6 @@ class PanelTables(NamedTuple):
     shape: IntArray
     start: IntArray
     sums: FloatArray
-
-
-class CornerRays(NamedTuple):
-    """Rays through the corners of the pixels, shape (height + 1, width + 1, ...)."""
-
-    origins: FloatArray
-    directions: FloatArray
-    valid: BoolArray
 
 
 class Lamp(NamedTuple):
@@ -322,13 +314,13 @@ class PanelScene:
         The nearest one on a ray is seen.
     light : RoomLight
         Light besides the lasers.
-    sensor : Sensor
+    sensor : CameraSensor
         Blur, noise and tone of the camera.
     """
 
     panels: Sequence[Panel]
     light: RoomLight = field(default_factory=RoomLight)
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: CameraSensor = field(default_factory=CameraSensor)
 
 
 @dataclass(slots=True)
@@ -354,7 +346,7 @@ class PanelRenderer:
     _rays: CornerRays = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._rays = _corner_rays(self.camera)
+        self._rays = corner_rays(self.camera)
 
     def render(
         self, scene: PanelScene, rng: np.random.Generator | None = None, t: float = 0.0
@@ -415,15 +407,6 @@ def _by_colour(sheets: Sheets | None) -> list[Sheets]:
         return [Sheets(none, none, none, none, none)]
     _, kind = np.unique(sheets.table[:, COLOUR : COLOUR + 3], axis=0, return_inverse=True)
     return [Sheets(*(part[kind == k] for part in sheets)) for k in range(int(kind.max()) + 1)]
-
-
-def _corner_rays(camera: Camera) -> CornerRays:
-    width, height = camera.size_px
-    x, y = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
-    rays = camera.rays(np.stack([x, y], axis=-1))
-    return CornerRays(
-        np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions), rays.valid
-    )
 
 
 def _pack(panels: Sequence[Panel]) -> PanelTables:

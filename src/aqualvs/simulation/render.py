@@ -23,7 +23,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.geometry.linear_algebra import Vec, combine, row3, unit
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
+from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
 from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources, light_on_points
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.shading import Light, Members, pack_light, radiance
@@ -178,7 +178,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class RenderedFrame:
     """One rendered frame and its truth.
 
     Attributes
@@ -221,21 +221,21 @@ class Renderer:
     samples: int = 2
     threads: int = 1
     camera: SimulatedCamera = IDEAL
-    _corners: "CornerRays" = field(init=False, repr=False)
+    _corners: CornerRays = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.sources:
             self.sources = default_sources(self.rig)
-        self._corners = corner_rays(self.rig)
+        self._corners = corner_rays(self.rig.camera())
 
     def render(
         self, scene: Scene, t: float = 0.0, rng: np.random.Generator | None = None
-    ) -> Picture:
+    ) -> RenderedFrame:
         """Return the picture at time `t` and its truth; without `rng` it has no noise."""
         surfaces, sheets = self._pack(scene, t)
         light = self._radiance(scene, t, surfaces, sheets)
         image = self.camera.picture(light, scene.water, scene.sensor, t, rng)
-        return Picture(image, find_lit_points(self.rig, surfaces, sheets))
+        return RenderedFrame(image, find_lit_points(self.rig, surfaces, sheets))
 
     def radiance(
         self, scene: Scene, t: float = 0.0, where: BoolArray | None = None
@@ -294,32 +294,6 @@ class Renderer:
             list(pool.map(render_band, pairwise(edges)))
         add_snow(out, camera, self.camera.light(scene), t, sheets)
         return out
-
-
-class CornerRays(NamedTuple):
-    """Rays through the corners of the pixels, shape (height + 1, width + 1, ...)."""
-
-    origins: FloatArray
-    directions: FloatArray
-    valid: BoolArray
-
-    def only(self, where: BoolArray) -> "CornerRays":
-        """Return the same rays, valid only at the corners of some pixels (height, width)."""
-        wanted = np.zeros_like(self.valid)
-        for rows in (slice(None, -1), slice(1, None)):
-            for columns in (slice(None, -1), slice(1, None)):
-                wanted[rows, columns] |= where
-        return self._replace(valid=self.valid & wanted)
-
-
-def corner_rays(rig: Rig) -> CornerRays:
-    """Trace the corners of all pixels through the housing."""
-    width, height = rig.size_px
-    x, y = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
-    rays = rig.camera().rays(np.stack([x, y], axis=-1))
-    return CornerRays(
-        np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions), rays.valid
-    )
 
 
 @inline_borrowing_kernel

@@ -21,12 +21,12 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.scene import (
     Box,
     Bubble,
+    CameraSensor,
     Fish,
     Fold,
     Mesh,
     Net,
     Scene,
-    Sensor,
     Target,
     Wall,
     WaterOptics,
@@ -241,7 +241,7 @@ class Scenario:
     bubbles: tuple[Bubble, ...] = ()
     boxes: tuple[Box, ...] = ()
     water: WaterOptics = field(default_factory=WaterOptics)
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
 
     @property
@@ -370,10 +370,10 @@ class SensorFile(_Strict):
     """Schema of the sensor; see `scene.Sensor`."""
 
     gain: Positive = 1.0
-    gamma: Positive = Sensor().gamma
-    read_noise: NotNegative = Sensor().read_noise
-    shot_noise: NotNegative = Sensor().shot_noise
-    defocus_px: NotNegative = Sensor().defocus_px
+    gamma: Positive = CameraSensor().gamma
+    read_noise: NotNegative = CameraSensor().read_noise
+    shot_noise: NotNegative = CameraSensor().shot_noise
+    defocus_px: NotNegative = CameraSensor().defocus_px
 
 
 class ScenarioFile(_Strict):
@@ -410,7 +410,7 @@ class ScenarioFile(_Strict):
             bubbles=random_bubbles(rng, self.bubbles, self.duration_s, behind),
             boxes=tuple(_box(box) for box in self.boxes),
             water=_water(self.water),
-            sensor=Sensor(**self.sensor.model_dump()),
+            sensor=CameraSensor(**self.sensor.model_dump()),
             lasers_on=self.lasers_on,
         )
 

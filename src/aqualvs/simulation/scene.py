@@ -20,7 +20,7 @@ Mesh: TypeAlias = Literal["diamond", "square", "hexagon"]
 Target: TypeAlias = Literal["net", "wall", "none"]
 
 
-class Label(IntEnum):
+class SurfaceKind(IntEnum):
     """Kind of surface of a lit point; the lower-case names are `labels` in truth files."""
 
     NONE = 0
@@ -254,7 +254,7 @@ class WaterOptics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sensor:
+class CameraSensor:
     """Sensor of the ideal camera: from radiance to grey levels.
 
     Attributes
@@ -292,7 +292,7 @@ class Scene:
         Content of the plane y = 0, for the truth files.
     water : WaterOptics
         Optical properties of the water.
-    sensor : Sensor
+    sensor : CameraSensor
         Optical and electronic properties of the camera.
     lasers_on : bool
         False switches all lasers off.
@@ -306,7 +306,7 @@ class Scene:
     boxes: tuple[Box, ...] = ()
     target: Target = "none"
     water: WaterOptics = field(default_factory=WaterOptics)
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
 
     def at(self, t: float) -> "Scene":

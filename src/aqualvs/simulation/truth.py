@@ -24,7 +24,7 @@ from aqualvs.simulation.lasers import (
     fan_rays,
     pack_sheets,
 )
-from aqualvs.simulation.scene import Label, Scene, Target
+from aqualvs.simulation.scene import Scene, SurfaceKind, Target
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 
 # A point is seen if the camera's ray to it ends no farther than this before it. The twine's
@@ -47,7 +47,7 @@ class LitPoints:
     laser : int32 array, shape (N,)
         Index into `Rig.lasers`.
     label : int32 array, shape (N,)
-        `Label` values.
+        `SurfaceKind` values.
     """
 
     points_in_dome: FloatArray
@@ -104,7 +104,7 @@ def _lit_by(
             origins[clear] + bubble[clear, None] * directions[clear],
         ]
     )
-    on_bubbles = np.full(int(clear.sum()), Label.BUBBLE, dtype=np.int32)
+    on_bubbles = np.full(int(clear.sum()), SurfaceKind.BUBBLE, dtype=np.int32)
     return points, np.concatenate([kind[solid].astype(np.int32), on_bubbles])
 
 
@@ -116,7 +116,7 @@ class Reach(NamedTuple):
     solid : array
         Distance of the first opaque surface in metres; infinite if there is none.
     kind : int array
-        Its `Label`.
+        Its `SurfaceKind`.
     bubble : array
         Distance of the first bubble.
     """
@@ -172,13 +172,13 @@ do not span a plane. The `pts` columns count visible lit points by what they lie
 # Ratio of the second to the first spread of lit points below which they lie on one line.
 _FLAT = 0.02
 _AIR = 1.1
-_LABELS: dict[Target, Label] = {"net": Label.NET, "wall": Label.WALL}
+_LABELS: dict[Target, SurfaceKind] = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL}
 
 
 def truth_row(frame: int, t: float, scene: Scene, rig: Rig, lit: LitPoints) -> list[Cell]:
     """Return the cells of one frame, in the order of `TRUTH_COLUMNS`."""
     medium = "water" if rig.n_water > _AIR else "air"
-    counts: list[Cell] = [int(np.sum(lit.label == label)) for label in list(Label)[1:]]
+    counts: list[Cell] = [int(np.sum(lit.label == label)) for label in list(SurfaceKind)[1:]]
     head: list[Cell] = [frame, f"{t:.4f}"]
     middle: list[Cell] = [medium, rig.n_water, scene.target, int(scene.lasers_on)]
     if scene.target == "none":
@@ -199,7 +199,7 @@ def _posture(plane: Plane) -> list[Cell]:
     return [1e3 * plane.offset, float(np.rad2deg(pitch)), float(np.rad2deg(yaw))]
 
 
-def visible_fit(lit: LitPoints, label: Label) -> tuple[Plane, float] | None:
+def visible_fit(lit: LitPoints, label: SurfaceKind) -> tuple[Plane, float] | None:
     """Return the least-squares plane through the lit points of a label and its largest residual.
 
     None if there are fewer than three points or all are on one line. The residual is in metres.

@@ -20,7 +20,7 @@ Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
+class Compression:
     """Compression of a video.
 
     Attributes
@@ -74,7 +74,7 @@ class VideoWriter(Closing):
         Width and height of every frame.
     fps : float
         Frames a second.
-    recording : Recording
+    recording : Compression
         Compression of the frames.
 
     Raises
@@ -86,9 +86,9 @@ class VideoWriter(Closing):
     """
 
     def __init__(
-        self, path: Path, size_px: tuple[int, int], fps: float, recording: Recording | None = None
+        self, path: Path, size_px: tuple[int, int], fps: float, recording: Compression | None = None
     ) -> None:
-        self._recording = Recording() if recording is None else recording
+        self._recording = Compression() if recording is None else recording
         _check(size_px, fps, self._recording.codec)
         self._path, self._n_frames = path, 0
         codec = _CODECS.get(self._recording.codec) or _lossy_codec()

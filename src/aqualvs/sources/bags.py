@@ -28,7 +28,13 @@ from aqualvs.sources.image_messages import (
     kind_of_schema,
 )
 from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, Op, decompressed
-from aqualvs.sources.message_source import MAX_BYTES, Logged, MessageSource, Topic, choose_topic
+from aqualvs.sources.message_source import (
+    MAX_BYTES,
+    ImageTopic,
+    Logged,
+    MessageSource,
+    choose_topic,
+)
 from aqualvs.special_files import refuse_special
 
 # Disk space to keep free where bags compressed as whole files are unpacked.
@@ -84,7 +90,7 @@ def _require(module: str, path: Path, what: str) -> None:
 def _source(
     path: Path,
     wanted: str | None,
-    topics: list[Topic],
+    topics: list[ImageTopic],
     messages: Callable[[str], Iterator[Logged]],
 ) -> MessageSource:
     """Return the images of the topic wanted, or of the only one."""
@@ -93,13 +99,13 @@ def _source(
     return MessageSource(f"{path}#{chosen.name}", read, chosen.n_messages)
 
 
-def _image_topics(path: Path) -> list[Topic]:
+def _image_topics(path: Path) -> list[ImageTopic]:
     counts: dict[str, int] = {}
     with _opened(path) as reader:
         for connection in reader.connections:
             if kind_of_schema(connection.msgtype):
                 counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    return [Topic(name, n) for name, n in counts.items()]
+    return [ImageTopic(name, n) for name, n in counts.items()]
 
 
 def _bag_messages(path: Path, topic: str) -> Iterator[Logged]:
@@ -222,28 +228,28 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     return _source(path, topic, _mcap_image_topics(path), functools.partial(_mcap_messages, path))
 
 
-def _mcap_image_topics(path: Path) -> list[Topic]:
+def _mcap_image_topics(path: Path) -> list[ImageTopic]:
     with _opened_mcap(path) as stream:
         summary = _summary(stream)
         if summary is None:
             return _listed(path, stream)
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return [
-            Topic(channel.topic, counts.get(channel.id))
+            ImageTopic(channel.topic, counts.get(channel.id))
             for channel in summary.channels.values()
             if channel.schema_id in summary.schemas
             and kind_of_schema(summary.schemas[channel.schema_id].name)
         ]
 
 
-def _listed(path: Path, stream: "_Bounded") -> list[Topic]:
+def _listed(path: Path, stream: "_Bounded") -> list[ImageTopic]:
     """Find the topics of a file without index by reading it to its end, or as far as it goes."""
-    found: dict[str, Topic] = {}
+    found: dict[str, ImageTopic] = {}
     try:
         with _told(path):
             for schema, channel, _ in _by_order(stream, None, only_channels=True):
                 if schema is not None and kind_of_schema(schema.name):
-                    found[channel.topic] = Topic(channel.topic, None)
+                    found[channel.topic] = ImageTopic(channel.topic, None)
     except SourceError:
         if not found:
             raise

@@ -25,7 +25,7 @@ Logged: TypeAlias = tuple[int, ImageMessage | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class ImageTopic:
     """A topic with images.
 
     Attributes
@@ -39,14 +39,14 @@ class Topic:
     n_messages: int | None
 
 
-def choose_topic(where: str, topics: list[Topic], wanted: str | None) -> Topic:
+def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> ImageTopic:
     """Return the topic wanted, or the only one.
 
     Parameters
     ----------
     where : str
         For messages.
-    topics : list of Topic
+    topics : list of ImageTopic
         With images.
     wanted : str or None
 

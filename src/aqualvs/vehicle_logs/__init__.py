@@ -11,15 +11,16 @@ from aqualvs.vehicle_logs.time_offset import (
 )
 from aqualvs.vehicle_logs.vehicle_log import (
     Interpolation,
+    LoggedStates,
     Places,
     Signal,
     VehicleLog,
     VehiclePlaces,
-    VehicleState,
 )
 
 __all__ = [
     "Interpolation",
+    "LoggedStates",
     "OffsetRefusal",
     "Places",
     "PostureTrack",
@@ -27,7 +28,6 @@ __all__ = [
     "TimeOffset",
     "VehicleLog",
     "VehiclePlaces",
-    "VehicleState",
     "dive_start_utc",
     "find_time_offset",
     "offset_from_clocks",

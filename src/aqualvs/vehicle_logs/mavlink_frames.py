@@ -123,7 +123,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class SelectedMessages:
     """Wanted messages of a telemetry log.
 
     Attributes
@@ -149,7 +149,7 @@ def looks_like_frames(head: bytes) -> bool:
     return _next_record(head, 0) is not None
 
 
-def read_frames(data: bytes) -> Frames:
+def read_frames(data: bytes) -> SelectedMessages:
     """Read the wanted messages of a telemetry log.
 
     Parameters
@@ -166,7 +166,7 @@ def read_frames(data: bytes) -> Frames:
         table, sound = _decode(octets, at, MESSAGES[number], magic)
         n_failed += int(np.count_nonzero(~sound))
         _merge(tables, MESSAGES[number].name, table[sound])
-    return Frames(tables, n_frames, n_failed, tuple(skipped))
+    return SelectedMessages(tables, n_frames, n_failed, tuple(skipped))
 
 
 def _scan(

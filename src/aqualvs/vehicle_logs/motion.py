@@ -174,7 +174,7 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class OffsetScores:
     """Agreement of all channels at every offset of the grid.
 
     Attributes
@@ -192,7 +192,7 @@ class Scores:
     overlap_s: FloatArray
 
 
-def scores_of(channels: tuple[Channel, ...]) -> Scores:
+def scores_of(channels: tuple[Channel, ...]) -> OffsetScores:
     """Return the agreement at every offset at which dive and log overlap.
 
     Channels must start at the same times and have the same lengths.
@@ -210,7 +210,7 @@ def scores_of(channels: tuple[Channel, ...]) -> Scores:
     offset_s: FloatArray = (
         first.logged.start_s - first.seen.start_s + STEP_S * lags.astype(np.float64)
     )
-    return Scores(offset_s, score, overlap)
+    return OffsetScores(offset_s, score, overlap)
 
 
 def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:

@@ -22,7 +22,7 @@ from aqualvs.vehicle_logs.motion import (
     STEP_S,
     Channel,
     Match,
-    Scores,
+    OffsetScores,
     match_at,
     rates_of,
     robust_sigma,
@@ -188,7 +188,9 @@ def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | Off
     )
 
 
-def _clear_peak(channels: tuple[Channel, ...], scores: Scores, where: str) -> float | OffsetRefusal:
+def _clear_peak(
+    channels: tuple[Channel, ...], scores: OffsetScores, where: str
+) -> float | OffsetRefusal:
     """Return the offset on the grid that is clearly the best."""
     enough = scores.overlap_s >= _LEAST_OVERLAP_S
     if not enough.any():
@@ -217,11 +219,11 @@ def _clear_peak(channels: tuple[Channel, ...], scores: Scores, where: str) -> fl
     )
 
 
-def _only(scores: Scores, near: BoolArray) -> Scores:
-    return Scores(scores.offset_s, scores.score, np.where(near, scores.overlap_s, 0.0))
+def _only(scores: OffsetScores, near: BoolArray) -> OffsetScores:
+    return OffsetScores(scores.offset_s, scores.score, np.where(near, scores.overlap_s, 0.0))
 
 
-def _peaks(scores: Scores, allowed: BoolArray) -> list[float]:
+def _peaks(scores: OffsetScores, allowed: BoolArray) -> list[float]:
     """Return the offsets of the best peaks, the highest first."""
     height = np.where(allowed, scores.score, 0.0)
     # Padded, since a peak may be the first or the last.

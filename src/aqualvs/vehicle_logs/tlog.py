@@ -23,7 +23,7 @@ import numpy as np
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.vehicle_logs.mavlink_frames import Frames, Table, read_frames
+from aqualvs.vehicle_logs.mavlink_frames import SelectedMessages, Table, read_frames
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of
 
 _STUCK_SHARE = 0.1
@@ -246,7 +246,7 @@ def read_tlog(path: Path) -> VehicleLog:
     )
 
 
-def _autopilot(frames: Frames, path: Path) -> tuple[int, str | None]:
+def _autopilot(frames: SelectedMessages, path: Path) -> tuple[int, str | None]:
     """Return whose messages to read, and a note where several vehicles speak."""
     beats = frames.tables.get("HEARTBEAT")
     speakers: set[int] = set()
@@ -272,7 +272,7 @@ def _autopilot(frames: Frames, path: Path) -> tuple[int, str | None]:
     return best, f"vehicles {named} speak; {best >> 8} is read, which speaks most"
 
 
-def _damage(frames: Frames) -> list[str]:
+def _damage(frames: SelectedMessages) -> list[str]:
     notes = []
     if frames.skipped:
         lost = sum(length for _, length in frames.skipped)

@@ -165,7 +165,7 @@ def bearing_of(angle: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VehicleState:
+class LoggedStates:
     """The vehicle at some times; NaN and False where the log has no value.
 
     Attributes
@@ -259,7 +259,7 @@ class VehicleLog:
             float(max(signal.time_s[-1] for signal in found)),
         )
 
-    def at(self, time_s: ArrayLike) -> VehicleState:
+    def at(self, time_s: ArrayLike) -> LoggedStates:
         """Return the vehicle's state at other times; values in gaps are not valid.
 
         Parameters
@@ -272,7 +272,7 @@ class VehicleLog:
         heading, heading_valid = _at(self.heading, times)
         roll, roll_valid = _at(self.roll, times)
         pitch, pitch_valid = _at(self.pitch, times)
-        return VehicleState(
+        return LoggedStates(
             time_s=times,
             depth=depth,
             heading=heading,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
-from aqualvs.workers.frame_results import Measured
+from aqualvs.workers.frame_results import FrameResult
 
 
 class Ended(Enum):
@@ -32,7 +32,7 @@ class Ended(Enum):
     """It does not hold what it should; what was sent before is sound."""
 
 
-Message: TypeAlias = list[Measured] | Ended
+Message: TypeAlias = list[FrameResult] | Ended
 
 _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fields(ScanPoints)}
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
@@ -78,12 +78,12 @@ def unpacked(parcel: bytes, memory: NDArray[np.uint8]) -> Message:
     for (index, time_s, posture, n_water, bare), stop in zip(heads, stops, strict=True):
         points = ScanPoints(*[column[first:stop] for column in columns])
         scan = Scan(index, time_s, _answer(posture), points, n_water)
-        found.append(Measured(scan, _answer(bare)))
+        found.append(FrameResult(scan, _answer(bare)))
         first = stop
     return found
 
 
-def _heads(block: Sequence[Measured]) -> list[tuple[Any, ...]]:
+def _heads(block: Sequence[FrameResult]) -> list[tuple[Any, ...]]:
     return [
         (m.scan.index, m.scan.time_s, _plain(m.scan.posture), m.scan.n_water, _plain(m.bare))
         for m in block

@@ -206,7 +206,7 @@ class ScansFrames(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class FrameResult:
     """Result of one frame.
 
     Attributes
@@ -246,16 +246,16 @@ class Meter:
         self.block_length = block_length(rig.size_px) if isinstance(scanner, Scanner) else 1
         self._bare_lens = BareLensComparison(rig) if rig.dome is not None else None
 
-    def measure(self, frames: Sequence[Frame]) -> list[Measured]:
+    def measure(self, frames: Sequence[Frame]) -> list[FrameResult]:
         """Measure frames, in their order."""
         return [
-            Measured(scan, self._bare(scan), frame)
+            FrameResult(scan, self._bare(scan), frame)
             for scan, frame in zip(self._scans(frames), frames, strict=True)
         ]
 
-    def lost(self, scan: Scan) -> Measured:
+    def lost(self, scan: Scan) -> FrameResult:
         """Complete the scan of a lost frame."""
-        return Measured(scan, self._bare(scan), is_lost=True)
+        return FrameResult(scan, self._bare(scan), is_lost=True)
 
     def _bare(self, scan: Scan) -> Posture | Refusal | None:
         return None if self._bare_lens is None else self._bare_lens.measure(scan)
@@ -275,7 +275,7 @@ class Meter:
 
 def measured_blocks(
     blocks: Iterator[list[tuple[list[Scan], Frame]]], meter: Meter
-) -> Iterator[list[Measured]]:
+) -> Iterator[list[FrameResult]]:
     """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
     Parameters
@@ -286,7 +286,7 @@ def measured_blocks(
 
     Yields
     ------
-    found : list of Measured
+    found : list of FrameResult
         Of one block; scans of lost frames before it come by themselves.
     """
     for block in blocks:

@@ -36,12 +36,12 @@ from aqualvs.sources.spans import (
     video_spans,
 )
 from aqualvs.workers.channel import Ended, Message, Receiver, Sender, SharedMemory
-from aqualvs.workers.frame_results import Measured, Meter, in_blocks
+from aqualvs.workers.frame_results import FrameResult, Meter, in_blocks
 from aqualvs.workers.start_method import context, deaf_to_interrupts, interrupts_blocked
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class SpanPart:
     """Wanted frames of a span.
 
     Attributes
@@ -64,7 +64,7 @@ class CrewWork:
     ----------
     path : Path
         A video, or a folder of images.
-    parts : tuple of Part
+    parts : tuple of SpanPart
         In the order of the dive.
     rig : Rig
     options : ScannerOptions
@@ -73,7 +73,7 @@ class CrewWork:
     """
 
     path: Path
-    parts: tuple[Part, ...]
+    parts: tuple[SpanPart, ...]
     rig: Rig
     options: ScannerOptions
     fps: float
@@ -109,7 +109,7 @@ def serve(
         os._exit(1)
 
 
-def _messages(part: Part, frames: Iterator[Frame], meter: Meter) -> Iterator[Message]:
+def _messages(part: SpanPart, frames: Iterator[Frame], meter: Meter) -> Iterator[Message]:
     wanted = itertools.islice(
         frames,
         part.first - part.span.first,
@@ -125,7 +125,7 @@ def _messages(part: Part, frames: Iterator[Frame], meter: Meter) -> Iterator[Mes
         yield Ended.WHOLE
 
 
-def _frames(work: CrewWork, part: Part, video: VideoParts) -> Iterator[Frame]:
+def _frames(work: CrewWork, part: SpanPart, video: VideoParts) -> Iterator[Frame]:
     if part.span.kind is SpanKind.VIDEO:
         return video.frames(part.span)
     return image_frames(work.path, part.span, work.fps)
@@ -157,7 +157,7 @@ def crew_work(
     options : ScannerOptions
     """
     parts = tuple(
-        Part(span, first, stop)
+        SpanPart(span, first, stop)
         for span in _spans(source)
         if (first := max(span.first, window.first)) < (stop := _earlier(span.stop, window.stop))
     )
@@ -226,7 +226,7 @@ class Crew(Closing):
         self._found: defaultdict[int, deque[Message]] = defaultdict(deque)
         self._n_processes = min(n_processes, len(work.parts))
 
-    def blocks(self) -> Iterator[list[Measured]]:
+    def blocks(self) -> Iterator[list[FrameResult]]:
         """Yield the results, in the order of the dive.
 
         It ends early where a part differs from its description, or a process has died:
@@ -241,7 +241,7 @@ class Crew(Closing):
             return
         self.is_done = self.next_frame == self._work.parts[-1].stop
 
-    def _of_part(self, number: int) -> Iterator[list[Measured]]:
+    def _of_part(self, number: int) -> Iterator[list[FrameResult]]:
         found = self._found[number]
         while True:
             while not found:

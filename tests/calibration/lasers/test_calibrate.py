@@ -16,7 +16,7 @@ from aqualvs.calibration.lasers.calibrate import (
     posture,
 )
 from aqualvs.calibration.lasers.checks import match_to_rig, named
-from aqualvs.calibration.lasers.solve import Start, paper_plane, solve_lasers
+from aqualvs.calibration.lasers.solve import InitialGuess, paper_plane, solve_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface
 from aqualvs.calibration.lasers.views import LaserView, place_views
 from aqualvs.errors import CalibrationError, OptionError
@@ -344,7 +344,7 @@ def test_a_plane_that_may_be_print_is_asked_about() -> None:
 def test_a_laser_that_no_point_tells_of_is_named_with_the_remedy() -> None:
     camera, surfaces = RIG.camera(), box()
     placed, _ = place_views(camera, box_seen(), surfaces)
-    start = Start(RIG, surfaces, tuple(placed), None)
+    start = InitialGuess(RIG, surfaces, tuple(placed), None)
     n_points = sum(len(view.placed) for view in placed)
     with pytest.raises(CalibrationError, match=r"laser 'lower' cannot be solved.*nearer, farther"):
         solve_lasers(start, list(RIG.lasers), np.full(n_points, -1), None)

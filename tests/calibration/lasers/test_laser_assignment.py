@@ -10,7 +10,7 @@ from aqualvs.calibration.lasers.laser_assignment import LaserSplit, split_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import (
     PooledStripes,
     StripePoints,
-    Surfaces,
+    TargetSurfaces,
     board_surface,
 )
 from aqualvs.calibration.lasers.views import LaserView, place_views, pooled
@@ -24,7 +24,7 @@ LENS = RIG.dome_from_cam.translation
 NOISE = Noise(corner_px=0.05, stripe_px=0.2)
 
 
-def placed(views: list[LaserView], surfaces: Surfaces, rig: Rig = RIG) -> PooledStripes:
+def placed(views: list[LaserView], surfaces: TargetSurfaces, rig: Rig = RIG) -> PooledStripes:
     return pooled(place_views(rig.camera(), views, surfaces)[0], surfaces)
 
 

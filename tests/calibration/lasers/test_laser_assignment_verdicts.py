@@ -7,7 +7,7 @@ import numpy as np
 from aqualvs.calibration.lasers.laser_assignment import (
     JudgedPlane,
     LaserSplit,
-    Verdict,
+    PlaneVerdict,
     split_lasers,
 )
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface, place_stripes
@@ -53,7 +53,7 @@ def test_light_on_a_wall_behind_is_not_another_laser() -> None:
         made = scene(seed, 1, 8, clutter=Clutter(behind=0.11), noise_px=0.1, margin=0.02)
         found = split(made)
         assert len(found.planes) == 1
-        others += [plane.why for plane in found.spare if plane.verdict is Verdict.OTHER]
+        others += [plane.why for plane in found.spare if plane.verdict is PlaneVerdict.OTHER]
     assert any("begins where another stripe ends" in why for why in others)
 
 

@@ -14,7 +14,7 @@ from aqualvs.calibration.lasers.problem import (
 )
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripePoints,
-    Surfaces,
+    TargetSurfaces,
     binned,
     board_surface,
     correlation_factor,
@@ -36,7 +36,7 @@ def made(
 ) -> tuple[LaserProblem, LaserState]:
     """A problem at its true state."""
     in_box = target == "box"
-    surfaces: Surfaces = box() if in_box else board_surface()
+    surfaces: TargetSurfaces = box() if in_box else board_surface()
     views = (box_views if in_box else board_views)(rig, spacing=0.02)[:2]
     poses = tuple((dome_from_box if in_box else dome_from_board)(i) for i in range(2))
     state = BundleState(rig, np.array([rig.n_water]), poses)

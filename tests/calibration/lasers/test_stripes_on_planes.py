@@ -5,7 +5,7 @@ import pytest
 
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripePoints,
-    Surfaces,
+    TargetSurfaces,
     board_surface,
     box_surfaces,
     place_stripes,
@@ -18,7 +18,7 @@ from aqualvs.simulation.scenarios import example_rig
 from laser_cases import BOX_PLANES, box, box_corners, dome_from_box
 
 
-def hits(surfaces: Surfaces, *targets: tuple[float, float, float]) -> list[str | None]:
+def hits(surfaces: TargetSurfaces, *targets: tuple[float, float, float]) -> list[str | None]:
     """Aim rays from the mouth of the box at points, and say what they hit."""
     origin = np.array([0.0, -0.01, 0.03])
     directions = np.array(targets) - origin

@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.calibration.solver.least_squares import Block, Loss, information_of, inverse, solve
+from aqualvs.calibration.solver.least_squares import (
+    Block,
+    RobustLoss,
+    information_of,
+    inverse,
+    solve,
+)
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 
@@ -22,7 +28,7 @@ class Linear:
     abscissas: tuple[FloatArray, ...]
     values: tuple[FloatArray, ...]
     barrier: float = np.inf
-    loss: Loss = Loss.HUBER
+    loss: RobustLoss = RobustLoss.HUBER
     priors: tuple[Block, ...] = ()
 
     n_parameters = 2
@@ -67,7 +73,7 @@ def _line(seed: int, noise: float, n: int = N) -> tuple[FloatArray, FloatArray]:
 
 def test_agrees_with_the_closed_form_and_its_covariance() -> None:
     x, y = _line(1, 0.5)
-    found = solve(Linear((x,), (y,), loss=Loss.SQUARE), np.zeros(2), reject=False)
+    found = solve(Linear((x,), (y,), loss=RobustLoss.SQUARE), np.zeros(2), reject=False)
     design = _by(x).reshape(-1, 2)
     answer, squares, _, _ = np.linalg.lstsq(design, y.reshape(-1), rcond=None)
     np.testing.assert_allclose(found.state, answer, rtol=1e-9)
@@ -122,7 +128,7 @@ def test_priors_are_meant_as_they_are() -> None:
     x, y = _line(7, 0.1, 20)
     # Slope known to be 0 ± 1e-3, whatever the noise of the data.
     prior = Block(
-        "prior", np.array([0]), np.zeros((1, 1)), np.full((1, 1, 1), 1e3), Loss.SQUARE, False
+        "prior", np.array([0]), np.zeros((1, 1)), np.full((1, 1, 1), 1e3), RobustLoss.SQUARE, False
     )
     found = solve(Linear((x,), (y,), priors=(prior,)), np.zeros(2))
     assert abs(found.state[0]) < 0.01
@@ -167,8 +173,8 @@ def test_exact_data_are_solved_exactly() -> None:
 
 
 @settings(max_examples=50)
-@given(st.sampled_from(list(Loss)), st.floats(0.0, 100.0))
-def test_weights_are_slopes_of_the_losses(loss: Loss, length: float) -> None:
+@given(st.sampled_from(list(RobustLoss)), st.floats(0.0, 100.0))
+def test_weights_are_slopes_of_the_losses(loss: RobustLoss, length: float) -> None:
     h = 1e-5 * max(length, 1.0)
     above, below = loss.cost(np.array([length + h, abs(length - h)]))
     slope = (above - below) / (length + h - abs(length - h)) if length > h else length

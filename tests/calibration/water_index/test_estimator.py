@@ -14,7 +14,7 @@ from aqualvs.calibration.water_index.estimator import (
     StepTest,
     calibrate_water,
 )
-from aqualvs.calibration.water_index.filter import MOST_POINTS, Frame
+from aqualvs.calibration.water_index.filter import MOST_POINTS, FrameCorners
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexReading
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray
@@ -368,13 +368,13 @@ def test_corners_that_are_always_off_and_a_plate_elsewhere_are_named() -> None:
 def test_a_frame_takes_each_corner_once_and_not_too_many() -> None:
     n = 3 * MOST_POINTS
     view = View("many", np.arange(n), np.ones((n, 3)), np.ones((n, 2)))
-    frame = Frame.of(0.0, view, ())
+    frame = FrameCorners.of(0.0, view, ())
     assert len(frame.ids) == MOST_POINTS
     assert max(frame.ids) == n - 1
     known = (5, 6, 7, *range(100, 161))
-    assert Frame.of(0.0, view, known).ids == known
+    assert FrameCorners.of(0.0, view, known).ids == known
     twice = View("twice", np.array([1, 1, 2]), np.ones((3, 3)), np.ones((3, 2)))
-    assert Frame.of(0.0, twice).ids == (1, 2)
+    assert FrameCorners.of(0.0, twice).ids == (1, 2)
 
 
 def test_priors() -> None:

@@ -27,7 +27,7 @@ from aqualvs.live.dashboard.access import (
     token_fault,
 )
 from aqualvs.live.dashboard.output import Dashboard, page_picture
-from aqualvs.live.dashboard.server import DashboardServer, Hub, Watcher
+from aqualvs.live.dashboard.server import DashboardServer, Hub, PageClient
 from aqualvs.live.options import host_and_port
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
@@ -285,7 +285,7 @@ def test_too_many_pages_are_refused(bench: Bench) -> None:
 
 def test_a_slow_page_gets_the_latest_and_few_pictures() -> None:
     async def scene() -> tuple[list[str | None], list[bytes | None]]:
-        watcher = Watcher(may_command=False)
+        watcher = PageClient(may_command=False)
         for i in range(10):
             watcher.put(f"{i}", bytes([i]))
         got = [await watcher.next()]

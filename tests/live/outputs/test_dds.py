@@ -19,7 +19,7 @@ from aqualvs.live.outputs.dds import (
     type_hash,
 )
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES
-from aqualvs.live.outputs.ros_messages import RosOptions, Topic, plane_pose
+from aqualvs.live.outputs.ros_messages import PublishedTopic, RosOptions, plane_pose
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.sources.base import State
@@ -140,7 +140,7 @@ def check_offers(listener: Listener, *, hashes: bool) -> None:
     def offers() -> dict[str, Any]:
         return {h["offer"]["topic"]: h["offer"] for h in listener.heard if "offer" in h}
 
-    names = {topic: f"rt{RosOptions().topic_name(topic)}" for topic in Topic}
+    names = {topic: f"rt{RosOptions().topic_name(topic)}" for topic in PublishedTopic}
     assert until(lambda: set(names.values()) <= set(offers()))
     for topic, name in names.items():
         offer = offers()[name]

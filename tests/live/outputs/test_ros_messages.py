@@ -24,14 +24,14 @@ from aqualvs.live.outputs.ros_messages import (
     POINT_TYPE,
     CloudMessage,
     DiagnosticsMessage,
+    DiagnosticStatus,
     Level,
     Message,
     MessageMaker,
     PoseMessage,
+    PublishedTopic,
     RangeMessage,
     RosOptions,
-    Status,
-    Topic,
     plane_pose,
 )
 from aqualvs.recording.sample import LiveSample
@@ -58,7 +58,7 @@ def real_arrays(size: int) -> st.SearchStrategy[np.ndarray]:
 
 
 statuses = st.builds(
-    Status,
+    DiagnosticStatus,
     level=st.sampled_from(Level),
     name=names,
     message=names,
@@ -120,16 +120,16 @@ def shifted(found: LiveSample, forward: float) -> LiveSample:
     return replace(found, scan=scan)
 
 
-def told(found: LiveSample, options: RosOptions | None = None) -> dict[Topic, Any]:
-    return dict(MessageMaker(options or RosOptions()).messages(found, set(Topic)))
+def told(found: LiveSample, options: RosOptions | None = None) -> dict[PublishedTopic, Any]:
+    return dict(MessageMaker(options or RosOptions()).messages(found, set(PublishedTopic)))
 
 
-def topic_of(message: Message) -> Topic:
+def topic_of(message: Message) -> PublishedTopic:
     return {
-        PoseMessage: Topic.POSTURE,
-        RangeMessage: Topic.RANGE,
-        CloudMessage: Topic.CLOUD,
-        DiagnosticsMessage: Topic.DIAGNOSTICS,
+        PoseMessage: PublishedTopic.POSTURE,
+        RangeMessage: PublishedTopic.RANGE,
+        CloudMessage: PublishedTopic.CLOUD,
+        DiagnosticsMessage: PublishedTopic.DIAGNOSTICS,
     }[type(message)]
 
 
@@ -144,7 +144,8 @@ def rosbags_types(distro: str) -> Ros2Types:
 
     return Ros2Types(
         classes={**store.types, "geometry_msgs/msg/PoseWithCovariance": pose},
-        range_has_variance="variance" in store.types[TYPE_NAMES[Topic.RANGE]].__annotations__,
+        range_has_variance="variance"
+        in store.types[TYPE_NAMES[PublishedTopic.RANGE]].__annotations__,
         octet=int,
         octets=lambda data: np.frombuffer(data, np.uint8),
     )
@@ -184,8 +185,8 @@ def ros1_message(store: Any, message: Message, seq: int) -> Any:
     return made
 
 
-@pytest.mark.parametrize("topic", Topic)
-def test_ros1_types_are_noetic_s(topic: Topic) -> None:
+@pytest.mark.parametrize("topic", PublishedTopic)
+def test_ros1_types_are_noetic_s(topic: PublishedTopic) -> None:
     noetic, kind = get_typestore(Stores.ROS1_NOETIC), ROS1_TYPES[topic]
     full = TYPE_NAMES[topic]
     assert full.replace("/msg/", "/") == kind.name
@@ -197,8 +198,8 @@ def test_ros1_types_are_noetic_s(topic: Topic) -> None:
 
 
 @pytest.mark.parametrize("distro", ["iron", "jazzy", "kilted"])
-@pytest.mark.parametrize("topic", Topic)
-def test_type_hashes(topic: Topic, distro: str) -> None:
+@pytest.mark.parametrize("topic", PublishedTopic)
+def test_type_hashes(topic: PublishedTopic, distro: str) -> None:
     expected = get_typestore(STORES[distro]).hash_rihs01(TYPE_NAMES[topic])
     assert type_hash(topic) == f"typehash={expected};".encode()
 
@@ -212,7 +213,7 @@ def test_posture_is_told_as_pose() -> None:
     found = sample()
     posture = found.scan.posture
     assert posture
-    pose = told(found)[Topic.POSTURE]
+    pose = told(found)[PublishedTopic.POSTURE]
     expected = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
     assert pose.stamp_ns == found.utc_ns
     assert pose.frame_id == "aqualvs_dome"
@@ -226,15 +227,15 @@ def test_posture_is_told_as_pose() -> None:
 def test_filtered_posture_has_its_own_topic() -> None:
     cov = np.diag([1e-6, 1e-4, 4e-4, 1.0, 1.0, 1.0])
     smooth = FilteredPosture(0.8, 0.0, 0.0, np.zeros(3), cov, 0.02, True)
-    pose = told(replace(sample(), filtered=smooth))[Topic.FILTERED]
+    pose = told(replace(sample(), filtered=smooth))[PublishedTopic.FILTERED]
     assert pose.position.tolist() == pytest.approx([0.8, 0.0, 0.0])
     assert pose.covariance.reshape(6, 6)[5, 5] == pytest.approx(4e-4)
-    assert Topic.FILTERED not in told(sample())
+    assert PublishedTopic.FILTERED not in told(sample())
 
 
 def test_cloud_holds_every_point() -> None:
     found = sample()
-    points, cloud = found.scan.points, told(found)[Topic.CLOUD]
+    points, cloud = found.scan.points, told(found)[PublishedTopic.CLOUD]
     rows = np.frombuffer(cloud.data, POINT_TYPE)
     assert len(rows) == cloud.width == len(points) > 500
     xyz = np.column_stack([rows["x"], rows["y"], rows["z"]])
@@ -257,13 +258,13 @@ def test_fields_describe_the_points() -> None:
 
 
 def test_cloud_says_that_a_point_is_missing() -> None:
-    assert not told(shifted(sample(), math.nan))[Topic.CLOUD].is_dense
+    assert not told(shifted(sample(), math.nan))[PublishedTopic.CLOUD].is_dense
 
 
 def test_no_points() -> None:
     found = sample()
     empty = replace(found, scan=replace(found.scan, points=ScanPoints.none()))
-    cloud = told(empty)[Topic.CLOUD]
+    cloud = told(empty)[PublishedTopic.CLOUD]
     assert (cloud.width, cloud.data, cloud.is_dense) == (0, b"", True)
 
 
@@ -271,7 +272,7 @@ def test_range() -> None:
     found = sample()
     posture = found.scan.posture
     assert posture
-    told_range = told(found)[Topic.RANGE]
+    told_range = told(found)[PublishedTopic.RANGE]
     assert told_range.range == posture.range
     assert told_range.variance == posture.total_covariance[0, 0]
     assert (told_range.min_range, told_range.max_range) == found.rig.working_range
@@ -285,7 +286,9 @@ def test_a_range_that_is_believed_lies_between_the_limits() -> None:
     assert posture
     near, far = found.rig.working_range
     beyond = replace(posture, range=1.005 * far)
-    told_range = told(replace(found, scan=replace(found.scan, posture=beyond)))[Topic.RANGE]
+    told_range = told(replace(found, scan=replace(found.scan, posture=beyond)))[
+        PublishedTopic.RANGE
+    ]
     assert told_range.min_range == near
     assert told_range.max_range == told_range.range == 1.005 * far
 
@@ -293,39 +296,41 @@ def test_a_range_that_is_believed_lies_between_the_limits() -> None:
 @pytest.mark.parametrize("reason", [r for r in Reason if r is not Reason.OUT_OF_RANGE])
 def test_without_posture(reason: Reason) -> None:
     found = told(refused(reason))
-    assert Topic.POSTURE not in found
-    assert math.isnan(found[Topic.RANGE].range)
-    assert found[Topic.RANGE].min_range < found[Topic.RANGE].max_range
-    assert found[Topic.CLOUD].width > 0
+    assert PublishedTopic.POSTURE not in found
+    assert math.isnan(found[PublishedTopic.RANGE].range)
+    assert found[PublishedTopic.RANGE].min_range < found[PublishedTopic.RANGE].max_range
+    assert found[PublishedTopic.CLOUD].width > 0
 
 
 @pytest.mark.parametrize(("forward", "expected"), [(-0.5, -math.inf), (0.5, math.inf)])
 def test_too_near_and_too_far(forward: float, expected: float) -> None:
     found = told(shifted(refused(Reason.OUT_OF_RANGE), forward))
-    assert found[Topic.RANGE].range == expected
+    assert found[PublishedTopic.RANGE].range == expected
 
 
 def test_out_of_range_without_points_is_unknown() -> None:
     found = refused(Reason.OUT_OF_RANGE)
     found = replace(found, scan=replace(found.scan, points=ScanPoints.none()))
-    assert math.isnan(told(found)[Topic.RANGE].range)
+    assert math.isnan(told(found)[PublishedTopic.RANGE].range)
 
 
 def test_only_what_is_wanted_is_made() -> None:
     maker = MessageMaker(RosOptions())
-    assert [topic for topic, _ in maker.messages(sample(), {Topic.RANGE})] == [Topic.RANGE]
+    assert [topic for topic, _ in maker.messages(sample(), {PublishedTopic.RANGE})] == [
+        PublishedTopic.RANGE
+    ]
 
 
 def test_diagnostics_come_once_a_second() -> None:
     maker, found = MessageMaker(RosOptions()), sample()
-    count: Counter[Topic] = Counter()
+    count: Counter[PublishedTopic] = Counter()
     for i in range(101):
         at = replace(found.instants, scanned_ns=40_000_000 * i)
         # The system's clock may jump; the pace must not.
         jumping = replace(found, instants=at, utc_ns=found.utc_ns - 10**12 * (i % 2))
-        count.update(topic for topic, _ in maker.messages(jumping, set(Topic)))
-    assert count[Topic.RANGE] == 101
-    assert count[Topic.DIAGNOSTICS] == 5
+        count.update(topic for topic, _ in maker.messages(jumping, set(PublishedTopic)))
+    assert count[PublishedTopic.RANGE] == 101
+    assert count[PublishedTopic.DIAGNOSTICS] == 5
 
 
 def test_diagnostics() -> None:
@@ -342,7 +347,7 @@ def test_diagnostics() -> None:
         quality=0.8,
         n_water=1.339,
     )
-    found = told(replace(sample(), health=health))[Topic.DIAGNOSTICS]
+    found = told(replace(sample(), health=health))[PublishedTopic.DIAGNOSTICS]
     by_name = {status.name: status for status in found.statuses}
     assert list(by_name) == [
         "aqualvs: posture",
@@ -377,16 +382,16 @@ def test_diagnostics() -> None:
 
 def test_diagnostics_without_posture() -> None:
     found = replace(refused(Reason.NO_STRIPES), health=Health())
-    posture, pipeline, *_ = told(found)[Topic.DIAGNOSTICS].statuses
+    posture, pipeline, *_ = told(found)[PublishedTopic.DIAGNOSTICS].statuses
     assert (posture.level, posture.message) == (Level.WARN, "no_stripes: because")
     assert (pipeline.level, pipeline.message) == (Level.WARN, "0.0 frames/s")
 
 
 def test_names() -> None:
     options = RosOptions(namespace="rov1/aqualvs", frame_id="rov1/dome")
-    assert options.topic_name(Topic.CLOUD) == "/rov1/aqualvs/cloud"
-    assert options.topic_name(Topic.DIAGNOSTICS) == "/diagnostics"
-    assert told(sample(), options)[Topic.RANGE].frame_id == "rov1/dome"
+    assert options.topic_name(PublishedTopic.CLOUD) == "/rov1/aqualvs/cloud"
+    assert options.topic_name(PublishedTopic.DIAGNOSTICS) == "/diagnostics"
+    assert told(sample(), options)[PublishedTopic.RANGE].frame_id == "rov1/dome"
 
 
 @pytest.mark.parametrize(
@@ -410,6 +415,6 @@ def test_wrong_options(wrong: dict[str, Any]) -> None:
 def test_dds_types_hold_their_fields() -> None:
     # Guards against two releases sharing the types of one.
     humble, jazzy = dds_types("humble"), dds_types("jazzy")
-    name = TYPE_NAMES[Topic.RANGE]
+    name = TYPE_NAMES[PublishedTopic.RANGE]
     fields = {field.name for field in dataclasses.fields(jazzy.classes[name])}
     assert fields - {f.name for f in dataclasses.fields(humble.classes[name])} == {"variance"}

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from aqualvs.errors import OptionError
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
-from aqualvs.scanning.paper.detector import ThresholdDetector, ThresholdOptions, pixels_of_returns
+from aqualvs.scanning.paper.detector import ThresholdDetector, pixels_of_returns
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import Returns, ThresholdOptions
 
 U8 = NDArray[np.uint8]
 

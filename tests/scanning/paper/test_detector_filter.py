@@ -9,9 +9,10 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import plan_searches
-from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter, ThresholdOptions
+from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, mesh_filter_dense
 from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 

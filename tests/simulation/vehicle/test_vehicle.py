@@ -15,11 +15,11 @@ from aqualvs.simulation.vehicle.models import (
     BLUEROV2_HEAVY,
     VEHICLES,
     VIDEORAY,
-    Sticks,
+    StickInput,
     ThrustCurve,
     VehicleModel,
 )
-from aqualvs.simulation.vehicle.vehicle import Sensor, Sensors, SimulatedVehicle, level_pose
+from aqualvs.simulation.vehicle.vehicle import SensorErrors, Sensors, SimulatedVehicle, level_pose
 from aqualvs.simulation.vehicle.water_motion import WaterMotion, Waves
 
 MODELS = pytest.mark.parametrize("model", VEHICLES.values(), ids=VEHICLES)
@@ -248,9 +248,9 @@ def test_same_seed_same_dive() -> None:
 
 def test_sensors_are_as_wrong_as_stated() -> None:
     kinds = Sensors(
-        depth=Sensor(noise=0.02, bias=0.5, rate=50.0),
-        heading=Sensor(noise=0.01, wander=0.1, wander_time=0.5, rate=50.0),
-        tilt=Sensor(),
+        depth=SensorErrors(noise=0.02, bias=0.5, rate=50.0),
+        heading=SensorErrors(noise=0.01, wander=0.1, wander_time=0.5, rate=50.0),
+        tilt=SensorErrors(),
     )
     rng = np.random.default_rng(7)
     pose = level_pose(np.array([0.0, 0.0, 6.0]), 0.3)
@@ -289,15 +289,15 @@ def test_faults_are_refused() -> None:
     with pytest.raises(OptionError, match="latency"):
         vehicle(BLUEROV2, latency=-1.0)
     with pytest.raises(OptionError, match="gain"):
-        Sticks(gain=0.0)
+        StickInput(gain=0.0)
     with pytest.raises(OptionError, match="dead zones"):
-        Sticks(throttle_dead_zone=600)
+        StickInput(throttle_dead_zone=600)
     with pytest.raises(OptionError, match="thrust curve"):
         ThrustCurve(lag=0.0)
     with pytest.raises(OptionError, match="factors"):
         BLUEROV2.scaled(mass=0.0)
     with pytest.raises(OptionError, match="sensor"):
-        Sensor(rate=0.0)
+        SensorErrors(rate=0.0)
     with pytest.raises(OptionError, match="masses"):
         replace(BLUEROV2, mass=-1.0)
 

@@ -90,7 +90,7 @@ _FALL = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class CornerGrid:
     """Corners of a board in one picture.
 
     Attributes
@@ -109,7 +109,7 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class PredictedCorners:
     """Places of the grid points as predicted from their neighbours.
 
     Attributes
@@ -127,13 +127,13 @@ class Prediction:
     valid: BoolArray
 
 
-def nothing_known(board: Board) -> Grid:
+def nothing_known(board: Board) -> CornerGrid:
     """Return the grid of a board without any corner found."""
     shape = board.corner_grid[::-1]
-    return Grid(np.zeros((*shape, 2)), np.zeros(shape, dtype=bool))
+    return CornerGrid(np.zeros((*shape, 2)), np.zeros(shape, dtype=bool))
 
 
-def predict(pixels: FloatArray, known: BoolArray) -> Prediction:
+def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
     """Fit an affine map to the known neighbours of every grid point, without the point itself.
 
     Parameters
@@ -163,7 +163,7 @@ def predict(pixels: FloatArray, known: BoolArray) -> Prediction:
     solution = np.linalg.solve(safe, right)
     found = np.where(valid[..., None], solution[..., 0, :], np.nan)
     axes = np.swapaxes(solution[..., 1:, :], -1, -2)
-    return Prediction(found, axes, valid)
+    return PredictedCorners(found, axes, valid)
 
 
 def _spread_both_ways(normal: FloatArray) -> BoolArray:
@@ -229,7 +229,7 @@ _FINDERS: tuple[tuple[str, _Finder], ...] = (
 class _Attempt:
     """A grid confirmed by the picture; `first_is_light` refers to the picture's orientation."""
 
-    grid: Grid
+    grid: CornerGrid
     first_is_light: bool
 
     @property
@@ -237,12 +237,12 @@ class _Attempt:
         return int(np.count_nonzero(self.grid.known))
 
 
-def find_chessboard(image: GreyImage, board: Board) -> Grid:
+def find_chessboard(image: GreyImage, board: Board) -> CornerGrid:
     """Find the inner corners of a chessboard.
 
     Returns
     -------
-    Grid
+    CornerGrid
         No corner known if the board is not seen whole. Corners that the picture does not
         confirm, under a laser stripe for example, are not known.
 
@@ -268,7 +268,7 @@ def find_chessboard(image: GreyImage, board: Board) -> Grid:
         notes.append(f"board found at a later try (OpenCV's {used})")
     if first_is_light:
         notes.append(_other_print(board))
-    return Grid(grid.pixels, grid.known, tuple(notes))
+    return CornerGrid(grid.pixels, grid.known, tuple(notes))
 
 
 def _other_print(board: Board) -> str:
@@ -325,7 +325,7 @@ def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
     shifts = sorted(np.ndindex(3, 3), key=lambda s: abs(s[0] - 1) + abs(s[1] - 1))
     dy, dx = max(shifts, key=lambda s: np.count_nonzero(seen[s[0] :, s[1] :][:rows, :columns]))
     window = np.s_[dy : dy + rows, dx : dx + columns]
-    grid = Grid(pixels[window], seen[window])
+    grid = CornerGrid(pixels[window], seen[window])
     return _Attempt(grid, first_is_light != bool((dy + dx) % 2))
 
 
@@ -339,7 +339,7 @@ def _diagonal_is_light(image: GreyImage, pixels: FloatArray) -> bool:
     return bool(tone[even].mean() > tone[~even].mean())
 
 
-def _in_board_order(found: _Attempt) -> tuple[Grid, bool]:
+def _in_board_order(found: _Attempt) -> tuple[CornerGrid, bool]:
     """Turn a grid so that the first square is dark; return whether it is light nevertheless."""
     pixels, known = found.grid.pixels, found.grid.known
     rows, columns = known.shape
@@ -350,7 +350,7 @@ def _in_board_order(found: _Attempt) -> tuple[Grid, bool]:
     light = {turn: found.first_is_light != bool(n % 2) for turn, n in over.items()}
     dark = [turn for turn, is_light in light.items() if not is_light]
     best = min(dark or light, key=lambda turn: float(np.rot90(pixels, turn)[0, 0].sum()))
-    return Grid(np.rot90(pixels, best), np.rot90(known, best)), not dark
+    return CornerGrid(np.rot90(pixels, best), np.rot90(known, best)), not dark
 
 
 def _inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
@@ -403,12 +403,12 @@ class Seeds:
     n_agreed: int
 
 
-def find_charuco(image: GreyImage, board: Board) -> Grid:
+def find_charuco(image: GreyImage, board: Board) -> CornerGrid:
     """Find the corners of a ChArUco board.
 
     Returns
     -------
-    Grid
+    CornerGrid
         No corner known if no two markers agree on one.
     """
     quick_px = 2 * max(round(0.5 * _QUICK_WINDOW * image.shape[1]), 1) + 1
@@ -499,7 +499,7 @@ def _neighbours(
     return agree, near & ~agree
 
 
-def _grow(image: GreyImage, board: Board, seeds: Seeds) -> Grid:
+def _grow(image: GreyImage, board: Board, seeds: Seeds) -> CornerGrid:
     """Refine the seeds, then proceed from known corners to neighbours until none is new."""
     shape = board.corner_grid[::-1]
     pixels, known = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
@@ -520,10 +520,10 @@ def _grow(image: GreyImage, board: Board, seeds: Seeds) -> Grid:
         )
         pixels[new], known[new] = fits.pixels, fits.valid
         known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
-    return Grid(pixels, known)
+    return CornerGrid(pixels, known)
 
 
-def _supported(grid: Grid, markers: Markers, board: Board) -> bool:
+def _supported(grid: CornerGrid, markers: Markers, board: Board) -> bool:
     """Return whether most markers lie where the grid predicts them.
 
     On a board of another pattern, for example with other counts of squares, some rows agree by

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from aqualvs.calibration.detection.boards import (
-    Grid,
+    CornerGrid,
     Markers,
     agreed_corners,
     find_charuco,
@@ -165,7 +165,7 @@ def detect_board(
     return _view(grid, board, name)
 
 
-def _view(grid: Grid, board: Board, name: str) -> View:
+def _view(grid: CornerGrid, board: Board, name: str) -> View:
     ids = np.flatnonzero(grid.known).astype(np.int64)
     return View(name, ids, board.corner_points()[ids], grid.pixels.reshape(-1, 2)[ids], grid.notes)
 

@@ -238,7 +238,7 @@ _SHIFT_Y = 4
 
 
 @dataclass(frozen=True, slots=True)
-class SharedError:
+class SharedDistanceError:
     """An error that all given distances share, estimated from the pictures.
 
     Attributes
@@ -321,13 +321,13 @@ def solved_by_offset(problem: DomeProblem, solution: Solution[BundleState]) -> F
 
 def _shared_error(
     covariance: FloatArray, blocks: Mapping[int, Block], shape: Mapping[int, float]
-) -> SharedError:
+) -> SharedDistanceError:
     """Fit an error of a given shape over the distances, from derivatives at the solution."""
     slopes, own, gradient = _slopes(len(covariance), blocks, shape)
     left = own - float(slopes @ covariance @ slopes)
     if left <= 1e-9 * own:
-        return SharedError(0.0, float("inf"))
-    return SharedError(gradient / left, 1.0 / float(np.sqrt(left)))
+        return SharedDistanceError(0.0, float("inf"))
+    return SharedDistanceError(gradient / left, 1.0 / float(np.sqrt(left)))
 
 
 def _slopes(

@@ -27,13 +27,13 @@ from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, Laser
 from aqualvs.calibration.lasers.report import (
     LaserCalibration,
     LaserFigures,
-    Solved,
+    SolvedLasers,
     ViewFigures,
     laser_figures,
     view_figures,
 )
-from aqualvs.calibration.lasers.solve import Start, paper_planes, solve_lasers, tolerance_px
-from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes, Surfaces
+from aqualvs.calibration.lasers.solve import InitialGuess, paper_planes, solve_lasers, tolerance_px
+from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes, TargetSurfaces
 from aqualvs.calibration.lasers.views import LaserView, PlacedView, place_views, pooled
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
@@ -92,7 +92,7 @@ class LaserOptions:
 def calibrate_lasers(
     rig: Rig,
     views: Sequence[LaserView],
-    surfaces: Surfaces,
+    surfaces: TargetSurfaces,
     *,
     options: LaserOptions | None = None,
     uncertainty: RigUncertainty | None = None,
@@ -105,7 +105,7 @@ def calibrate_lasers(
         Camera, dome and media; its lasers, if any, give names, order and windows.
     views : sequence of LaserView
         Corners and stripes of every picture.
-    surfaces : Surfaces
+    surfaces : TargetSurfaces
         Of the target: `box_surfaces` or `board_surface`.
     options : LaserOptions, optional
     uncertainty : RigUncertainty, optional
@@ -130,7 +130,7 @@ def calibrate_lasers(
     check_poses(placed)
     check_distances(placed, rig)
     lasers, laser_of, warnings = _sorted_stripes(rig, placed, surfaces, options)
-    start = Start(seen_rig, surfaces, tuple(placed), doubt if options.refine else None)
+    start = InitialGuess(seen_rig, surfaces, tuple(placed), doubt if options.refine else None)
     solved, words = solve_lasers(start, lasers, laser_of, options.loose)
     result = _result_rig(rig, solved, lasers, start.doubt)
     joint = joint_uncertainty(
@@ -165,7 +165,7 @@ def _doubt(rig: Rig, options: LaserOptions, uncertainty: RigUncertainty) -> Came
 
 
 def _sorted_stripes(
-    rig: Rig, views: Sequence[PlacedView], surfaces: Surfaces, options: LaserOptions
+    rig: Rig, views: Sequence[PlacedView], surfaces: TargetSurfaces, options: LaserOptions
 ) -> tuple[list[Laser], IntArray, list[str]]:
     """Return the lasers with rough planes, the index of each point's laser, and warnings."""
     split, warnings = _split(rig, views, surfaces, options)
@@ -188,7 +188,7 @@ def _sorted_stripes(
 
 
 def _split(
-    rig: Rig, views: Sequence[PlacedView], surfaces: Surfaces, options: LaserOptions
+    rig: Rig, views: Sequence[PlacedView], surfaces: TargetSurfaces, options: LaserOptions
 ) -> tuple[LaserSplit, list[str]]:
     """Split the stripes, with a larger tolerance if a tilted board may have split lasers."""
     expected = options.n_lasers or len(rig.lasers) or None
@@ -209,7 +209,7 @@ def _split(
 
 
 def _result_rig(
-    rig: Rig, solved: Solved, lasers: Sequence[Laser], doubt: CameraDoubt | None
+    rig: Rig, solved: SolvedLasers, lasers: Sequence[Laser], doubt: CameraDoubt | None
 ) -> Rig:
     state = solved.state
     found = tuple(sheet.laser(laser) for laser, sheet in zip(lasers, state.sheets, strict=True))
@@ -220,7 +220,7 @@ def _result_rig(
 
 
 def _warnings(
-    solved: Solved, lasers: Sequence[LaserFigures], views: Sequence[ViewFigures]
+    solved: SolvedLasers, lasers: Sequence[LaserFigures], views: Sequence[ViewFigures]
 ) -> list[str]:
     words = [
         f"{view.name}: corners miss by {view.rms_corners_px:.2f} px (rms); check the rig, the "
@@ -281,7 +281,7 @@ class HeldOutView:
 def leave_one_out(
     rig: Rig,
     views: Sequence[LaserView],
-    surfaces: Surfaces,
+    surfaces: TargetSurfaces,
     *,
     options: LaserOptions | None = None,
     uncertainty: RigUncertainty | None = None,
@@ -316,7 +316,7 @@ def leave_one_out(
 
 
 def _measured(
-    calibration: LaserCalibration, view: LaserView, surfaces: Surfaces, options: LaserOptions
+    calibration: LaserCalibration, view: LaserView, surfaces: TargetSurfaces, options: LaserOptions
 ) -> HeldOutView:
     rig = calibration.rig
     seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)

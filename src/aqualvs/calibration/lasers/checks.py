@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserSplit, Verdict
-from aqualvs.calibration.lasers.report import Solved
-from aqualvs.calibration.lasers.stripes_on_planes import Surfaces
+from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserSplit, PlaneVerdict
+from aqualvs.calibration.lasers.report import SolvedLasers
+from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces
 from aqualvs.calibration.lasers.views import LaserView, PlacedView
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
 from aqualvs.errors import CalibrationError
@@ -180,7 +180,7 @@ def check_count(
     expected: int | None,
     rig: Rig,
     views: Sequence[PlacedView],
-    surfaces: Surfaces,
+    surfaces: TargetSurfaces,
 ) -> list[str]:
     """Refuse fewer or more lasers than expected, or an undecided number; warn of uncertain ones.
 
@@ -209,7 +209,7 @@ def check_count(
     words = [
         f"a plane of light ({_plane(plane, views, surfaces)}) is not taken for a laser: {plane.why}"
         for plane in split.spare
-        if plane.verdict is Verdict.OTHER or plane in split.undecided
+        if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
     ]
     taken = [line for plane in split.spare for line in plane.members.tolist()]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
@@ -232,13 +232,15 @@ def check_count(
     return words
 
 
-def _planes(planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+def _planes(
+    planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces: TargetSurfaces
+) -> str:
     some = [f"{_plane(plane, views, surfaces)}: {plane.why}" for plane in planes[:3]]
     more = [f"and {len(planes) - 3} more"] if len(planes) > 3 else []
     return "; ".join(some + more)
 
 
-def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: TargetSurfaces) -> str:
     """Return the number of a plane's points and the pictures it is seen in."""
     patches = plane.patches
     rest = f" and {len(patches) - 1} others" if len(patches) > 1 else ""
@@ -250,7 +252,7 @@ def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
     return float(np.median([view.rms_px for view in views]) / np.sqrt(2.0))
 
 
-def contradicts(solved: Solved) -> bool:
+def contradicts(solved: SolvedLasers) -> bool:
     """Return whether corners and stripes of a board cannot both be right.
 
     Then stripes shift the board from its pose by corners alone, or stripes do not fit one plane
@@ -260,7 +262,7 @@ def contradicts(solved: Solved) -> bool:
     return corners > _CORNERS_CONTRADICT or _stripes_misfit(solved) > _STRIPES_CONTRADICT
 
 
-def _stripes_misfit(solved: Solved) -> float:
+def _stripes_misfit(solved: SolvedLasers) -> float:
     """Return the ratio of the stripes' residuals from their plane to those from straight lines."""
     from_plane = from_line = 0.0
     for i, group in enumerate(solved.problem.groups):
@@ -279,7 +281,7 @@ def _stripes_misfit(solved: Solved) -> float:
     return float(np.sqrt(from_plane / max(from_line, 1e-12)))
 
 
-def loose_words(solved: Solved) -> str:
+def loose_words(solved: SolvedLasers) -> str:
     """Return the warning that a board is assumed to lie unevenly on its surface."""
     slack = solved.state.slack
     tilt = np.rad2deg(np.sqrt(np.mean(np.sum(slack[:, :2] ** 2, axis=1))))
@@ -291,14 +293,14 @@ def loose_words(solved: Solved) -> str:
     )
 
 
-def _corners_px(solved: Solved) -> float:
+def _corners_px(solved: SolvedLasers) -> float:
     n_groups = len(solved.problem.groups)
     blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
     squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
     return float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
 
 
-def _alone_px(solved: Solved) -> float:
+def _alone_px(solved: SolvedLasers) -> float:
     return float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
 
 
@@ -307,7 +309,7 @@ def _too_few(
     expected: int | None,
     rig: Rig,
     views: Sequence[PlacedView],
-    surfaces: Surfaces,
+    surfaces: TargetSurfaces,
 ) -> str:
     which = ""
     if split.planes and len(rig.lasers) == expected:
@@ -332,12 +334,12 @@ def _too_few(
     )
 
 
-def _remedy(surfaces: Surfaces) -> str:
+def _remedy(surfaces: TargetSurfaces) -> str:
     if len(surfaces.planes) > 1:
         return "add pictures in which every stripe crosses from one plane to another"
     return "add pictures with the board nearer, farther or tilted another way"
 
 
-def _where(patch: int, views: Sequence[PlacedView], surfaces: Surfaces) -> str:
+def _where(patch: int, views: Sequence[PlacedView], surfaces: TargetSurfaces) -> str:
     i_view, i_surface = divmod(patch, len(surfaces.planes))
     return f"{views[i_view].view.name}, plane '{surfaces.names[i_surface]}'"

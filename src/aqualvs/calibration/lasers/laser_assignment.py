@@ -47,7 +47,7 @@ _LEAST_BASELINE = 2e-3
 _POORER, _LEAST_RESIDUAL_PX = 5.0, 0.1
 
 
-class Verdict(Enum):
+class PlaneVerdict(Enum):
     """Verdict on a plane of light."""
 
     LASER = "laser"
@@ -68,7 +68,7 @@ class JudgedPlane:
         Indices of its points.
     patches : tuple of int
         Surfaces of views that it is seen on.
-    verdict : Verdict
+    verdict : PlaneVerdict
     why : str
         In words, the reason why it is no laser or may be none; empty for lasers.
     """
@@ -76,7 +76,7 @@ class JudgedPlane:
     candidate: PlaneCandidate
     members: IntArray
     patches: tuple[int, ...]
-    verdict: Verdict
+    verdict: PlaneVerdict
     why: str = ""
 
 
@@ -112,13 +112,13 @@ def judged(
         members = _members(lines, candidate)
         fault = _fault(pooled, candidate, members, seen)
         if abs(float(candidate.plane.signed_distance(lens_in_dome))) < _LEAST_BASELINE:
-            fault = Verdict.OTHER, "it stays in one place of the picture, near or far"
+            fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
-            fault = Verdict.WEAK, "too few stripes lie in it to tell it from an accident"
-        verdict, why = fault or (Verdict.LASER, "")
+            fault = PlaneVerdict.WEAK, "too few stripes lie in it to tell it from an accident"
+        verdict, why = fault or (PlaneVerdict.LASER, "")
         patches = tuple(np.unique(pooled.patch[members]).tolist())
         seen.append(JudgedPlane(candidate, members, patches, verdict, why))
-    ranks = list(Verdict)
+    ranks = list(PlaneVerdict)
     return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
 
 
@@ -148,27 +148,27 @@ def _fault(
     candidate: PlaneCandidate,
     members: IntArray,
     seen: Sequence[JudgedPlane],
-) -> tuple[Verdict, str] | None:
+) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
     if len(members) < _LEAST_POINTS:
-        return Verdict.OTHER, f"it has {len(members)} points only"
+        return PlaneVerdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
-        return Verdict.DOUBTFUL, (
+        return PlaneVerdict.DOUBTFUL, (
             "its stripe stays in one place of the target, as print or an edge would; move the "
             "camera sideways, or turn it, between pictures"
         )
     for other in seen:
-        if other.verdict is Verdict.OTHER:
+        if other.verdict is PlaneVerdict.OTHER:
             continue
         fault = _same_light(pooled, members, other)
         if fault is not None:
             return fault
     best = min(
-        (other.candidate.residual_px for other in seen if other.verdict is Verdict.LASER),
+        (other.candidate.residual_px for other in seen if other.verdict is PlaneVerdict.LASER),
         default=np.inf,
     )
     if candidate.residual_px > _POORER * max(best, _LEAST_RESIDUAL_PX):
-        return Verdict.DOUBTFUL, (
+        return PlaneVerdict.DOUBTFUL, (
             f"its stripes miss a plane by {candidate.residual_px:.1f} px, those of another laser "
             f"by {best:.1f} px; they may lie on something else than the target"
         )
@@ -179,21 +179,24 @@ def _same_light(
     pooled: PooledStripes,
     members: IntArray,
     other: JudgedPlane,
-) -> tuple[Verdict, str] | None:
+) -> tuple[PlaneVerdict, str] | None:
     """Return the reason why a plane's stripes may be of another plane's laser, or None."""
     mine = set(pooled.patch[members].tolist())
     shared = mine & set(other.patches)
     away = plane_residuals_px(pooled.placed, [other.candidate.plane])[members, 0]
     distance = float(np.median(np.abs(away)))
     if distance <= _HALO_PX and shared:
-        return Verdict.OTHER, "it is the halo of another stripe"
+        return PlaneVerdict.OTHER, "it is the halo of another stripe"
     if distance <= _TORN_PX and len(shared) <= (1.0 - _MOST) * len(mine):
-        return Verdict.TORN, (
+        return PlaneVerdict.TORN, (
             f"it is {distance:.0f} px away from a laser that is seen in other pictures"
         )
     goes_on = sum(_goes_on(pooled, members, other.members, patch) for patch in shared)
     if len(shared) >= 2 and goes_on >= _MOST * len(mine):
-        return Verdict.OTHER, "it begins where another stripe ends, as that laser's light does on "
+        return (
+            PlaneVerdict.OTHER,
+            "it begins where another stripe ends, as that laser's light does on ",
+        )
     return None
 
 
@@ -293,13 +296,13 @@ class LaserSplit:
         return tuple(
             plane
             for plane in self.spare
-            if plane.verdict is not Verdict.OTHER and plane.candidate.log_false_alarms <= most
+            if plane.verdict is not PlaneVerdict.OTHER and plane.candidate.log_false_alarms <= most
         )
 
     @property
     def torn(self) -> bool:
         """True if a laser appears as several planes, as on a board that is not flat."""
-        return any(plane.verdict is Verdict.TORN for plane in self.spare)
+        return any(plane.verdict is PlaneVerdict.TORN for plane in self.spare)
 
 
 def split_lasers(
@@ -330,7 +333,7 @@ def split_lasers(
     """
     lines = _all_lines(pooled)
     found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
-    taken = [plane for plane in found if plane.verdict is Verdict.LASER]
+    taken = [plane for plane in found if plane.verdict is PlaneVerdict.LASER]
     in_planes = {int(i) for plane in found for i in plane.candidate.lines}
     lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
     longest = max(lonely, default=0)
@@ -352,7 +355,7 @@ def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int)
     Not if a much longer stripe, of `longest` points, is in no plane: that may be the laser then,
     seen on one surface only.
     """
-    perhaps = plane.verdict in (Verdict.WEAK, Verdict.DOUBTFUL)
+    perhaps = plane.verdict in (PlaneVerdict.WEAK, PlaneVerdict.DOUBTFUL)
     own = max(len(lines[int(i)].members) for i in plane.candidate.lines)
     return perhaps and plane.candidate.log_false_alarms <= _TOLD and longest <= _LONGER * own
 

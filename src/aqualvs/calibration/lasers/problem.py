@@ -13,12 +13,12 @@ import numpy as np
 
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripeGroup,
-    Surfaces,
+    TargetSurfaces,
     points_on,
     solve_on_surface,
 )
 from aqualvs.calibration.solver.bundle import Bundle, BundleState, point_by_pose
-from aqualvs.calibration.solver.least_squares import Block, Loss
+from aqualvs.calibration.solver.least_squares import Block, RobustLoss
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
@@ -100,7 +100,7 @@ class LaserProblem:
     ----------
     bundle : Bundle
         Corners and priors; all views in its first medium.
-    surfaces : Surfaces
+    surfaces : TargetSurfaces
         Of the target.
     groups : tuple of StripeGroup
         Stripes; their residuals come before the corners'.
@@ -110,7 +110,7 @@ class LaserProblem:
     """
 
     bundle: Bundle
-    surfaces: Surfaces
+    surfaces: TargetSurfaces
     groups: tuple[StripeGroup, ...]
     n_lasers: int
     slack: Slack | None = None
@@ -151,7 +151,7 @@ class LaserProblem:
                     self.slack_columns(i),
                     (row / sigma)[None],
                     np.diag(1.0 / sigma)[None],
-                    Loss.SQUARE,
+                    RobustLoss.SQUARE,
                     scaled=False,
                 )
                 for i, row in enumerate(state.slack)

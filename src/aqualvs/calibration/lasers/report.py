@@ -137,7 +137,7 @@ class LaserCalibration:
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class SolvedLasers:
     """A solved problem with its parts."""
 
     problem: LaserProblem
@@ -165,7 +165,7 @@ class Solved:
 
 
 def laser_figures(
-    solved: Solved,
+    solved: SolvedLasers,
     joint: JointResult,
     lasers: Sequence[Laser],
     papers: Sequence[Plane],
@@ -179,7 +179,7 @@ def laser_figures(
 
 
 def _laser_figures(
-    solved: Solved, joint: JointResult, i_laser: int, laser: Laser, paper: Plane, words: str
+    solved: SolvedLasers, joint: JointResult, i_laser: int, laser: Laser, paper: Plane, words: str
 ) -> LaserFigures:
     mine = solved.groups_of(laser=i_laser)
     groups = [solved.problem.groups[i] for i in mine]
@@ -203,7 +203,7 @@ def _laser_figures(
 
 
 def _stripes(
-    solved: Solved, groups: Sequence[int]
+    solved: SolvedLasers, groups: Sequence[int]
 ) -> tuple[FloatArray, BoolArray, IntArray, FloatArray]:
     """Return residuals (px), inlier mask, counts and distances (m) of groups' bins."""
     parts = [solved.stripe_residuals_px(i) for i in groups]
@@ -222,12 +222,12 @@ def _rms(values: FloatArray, weights: IntArray) -> float:
     return float(np.sqrt(np.average(values**2, weights=weights)))
 
 
-def view_figures(solved: Solved) -> list[ViewFigures]:
+def view_figures(solved: SolvedLasers) -> list[ViewFigures]:
     """Return the figures of every picture."""
     return [_view_figures(solved, i, view) for i, view in enumerate(solved.views)]
 
 
-def _view_figures(solved: Solved, i_view: int, view: PlacedView) -> ViewFigures:
+def _view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFigures:
     n_groups = len(solved.problem.groups)
     block = solved.solution.blocks[n_groups + i_view]
     inside = solved.solution.inliers[n_groups + i_view]

@@ -15,9 +15,9 @@ from aqualvs.calibration.lasers.checks import contradicts, like, typical_corner_
 from aqualvs.calibration.lasers.covariance import CameraDoubt
 from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
 from aqualvs.calibration.lasers.problem import N_SLACK, LaserProblem, LaserState, Slack
-from aqualvs.calibration.lasers.report import Solved
+from aqualvs.calibration.lasers.report import SolvedLasers
 from aqualvs.calibration.lasers.stripes_on_planes import (
-    Surfaces,
+    TargetSurfaces,
     binned,
     correlation_factor,
     points_on,
@@ -76,16 +76,16 @@ def _bent(rig: Rig, laser: Laser) -> Sheet:
 
 
 def choose_sheets(
-    flat: Solved,
+    flat: SolvedLasers,
     rig: Rig,
     lasers: Sequence[Laser],
-    solve_with: Callable[[tuple[Sheet, ...]], Solved],
-) -> tuple[Solved, list[str]]:
+    solve_with: Callable[[tuple[Sheet, ...]], SolvedLasers],
+) -> tuple[SolvedLasers, list[str]]:
     """Choose plane or bent sheet for every laser that has a window.
 
     Parameters
     ----------
-    flat : Solved
+    flat : SolvedLasers
         With all lasers as planes.
     rig : Rig
         In the medium of the pictures.
@@ -96,7 +96,7 @@ def choose_sheets(
 
     Returns
     -------
-    solved : Solved
+    solved : SolvedLasers
         With the chosen sheets.
     words : list of str
         For every laser, the choice and its reason.
@@ -128,7 +128,7 @@ def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
     return True, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
 
 
-def _fit(solved: Solved, i_laser: int) -> _Fit:
+def _fit(solved: SolvedLasers, i_laser: int) -> _Fit:
     squares: list[FloatArray] = []
     sequences: list[FloatArray] = []
     for i in solved.groups_of(laser=i_laser):
@@ -150,14 +150,14 @@ _FEWEST_POINTS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class InitialGuess:
     """Input and initial guess of a solve.
 
     Attributes
     ----------
     rig : Rig
         In the medium of the pictures.
-    surfaces : Surfaces
+    surfaces : TargetSurfaces
         Of the target.
     views : tuple of PlacedView
     doubt : CameraDoubt or None
@@ -169,7 +169,7 @@ class Start:
     """
 
     rig: Rig
-    surfaces: Surfaces
+    surfaces: TargetSurfaces
     views: tuple[PlacedView, ...]
     doubt: CameraDoubt | None
     slack: Slack | None = None
@@ -204,13 +204,13 @@ def tolerance_px(lasers: Sequence[Laser]) -> float:
 
 
 def solve_lasers(
-    start: Start, lasers: Sequence[Laser], laser_of: IntArray, loose: bool | None
-) -> tuple[Solved, list[str]]:
+    start: InitialGuess, lasers: Sequence[Laser], laser_of: IntArray, loose: bool | None
+) -> tuple[SolvedLasers, list[str]]:
     """Solve lasers as planes, again with points assigned by those planes, then their sheets.
 
     Parameters
     ----------
-    start : Start
+    start : InitialGuess
     lasers : sequence of Laser
         `plane` fits the light in the medium of the pictures roughly.
     laser_of : int array, shape (N,)
@@ -220,7 +220,7 @@ def solve_lasers(
 
     Returns
     -------
-    solved : Solved
+    solved : SolvedLasers
     words : list of str
         For every laser, the chosen sheet and the reason.
     """
@@ -242,8 +242,8 @@ def solve_lasers(
 
 
 def _sorted_again(
-    start: Start, solved: Solved, laser_of: IntArray, tolerance: float
-) -> tuple[Start, IntArray]:
+    start: InitialGuess, solved: SolvedLasers, laser_of: IntArray, tolerance: float
+) -> tuple[InitialGuess, IntArray]:
     """Return the start with solved poses, and each point's laser by solved planes.
 
     Both are unchanged if a laser would lose its points.
@@ -263,8 +263,8 @@ def _sorted_again(
 
 
 def _solve_from(
-    start: Start, sheets: tuple[Sheet, ...], laser_of: IntArray, names: Sequence[str]
-) -> Solved:
+    start: InitialGuess, sheets: tuple[Sheet, ...], laser_of: IntArray, names: Sequence[str]
+) -> SolvedLasers:
     camera, groups = start.rig.camera(), []
     for i_view, mine in enumerate(split_by_view(laser_of, start.views)):
         view = start.views[i_view]
@@ -280,7 +280,7 @@ def _solve_from(
     slack = np.zeros((len(start.views), N_SLACK))
     state = LaserState(start.state(), sheets, slack)
     solution = solve(problem, state, remedy=lambda i: free_words(problem, names, start.views, i))
-    return Solved(problem, solution, start.views)
+    return SolvedLasers(problem, solution, start.views)
 
 
 def free_words(
@@ -319,7 +319,7 @@ def free_words(
     )
 
 
-def paper_planes(solved: Solved) -> list[Plane]:
+def paper_planes(solved: SolvedLasers) -> list[Plane]:
     """Return the planes of all lasers by the paper's method (Eq. 33-36)."""
     camera = solved.problem.bundle.start.camera(0)
     surfaces, planes = solved.problem.surfaces, []

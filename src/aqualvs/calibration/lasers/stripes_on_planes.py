@@ -76,7 +76,7 @@ _PIXEL_STEPS: FloatArray = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 
 
 @dataclass(frozen=True, slots=True)
-class Surfaces:
+class TargetSurfaces:
     """Flat surfaces of a target that stripes are seen on, in the target's frame.
 
     Attributes
@@ -128,7 +128,7 @@ class Surfaces:
         return inside
 
 
-def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> Surfaces:
+def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> TargetSurfaces:
     """Return the surfaces of an open box.
 
     Parameters
@@ -160,10 +160,10 @@ def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> Surfaces:
         outward.append(plane if beyond.max() <= _ON_PLANE else Plane(-plane.normal, -plane.offset))
     lowest, highest = points.min(axis=0), points.max(axis=0)
     rim = _RIM_SHARE * float(np.max(highest - lowest))
-    return Surfaces(tuple(planes), tuple(outward), lowest - rim, highest + rim)
+    return TargetSurfaces(tuple(planes), tuple(outward), lowest - rim, highest + rim)
 
 
-def board_surface(*, thickness: float = 0.0) -> Surfaces:
+def board_surface(*, thickness: float = 0.0) -> TargetSurfaces:
     """Return the surface of a board, for stripes on the board or beside it.
 
     Parameters
@@ -174,7 +174,7 @@ def board_surface(*, thickness: float = 0.0) -> Surfaces:
     """
     far = np.full(3, np.inf)
     # A board's z axis points into it (OpenCV).
-    return Surfaces(("board",), (Plane(np.array([0.0, 0.0, 1.0]), thickness),), -far, far)
+    return TargetSurfaces(("board",), (Plane(np.array([0.0, 0.0, 1.0]), thickness),), -far, far)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +186,7 @@ class PlacedStripes:
     index : int array, shape (N,)
         Indices into the `StripePoints`.
     surface : int array, shape (N,)
-        Index into `Surfaces`.
+        Index into `TargetSurfaces`.
     points_in_dome : array, shape (N, 3)
         In metres.
     by_pixel : array, shape (N, 3, 2)
@@ -251,7 +251,7 @@ class PooledStripes:
 
 
 def place_stripes(
-    camera: Camera, stripes: StripePoints, dome_from_target: SE3, surfaces: Surfaces
+    camera: Camera, stripes: StripePoints, dome_from_target: SE3, surfaces: TargetSurfaces
 ) -> PlacedStripes:
     """Find the surface and place of every stripe point (paper, Eq. 34).
 
@@ -263,7 +263,7 @@ def place_stripes(
         Of the picture.
     dome_from_target : SE3
         Pose of the target in it.
-    surfaces : Surfaces
+    surfaces : TargetSurfaces
         Of the target.
 
     Returns
@@ -339,7 +339,7 @@ class StripeGroup:
     across : array, shape (B, 2)
         As `StripePoints`.
     surface : int array, shape (B,)
-        Index into `Surfaces`.
+        Index into `TargetSurfaces`.
     sigma_px : array, shape (B,)
         Nominal noise across the stripe.
     counts : int array, shape (B,)

@@ -16,7 +16,7 @@ from aqualvs.calibration.lasers.stripes_on_planes import (
     PlacedStripes,
     PooledStripes,
     StripePoints,
-    Surfaces,
+    TargetSurfaces,
     place_stripes,
 )
 from aqualvs.calibration.solver.bundle import moved_target, point_by_pose
@@ -166,7 +166,7 @@ class PlacedView:
 
 
 def place_views(
-    camera: Camera, views: Sequence[LaserView], surfaces: Surfaces
+    camera: Camera, views: Sequence[LaserView], surfaces: TargetSurfaces
 ) -> tuple[list[PlacedView], list[str]]:
     """Find the pose of every picture, and its stripes on the surfaces.
 
@@ -176,7 +176,7 @@ def place_views(
         Looking into the medium of the pictures.
     views : sequence of LaserView
         One for each picture.
-    surfaces : Surfaces
+    surfaces : TargetSurfaces
         Of the target. If it has several, markers must be seen on at least two.
 
     Returns
@@ -203,7 +203,7 @@ def place_views(
     return found, left_out
 
 
-def _placed_view(camera: Camera, laser_view: LaserView, surfaces: Surfaces) -> PlacedView:
+def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces) -> PlacedView:
     view = laser_view.view
     if len(view) < _FEWEST_CORNERS:
         raise CalibrationError(
@@ -235,13 +235,13 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: Surfaces) -> P
     )
 
 
-def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: Surfaces) -> PlacedView:
+def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: TargetSurfaces) -> PlacedView:
     """Return the picture with another pose, and its stripes placed by that pose."""
     placed = place_stripes(camera, view.stripes, pose, surfaces)
     return replace(view, dome_from_target=pose, placed=placed)
 
 
-def _check_surfaces(view: View, surfaces: Surfaces) -> None:
+def _check_surfaces(view: View, surfaces: TargetSurfaces) -> None:
     seen = planes_with_points(view, surfaces.planes)
     if len(seen) < 2:
         where = f"plane '{surfaces.names[seen[0]]}' only" if seen else "none of the planes"
@@ -261,7 +261,7 @@ def _none() -> PlacedStripes:
     )
 
 
-def pooled(views: Sequence[PlacedView], surfaces: Surfaces) -> PooledStripes:
+def pooled(views: Sequence[PlacedView], surfaces: TargetSurfaces) -> PooledStripes:
     """Return the stripe points of all pictures joined."""
     n_surfaces = len(surfaces.planes)
     parts = [view.placed for view in views]

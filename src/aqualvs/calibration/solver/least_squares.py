@@ -2,7 +2,7 @@
 
 Levenberg-Marquardt on the normal equations (Marquardt 1963, doi:10.1137/0111030), made robust by
 iteratively reweighted least squares (Huber 1964, doi:10.1214/aoms/1177703732). A loss is a function
-of the length of an observation's residual in standard deviations (`Loss`).
+of the length of an observation's residual in standard deviations (`RobustLoss`).
 
 The noise of each block (`Block`) is estimated from its residuals, shrunk towards the noise of its
 group; the covariance follows from that estimate, not from the nominal noise.
@@ -27,7 +27,7 @@ _HUBER = 3.0
 _CAUCHY = 2.385
 
 
-class Loss(StrEnum):
+class RobustLoss(StrEnum):
     """Loss function of the length of a residual."""
 
     SQUARE = "square"
@@ -40,18 +40,18 @@ class Loss(StrEnum):
     def cost(self, lengths: FloatArray) -> FloatArray:
         """Return the loss of residuals (N,), half the square for short ones."""
         square: FloatArray = 0.5 * lengths**2
-        if self is Loss.HUBER:
+        if self is RobustLoss.HUBER:
             return np.where(lengths <= _HUBER, square, _HUBER * (lengths - 0.5 * _HUBER))
-        if self is Loss.CAUCHY:
+        if self is RobustLoss.CAUCHY:
             logarithm: FloatArray = 0.5 * _CAUCHY**2 * np.log1p((lengths / _CAUCHY) ** 2)
             return logarithm
         return square
 
     def weight(self, lengths: FloatArray) -> FloatArray:
         """Return d cost / d length over length, the weight of iterative reweighting."""
-        if self is Loss.HUBER:
+        if self is RobustLoss.HUBER:
             return np.where(lengths <= _HUBER, 1.0, _HUBER / np.maximum(lengths, _HUBER))
-        if self is Loss.CAUCHY:
+        if self is RobustLoss.CAUCHY:
             weight: FloatArray = 1.0 / (1.0 + (lengths / _CAUCHY) ** 2)
             return weight
         return np.ones_like(lengths)
@@ -72,7 +72,7 @@ class Block:
         belong to one observation, such as x and y of a corner. NaN rows are not seen.
     jacobian : array, shape (N, K, C)
         Derivative of `residuals`.
-    loss : Loss
+    loss : RobustLoss
         Loss of the length of an observation's residual.
     scaled : bool
         Whether the noise is estimated, as a multiple of the nominal one; for priors it is not.
@@ -82,7 +82,7 @@ class Block:
     columns: IntArray
     residuals: FloatArray
     jacobian: FloatArray
-    loss: Loss = Loss.HUBER
+    loss: RobustLoss = RobustLoss.HUBER
     scaled: bool = True
     lengths: FloatArray = field(init=False, repr=False, compare=False)
     """Lengths (N,) of the observations' residuals."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aqualvs.calibration.solver.least_squares import Block, Loss
+from aqualvs.calibration.solver.least_squares import Block, RobustLoss
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotvec_from_rotation
 from aqualvs.optics.rig import Rig, RigUncertainty
@@ -40,7 +40,9 @@ class KnownDistance:
         by_turn = np.array([ny * z - nz * y, nz * x - nx * z, nx * y - ny * x])
         jacobian = np.concatenate([by_turn, normal]) / (normal[1] * self.sigma)
         residual = np.array([[(found - self.distance) / self.sigma]])
-        return [Block(DISTANCES, columns, residual, jacobian[None, None, :], Loss.HUBER, False)]
+        return [
+            Block(DISTANCES, columns, residual, jacobian[None, None, :], RobustLoss.HUBER, False)
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,7 @@ class SquareBoard:
                 columns[:3],
                 tilt[None, axes] / sigma,
                 by_turn[None, axes, :] / sigma,
-                Loss.CAUCHY,
+                RobustLoss.CAUCHY,
                 False,
             )
             for group, axes, sigma in (
@@ -183,4 +185,4 @@ def _whiten(covariance: FloatArray) -> FloatArray:
 
 def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
     residuals = (whiten @ moved)[:, None]
-    return Block(PRIORS, columns, residuals, whiten[:, None, :], Loss.SQUARE, False)
+    return Block(PRIORS, columns, residuals, whiten[:, None, :], RobustLoss.SQUARE, False)

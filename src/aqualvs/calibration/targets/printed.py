@@ -51,7 +51,7 @@ class BoxPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
+class SheetPatch:
     """Part of a plane that one sheet of paper covers.
 
     Attributes
@@ -88,7 +88,7 @@ class _Wall:
 
 def box_patches(
     plan: BoxPlan, rooms: Sequence[tuple[float, float]]
-) -> tuple[MarkerSet, tuple[Patch, ...]]:
+) -> tuple[MarkerSet, tuple[SheetPatch, ...]]:
     """Return a box's markers, and the patches in which they can be printed.
 
     Parameters
@@ -109,7 +109,7 @@ def box_patches(
     ids: list[int] = []
     corners: list[FloatArray] = []
     names: list[str] = []
-    patches: list[Patch] = []
+    patches: list[SheetPatch] = []
     walls = _walls(plan)
     for name, wall in walls.items():
         first = plan.first_id + len(ids)
@@ -183,7 +183,7 @@ def _patches(
     pitch: float,
     marker: float,
     rooms: Sequence[tuple[float, float]],
-) -> list[Patch]:
+) -> list[SheetPatch]:
     """Cut a wall's grid into the fewest blocks of whole cells that fit a sheet."""
     rows, columns = placed.shape[:2]
     numbers = first + np.arange(rows * columns).reshape(rows, columns)
@@ -196,7 +196,7 @@ def _patches(
             block = placed[i : i + n_down, j : j + n_across]
             corner = block[0, 0] - inset
             patches.append(
-                Patch(
+                SheetPatch(
                     name,
                     (float(corner[0]), float(corner[1])),
                     (block.shape[1] * pitch, block.shape[0] * pitch),
@@ -285,7 +285,7 @@ class Text:
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class PdfPage:
     """Page of the PDF file.
 
     Attributes
@@ -303,7 +303,7 @@ class Page:
     texts: tuple[Text, ...] = field(default=())
 
 
-def pdf_bytes(pages: Sequence[Page], title: str) -> bytes:
+def pdf_bytes(pages: Sequence[PdfPage], title: str) -> bytes:
     """Return a PDF file of these pages; the same pages give the same bytes."""
     kids = " ".join(f"{4 + 2 * i} 0 R" for i in range(len(pages)))
     objects = [
@@ -323,7 +323,7 @@ def pdf_bytes(pages: Sequence[Page], title: str) -> bytes:
     return _file(objects)
 
 
-def _content(page: Page) -> str:
+def _content(page: PdfPage) -> str:
     """Return the PDF content stream of a page; coordinates are millimetres, y down."""
     scale = f"{_POINTS_PER_MM:.8f}"
     height = f"{page.height * _POINTS_PER_MM:.4f}"
@@ -463,7 +463,7 @@ def best_paper(word: str, width: float, height: float, what: str) -> Paper:
     )
 
 
-def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words: str) -> Page:
+def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words: str) -> PdfPage:
     """Return a page with a print in its middle, a ruler to check the scale, and a caption.
 
     Parameters
@@ -488,7 +488,7 @@ def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words
         Text(_EDGE_MM, height - _EDGE_MM - 4.2, _TEXT_MM, words),
         Text(_EDGE_MM, height - _EDGE_MM, _TEXT_MM, scale),
     )
-    return Page(width, height, np.concatenate([placed, ruler(_EDGE_MM, ruler_y)]), texts)
+    return PdfPage(width, height, np.concatenate([placed, ruler(_EDGE_MM, ruler_y)]), texts)
 
 
 def ruler(x: float, y: float) -> FloatArray:

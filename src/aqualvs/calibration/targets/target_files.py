@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, Field, ValidationError
 
 from aqualvs.calibration.targets.targets import (
     DICTIONARIES,
@@ -27,6 +26,7 @@ from aqualvs.calibration.targets.targets import (
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, SchemaWords, StrictPart, Triple
 from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text, write_text
 
 # Keys of free text, often written without quotes but with colons, which YAML would reject.
@@ -55,19 +55,11 @@ def _quoted(match: re.Match[str]) -> str:
     return f"{match[1]}: '{text}'"
 
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=2, le=1000)]
-Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Corners = Annotated[list[Triple], Field(min_length=4, max_length=4)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class BoardFile(_Part):
+class BoardFile(StrictPart):
     """Schema of `board.yaml`."""
 
     kind: Literal["chessboard", "charuco"] | None = None
@@ -83,14 +75,14 @@ class BoardFile(_Part):
     note: Any = None
 
 
-class PlanePart(_Part):
+class PlanePart(StrictPart):
     """Schema of one of `planes`: normal . X = d."""
 
     normal: Triple
     d: Number
 
 
-class MarkerPart(_Part):
+class MarkerPart(StrictPart):
     """Schema of one of `markers`."""
 
     id: Annotated[int, Field(ge=0)]
@@ -99,17 +91,17 @@ class MarkerPart(_Part):
     corners: Corners
 
 
-class MediumPart(_Part):
+class MediumPart(StrictPart):
     """Schema of `medium`, in which the pictures were taken."""
 
     n_outside_nominal: Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 
 
-class MarkersFile(_Part):
+class MarkersFile(StrictPart):
     """Schema of `box.yaml` and `target.yaml`."""
 
     frame: str | None = None
-    planes: dict[str, PlanePart] = {}
+    planes: dict[str, PlanePart] = Field(default={})
     family: str
     corner_order: str | None = None
     markers: Annotated[list[MarkerPart], Field(min_length=1)]
@@ -147,23 +139,7 @@ _EXAMPLES = {
     "medium": "medium: {n_outside_nominal: 1.333}",
     "n_outside_nominal": "n_outside_nominal: 1.333",
 }
-_TYPES = {
-    "float_type": "a plain number",
-    "int_type": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "a word",
-    "list_type": "a list",
-    "model_type": "keys and values",
-    "dict_type": "keys and values",
-}
-_LIMITS = {
-    "finite_number": "write a finite number",
-    "greater_than": "it must be greater than {gt:g}",
-    "greater_than_equal": "it must be at least {ge:g}",
-    "less_than_equal": "it must be at most {le:g}",
-    "too_short": "write {min_length} values",
-    "too_long": "write {max_length} values",
-}
+_WORDS = SchemaWords(file="this file", parts=_PARTS, examples=_EXAMPLES, first_line="note: text")
 
 
 def parse_target(content: dict[Any, Any], model: type[_File], source: str) -> _File:
@@ -177,53 +153,7 @@ def parse_target(content: dict[Any, Any], model: type[_File], source: str) -> _F
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        faults = error.errors(include_url=False)
-        unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
-        # A misspelt key explains the one that is missing.
-        sentence = _sentence((unknown or faults)[0], model)
-        raise CalibrationError(f"{source}: {sentence}") from None
-
-
-def _sentence(fault: ErrorDetails, model: type[BaseModel]) -> str:
-    place, kind = _place(fault["loc"]), fault["type"]
-    if kind == "extra_forbidden":
-        return f"{place} is not a key of this file; {_closest(fault['loc'], model)}"
-    if kind == "missing":
-        return f"{place} is missing; add it, for example '{_example(fault['loc'])}'"
-    if kind == "literal_error":
-        return f"{place} is {_shown(fault['input'])}; write {fault['ctx']['expected']}"
-    limits = fault.get("ctx", {})
-    if kind in _LIMITS:
-        remedy = _LIMITS[kind].format(**limits)
-    elif kind in _TYPES:
-        remedy = f"write {_TYPES[kind]}, for example '{_example(fault['loc'])}'"
-    else:
-        remedy = fault["msg"]
-    return f"{place} is {_shown(fault['input'])}; {remedy}"
-
-
-def _example(loc: tuple[int | str, ...]) -> str:
-    words = [part for part in loc if part in _EXAMPLES]
-    return _EXAMPLES[str(words[-1])] if words else "note: text"
-
-
-def _place(loc: tuple[int | str, ...]) -> str:
-    text = ""
-    for part in loc:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
-def _closest(loc: tuple[int | str, ...], model: type[BaseModel]) -> str:
-    part = _PARTS.get(str(loc[0]), model) if len(loc) > 1 else model
-    known = list(part.model_fields)
-    close = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
-
-
-def _shown(value: object) -> str:
-    text = "empty" if value is None else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+        raise CalibrationError(f"{source}: {_WORDS.first_fault(error, model)}") from None
 
 
 # Tolerance of a ruler, as a share of the marker and in millimetres.

@@ -22,7 +22,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration.water_index.filter import (
     MIN_POINTS,
     WIDE,
-    Frame,
+    FrameCorners,
     IndexModel,
     Innovation,
     Update,
@@ -189,7 +189,7 @@ class IndexEstimator:
             NaN or wrong do no harm if most are right.
         """
         known = () if self._state is None else self._state.ids
-        frame = Frame.of(time, view, known)
+        frame = FrameCorners.of(time, view, known)
         refused = self._refusal(frame)
         if refused:
             return self._reading(time, view.name, refused)
@@ -236,7 +236,7 @@ class IndexEstimator:
         """
         if self.state is None:
             raise CalibrationError("no picture shows enough of the target yet; add one that does")
-        frame = Frame.of(self.state.time, view, self.state.ids)
+        frame = FrameCorners.of(self.state.time, view, self.state.ids)
         left: FloatArray = self._model.line(self.state, frame).residuals.reshape(-1, 2)
         return left
 
@@ -246,7 +246,7 @@ class IndexEstimator:
             self.rig, self.uncertainty, options.pose_sigmas, options.sigma_corner_px, middle
         )
 
-    def _refusal(self, frame: Frame) -> str:
+    def _refusal(self, frame: FrameCorners) -> str:
         if not math.isfinite(frame.time):
             return "it has no time"
         if self._state is not None and frame.time < self._last_time:
@@ -258,7 +258,7 @@ class IndexEstimator:
             return f"{len(frame.ids)} corners of the target are seen; {MIN_POINTS} are needed"
         return ""
 
-    def _first(self, name: str, frame: Frame) -> IndexReading:
+    def _first(self, name: str, frame: FrameCorners) -> IndexReading:
         self._model = self._model_about(frame.points.mean(axis=0))
         start = self.rig.n_water if self.prior is None else self.prior.n
         state, noise = self._model.first(frame, start), _NOMINAL_NOISE
@@ -271,7 +271,7 @@ class IndexEstimator:
         self._last_time, self._noise = frame.time, noise
         return self._believe(name, seen, update, state.n)
 
-    def _next(self, name: str, last: IndexState, frame: Frame) -> IndexReading:
+    def _next(self, name: str, last: IndexState, frame: FrameCorners) -> IndexReading:
         state = self._until(last, frame)
         self._since_prior += self.options.drift**2 * (frame.time - self._last_time)
         self._last_time = frame.time
@@ -336,7 +336,7 @@ class IndexEstimator:
                 update = believe(self._model, state, seen.frame, noise)
         return update.state.later(self._last_time, self.options.drift), update
 
-    def _until(self, state: IndexState, frame: Frame) -> IndexState:
+    def _until(self, state: IndexState, frame: FrameCorners) -> IndexState:
         later = state.later(frame.time, self.options.drift)
         return later.with_corners(frame.ids, self.options.sigma_corner_px)
 

@@ -5,8 +5,9 @@ and the constant error of each corner (printing, detection) do not. They are kno
 accuracy and are estimated along with the index: frames average out the noise of the corners, never
 the error of the constants.
 
-`Frame` holds the corners of a picture that the estimate uses, `IndexModel` predicts their pixels
-and the derivatives by the state, `compare` gives the innovation, `believe` the updated state.
+`FrameCorners` holds the corners of a picture that the estimate uses, `IndexModel` predicts their
+pixels and the derivatives by the state, `compare` gives the innovation, `believe` the updated
+state.
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from aqualvs.calibration.solver.bundle import moved_target, point_by_pose
-from aqualvs.calibration.solver.least_squares import Loss
+from aqualvs.calibration.solver.least_squares import RobustLoss
 from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration.water_index.state import (
     FAR,
@@ -40,7 +41,7 @@ MOST_POINTS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class FrameCorners:
     """Corners of one picture for the estimate.
 
     Attributes
@@ -61,7 +62,7 @@ class Frame:
     pixels: FloatArray
 
     @classmethod
-    def of(cls, time: float, view: View, known: tuple[int, ...] = ()) -> "Frame":
+    def of(cls, time: float, view: View, known: tuple[int, ...] = ()) -> "FrameCorners":
         """Return the finite corners of a view, at most `MOST_POINTS` together with known ones."""
         finite = np.all(np.isfinite(view.pixels), axis=1) & np.all(np.isfinite(view.points), axis=1)
         _, first = np.unique(view.ids, return_index=True)
@@ -76,7 +77,7 @@ class Frame:
         ids = tuple(int(view.ids[i]) for i in keep)
         return cls(time, ids, view.points[keep], view.pixels[keep])
 
-    def where(self, keep: BoolArray) -> "Frame":
+    def where(self, keep: BoolArray) -> "FrameCorners":
         """Return the corners that `keep` (M,) marks."""
         ids = tuple(i for i, kept in zip(self.ids, keep, strict=True) if kept)
         return replace(self, ids=ids, points=self.points[keep], pixels=self.pixels[keep])
@@ -157,7 +158,7 @@ class IndexModel:
         scale = np.array([sigmas[name] for name in uncertain])
         object.__setattr__(self, "_moved", _MovedRig(self.rig, uncertain, scale))
 
-    def first(self, frame: Frame, n: float) -> IndexState:
+    def first(self, frame: FrameCorners, n: float) -> IndexState:
         """Return the state before a first frame, with the index searched from `n`."""
         camera = self.uncertainty.of(self.camera_names)
         blank = first_state(frame.time, n, WIDE, self.pose_sigmas, camera)
@@ -165,20 +166,20 @@ class IndexModel:
             frame.time, self.nearest(blank, frame), WIDE, self.pose_sigmas, camera
         ).with_corners(frame.ids, self.sigma_corner)
 
-    def jumped(self, state: IndexState, frame: Frame) -> IndexState:
+    def jumped(self, state: IndexState, frame: FrameCorners) -> IndexState:
         """Return the state after a jump of the index to the value by a frame."""
         n = self.nearest(state, frame)
         line = self.line(at_index(state, n, slopes_too=True), frame)
         return self.settled(state, line, frame).stepped(n, WIDE)
 
-    def settled(self, state: IndexState, line: Line, frame: Frame) -> IndexState:
+    def settled(self, state: IndexState, line: Line, frame: FrameCorners) -> IndexState:
         """Return a state with corner errors for the picture that `line` predicts."""
         predicted = frame.pixels - line.residuals.reshape(-1, 2)
         visible = np.isfinite(predicted[:, 0])
         ids = frame.where(visible).ids
         return state.with_corners_at(ids, predicted[visible], self.sigma_corner) if ids else state
 
-    def line(self, state: IndexState, frame: Frame) -> Line:
+    def line(self, state: IndexState, frame: FrameCorners) -> Line:
         """Return the prediction of a frame near a state; residuals are NaN for unseen corners.
 
         Derivatives are taken at the constants' first guesses and at `state.n_of_slopes`. Taken
@@ -204,7 +205,7 @@ class IndexModel:
         residuals = frame.pixels - pixels - off
         return Line(residuals.reshape(-1), slopes.reshape(-1, len(state.mean)))
 
-    def slope_uncertainty(self, state: IndexState, frame: Frame) -> float:
+    def slope_uncertainty(self, state: IndexState, frame: FrameCorners) -> float:
         """Return the relative standard deviation of a change of index by the state's uncertainty.
 
         The derivative of the picture by the index depends on the constants: a product of unknowns
@@ -224,7 +225,7 @@ class IndexModel:
         power = max(float(np.sum(reference**2)), BLIND**2)
         return float(np.sqrt(max(float(variance), 0.0))) / power
 
-    def _slope_at(self, mean: FloatArray, n: float, frame: Frame) -> FloatArray:
+    def _slope_at(self, mean: FloatArray, n: float, frame: FrameCorners) -> FloatArray:
         """Return the derivative (M, 2) of pixels by the index, all constants as in `mean`."""
         rig = rig_moved_by(self.rig, self.camera_names, mean[FIRST_CAMERA:])
         camera = rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
@@ -233,7 +234,7 @@ class IndexModel:
         by_n: FloatArray = slopes[..., parameter_names(camera).index("n_water")]
         return by_n
 
-    def _slopes(self, n: float, frame: Frame) -> FloatArray:
+    def _slopes(self, n: float, frame: FrameCorners) -> FloatArray:
         """Return derivatives (M, 2, 9 + C) of pixels by all but the corners' errors."""
         if self._cache.get("n") != n or self._cache.get("ids") != frame.ids:
             camera = self.rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
@@ -248,7 +249,7 @@ class IndexModel:
         known: FloatArray = self._cache["slopes"]
         return known
 
-    def nearest(self, state: IndexState, frame: Frame) -> float:
+    def nearest(self, state: IndexState, frame: FrameCorners) -> float:
         """Return the index that fits most corners, with all constants fixed.
 
         Newton's method on the weighted median of the corners' single estimates: half of them may
@@ -319,7 +320,7 @@ class Innovation:
 
     Attributes
     ----------
-    frame : Frame
+    frame : FrameCorners
         Its corners that fit.
     n_points : int
         Number of corners before the misfits were left out.
@@ -333,7 +334,7 @@ class Innovation:
         number: about 1.
     """
 
-    frame: Frame
+    frame: FrameCorners
     n_points: int
     shift: float
     sigma: float
@@ -367,7 +368,7 @@ class Update:
     noise: float
 
 
-def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) -> Innovation:
+def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Innovation:
     """Return the innovation of a frame: its difference from the prediction by a state.
 
     Parameters
@@ -375,7 +376,7 @@ def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
     model : IndexModel
     state : IndexState
         At the frame's time, with entries for its corners.
-    frame : Frame
+    frame : FrameCorners
         At least one corner.
     noise : float
         Standard deviation of a coordinate, in pixels.
@@ -397,7 +398,7 @@ def compare(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
     )
 
 
-def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) -> Update:
+def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Update:
     """Return the state updated by a frame whose corners fit it.
 
     Parameters
@@ -405,7 +406,7 @@ def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
     model : IndexModel
     state : IndexState
         At the frame's time, with entries for its corners.
-    frame : Frame
+    frame : FrameCorners
         At least one corner, all of them visible.
     noise : float
         Standard deviation of a coordinate, in pixels.
@@ -419,7 +420,7 @@ def believe(model: IndexModel, state: IndexState, frame: Frame, noise: float) ->
         lengths = _lengths(step.left / np.sqrt(step.expected))
         close = abs(step.mean[N] - at.n) < LINEAR
         at = replace(state, mean=step.mean)
-        weights = np.where(lengths < _REJECT, Loss.HUBER.weight(lengths), _REJECTED)
+        weights = np.where(lengths < _REJECT, RobustLoss.HUBER.weight(lengths), _REJECTED)
         if close and np.allclose(weights, used, atol=0.05):
             break
     good = np.repeat(used > _REJECTED, 2)

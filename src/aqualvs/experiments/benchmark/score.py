@@ -4,20 +4,413 @@ Systems that come with aqualvs can be run over the set as well: aqualvs itself, 
 compared with (`OWN_SYSTEMS`).
 """
 
+import csv
+import json
+import math
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.experiments.benchmark.measures import SCORE_FILES, lines, score_systems, write_scores
-from aqualvs.experiments.benchmark.set import TARGET_FILE, BenchmarkSet, load_set, read_system
+from aqualvs.experiments.benchmark.set import (
+    TARGET_FILE,
+    Answers,
+    BenchmarkSet,
+    DiveTruth,
+    System,
+    load_set,
+    read_system,
+)
+from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.nets.target_file import target_facts
 from aqualvs.pipeline import run
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import RunRequest, scanner_options
 from aqualvs.scanning.target import TargetKind
+from aqualvs.simulation.benchmark import VISIBLE_LIMIT
+
+WRONG_PERCENT = 5.0
+"""An answer whose range is off by more is to something else than the target."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAnswers:
+    """Answers against the truth of N frames, of one dive or of many.
+
+    Attributes
+    ----------
+    valid : bool array, shape (N,)
+        Frames with an answer.
+    n_visible : array, shape (N,)
+        Visible stripe points.
+    error : array, shape (N, 3)
+        Range in percent of the true one, pitch and yaw in degrees; NaN without answer or target.
+    sigma : array, shape (N, 3)
+        What the system claims for them, same units.
+    """
+
+    valid: BoolArray
+    n_visible: FloatArray
+    error: FloatArray
+    sigma: FloatArray
+
+    @property
+    def measurable(self) -> BoolArray:
+        """Frames that show enough to be measured, and must be."""
+        enough: BoolArray = self.n_visible >= VISIBLE_LIMIT
+        return enough
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSpread:
+    """Absolute errors in few numbers; NaN without any."""
+
+    rms: float
+    median: float
+    p95: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Score:
+    """Score of a system on some frames.
+
+    Attributes
+    ----------
+    n_frames, n_measurable, n_available : int
+        Frames; those with at least `VISIBLE_LIMIT` visible stripe points; those of them with an
+        answer.
+    available_percent : float
+        Share of the last two; NaN where nothing is measurable.
+    range_percent, pitch_deg, yaw_deg : ErrorSpread
+        Errors of the answers in measurable frames.
+    n_wrong : int
+        Answers off by more than `WRONG_PERCENT` of the range in frames with any visible point.
+    n_empty, n_false : int
+        Frames without any visible point, and those of them that were answered all the same.
+    z_range, z_pitch, z_yaw : float
+        Rms of error over claimed sigma in measurable frames: 1 is honest, more is too sure; NaN
+        where no sigma is claimed.
+    sigma_range_percent, sigma_pitch_deg, sigma_yaw_deg : float
+        Medians of the claimed sigmas in measurable frames.
+    """
+
+    n_frames: int
+    n_measurable: int
+    n_available: int
+    available_percent: float
+    range_percent: ErrorSpread
+    pitch_deg: ErrorSpread
+    yaw_deg: ErrorSpread
+    n_wrong: int
+    n_empty: int
+    n_false: int
+    z_range: float
+    z_pitch: float
+    z_yaw: float
+    sigma_range_percent: float
+    sigma_pitch_deg: float
+    sigma_yaw_deg: float
+
+
+def compare(truth: DiveTruth, answers: Answers) -> FrameAnswers:
+    """Hold the answers to a dive against its truth."""
+    shown = np.where(answers.valid[:, None], answers.posture, np.nan)
+    error = shown - truth.posture
+    scale = 100.0 / truth.posture[:, 0]
+    error[:, 0] *= scale
+    sigma = np.where(answers.valid[:, None], answers.sigma, np.nan)
+    sigma[:, 0] *= scale
+    return FrameAnswers(answers.valid, truth.n_visible.astype(np.float64), error, sigma)
+
+
+def pooled(parts: Sequence[FrameAnswers]) -> FrameAnswers:
+    """Return the frames of several dives as one."""
+    return FrameAnswers(
+        np.concatenate([part.valid for part in parts]),
+        np.concatenate([part.n_visible for part in parts]),
+        np.concatenate([part.error for part in parts]),
+        np.concatenate([part.sigma for part in parts]),
+    )
+
+
+def score(frames: FrameAnswers) -> Score:
+    """Return the score of some frames."""
+    measurable, empty = frames.measurable, frames.n_visible == 0
+    n_measurable, n_available = int(measurable.sum()), int((measurable & frames.valid).sum())
+    off = np.abs(frames.error[:, 0]) > WRONG_PERCENT
+    error, sigma = frames.error[measurable], frames.sigma[measurable]
+    z = [_normalised(error[:, k], sigma[:, k]) for k in range(3)]
+    middle = [_median(sigma[:, k]) for k in range(3)]
+    return Score(
+        n_frames=len(frames.valid),
+        n_measurable=n_measurable,
+        n_available=n_available,
+        available_percent=100.0 * n_available / n_measurable if n_measurable else np.nan,
+        range_percent=_spread(error[:, 0]),
+        pitch_deg=_spread(error[:, 1]),
+        yaw_deg=_spread(error[:, 2]),
+        n_wrong=int((off & ~empty).sum()),
+        n_empty=int(empty.sum()),
+        n_false=int((empty & frames.valid).sum()),
+        z_range=z[0],
+        z_pitch=z[1],
+        z_yaw=z[2],
+        sigma_range_percent=middle[0],
+        sigma_pitch_deg=middle[1],
+        sigma_yaw_deg=middle[2],
+    )
+
+
+def bars_against(frames: FrameAnswers, clear: FrameAnswers) -> FloatArray:
+    """Return how much longer error bars are than those of the same frames in clear water.
+
+    Parameters
+    ----------
+    frames, clear : FrameAnswers
+        Frame by frame the same course before the same target.
+
+    Returns
+    -------
+    ratios : array, shape (N, 3)
+        Sigma of range (in percent), pitch and yaw over that in clear water; NaN where a frame is
+        not measurable or lacks one.
+    """
+    both = frames.measurable & clear.measurable
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(both[:, None], frames.sigma / clear.sigma, np.nan)
+
+
+def _spread(errors: FloatArray) -> ErrorSpread:
+    sizes = np.abs(errors[np.isfinite(errors)])
+    if not len(sizes):
+        return ErrorSpread(np.nan, np.nan, np.nan, np.nan)
+    rms = float(np.sqrt(np.mean(sizes**2)))
+    return ErrorSpread(
+        rms, float(np.median(sizes)), float(np.percentile(sizes, 95.0)), float(sizes.max())
+    )
+
+
+def _normalised(errors: FloatArray, sigmas: FloatArray) -> float:
+    known = np.isfinite(errors) & (sigmas > 0.0)
+    if not known.any():
+        return np.nan
+    return float(np.sqrt(np.mean((errors[known] / sigmas[known]) ** 2)))
+
+
+def _median(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
+
+
+TOTAL = "total"
+_CLEAR = "clear"
+_HEADER = (
+    *("level", "system", "frames", "available %", "range rms %", "median", "p95", "max"),
+    *("pitch rms deg", "yaw rms deg", "wrong", "false", "z range", "z pitch", "z yaw"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A score and what it is of.
+
+    Attributes
+    ----------
+    system : str
+    scope : {"dive", "level", "total"}
+    name : str
+        Of the dive or level; "total" for all.
+    score : Score
+    """
+
+    system: str
+    scope: str
+    name: str
+    score: Score
+
+
+@dataclass(frozen=True, slots=True)
+class Bars:
+    """Median length of error bars on a level, relative to those of the clear twins.
+
+    Attributes
+    ----------
+    system, level : str
+    range, pitch, yaw : float
+        NaN where the system claims none.
+    """
+
+    system: str
+    level: str
+    range: float
+    pitch: float
+    yaw: float
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Everything that was found of some systems.
+
+    Attributes
+    ----------
+    title : str
+        The set's.
+    entries : tuple of Entry
+        By system: dives, levels, total.
+    bars : tuple of Bars
+    """
+
+    title: str
+    entries: tuple[Entry, ...]
+    bars: tuple[Bars, ...]
+
+
+def score_systems(benchmark: BenchmarkSet, systems: Sequence[System]) -> Scores:
+    """Score systems on a set."""
+    entries: list[Entry] = []
+    bars: list[Bars] = []
+    for system in systems:
+        frames = {dive.name: compare(dive, system.answers[dive.name]) for dive in benchmark.dives}
+        entries += [Entry(system.name, "dive", name, score(part)) for name, part in frames.items()]
+        for level in benchmark.levels:
+            names = [dive.name for dive in benchmark.dives if dive.level == level]
+            together = pooled([frames[name] for name in names])
+            entries.append(Entry(system.name, "level", level, score(together)))
+            if level != _CLEAR:
+                bars += _bars(system.name, level, names, frames)
+        entries.append(Entry(system.name, TOTAL, TOTAL, score(pooled(list(frames.values())))))
+    return Scores(benchmark.title, tuple(entries), tuple(bars))
+
+
+def _bars(system: str, level: str, names: list[str], frames: dict[str, FrameAnswers]) -> list[Bars]:
+    """Compare dives with their clear twins; empty without twins or without claimed sigmas."""
+    found = []
+    for name in names:
+        twin = frames.get(f"{_CLEAR}_{name.removeprefix(f'{level}_')}")
+        if twin is not None and len(twin.valid) == len(frames[name].valid):
+            found.append(bars_against(frames[name], twin))
+    ratios: FloatArray = np.concatenate([np.empty((0, 3)), *found])
+    ratios = ratios[np.isfinite(ratios).all(axis=1)]
+    if not len(ratios):
+        return []
+    return [Bars(system, level, *(float(value) for value in np.median(ratios, axis=0)))]
+
+
+def lines(scores: Scores, *, dives: bool) -> list[str]:
+    """Return the table to read: level after level, the systems below each other.
+
+    Parameters
+    ----------
+    scores : Scores
+    dives : bool
+        Whether to show every dive before its level.
+    """
+    rows = _rows(scores, dives=dives)
+    widths = [max(len(row[k]) for row in (_HEADER, *rows)) for k in range(len(_HEADER))]
+    text = [scores.title]
+    for row in (_HEADER, *rows):
+        cells = [
+            value.ljust(width) if k < 2 else value.rjust(width)
+            for k, (value, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        text.append("  ".join(cells).rstrip())
+    return [*text, *(_bar_line(bar) for bar in scores.bars)]
+
+
+def markdown(scores: Scores, *, dives: bool) -> str:
+    """Return the same table in Markdown."""
+    rows = [_HEADER, tuple("---" for _ in _HEADER), *_rows(scores, dives=dives)]
+    table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    bars = "".join(f"- {_bar_line(bar)}\n" for bar in scores.bars)
+    return f"{scores.title}\n\n{table}\n\n{bars}"
+
+
+SCORE_FILES = ("scores.csv", "scores.json", "scores.md")
+"""What `write_scores` writes."""
+
+
+def write_scores(scores: Scores, folder: Path) -> list[Path]:
+    """Write `scores.csv`, `scores.json` and `scores.md`; return their paths.
+
+    Raises
+    ------
+    OSError
+        If the folder or a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    table, data, text = (folder / name for name in SCORE_FILES)
+    records = [_record(entry) for entry in scores.entries]
+    with table.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(records[0]))
+        writer.writeheader()
+        writer.writerows(
+            {key: "" if value is None else value for key, value in record.items()}
+            for record in records
+        )
+    bars = [_without_nan(asdict(bar)) for bar in scores.bars]
+    content = {"set": scores.title, "scores": records, "error_bars_against_clear": bars}
+    data.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    text.write_text(markdown(scores, dives=True), encoding="utf-8")
+    return [table, data, text]
+
+
+def _record(entry: Entry) -> dict[str, Any]:
+    """Return an entry as one flat mapping; None where a number does not exist."""
+    flat: dict[str, Any] = {"system": entry.system, "scope": entry.scope, "name": entry.name}
+    for key, value in asdict(entry.score).items():
+        if isinstance(value, dict):
+            flat |= {f"{key}_{kind}": number for kind, number in value.items()}
+        else:
+            flat[key] = value
+    return _without_nan(flat)
+
+
+def _without_nan(record: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: None if isinstance(value, float) and math.isnan(value) else value
+        for key, value in record.items()
+    }
+
+
+def _rows(scores: Scores, *, dives: bool) -> list[tuple[str, ...]]:
+    """Return the cells of the table, the entries of the same name together."""
+    shown = [entry for entry in scores.entries if dives or entry.scope != "dive"]
+    names = list(dict.fromkeys(entry.name for entry in shown))
+    return [_cells(entry) for name in names for entry in shown if entry.name == name]
+
+
+def _cells(entry: Entry) -> tuple[str, ...]:
+    found = entry.score
+    spread = found.range_percent
+    return (
+        entry.name,
+        entry.system,
+        f"{found.n_measurable}/{found.n_frames}",
+        _number(found.available_percent, 1),
+        *(_number(value, 3) for value in (spread.rms, spread.median, spread.p95, spread.max)),
+        _number(found.pitch_deg.rms, 2),
+        _number(found.yaw_deg.rms, 2),
+        str(found.n_wrong),
+        f"{found.n_false}/{found.n_empty}",
+        *(_number(value, 2) for value in (found.z_range, found.z_pitch, found.z_yaw)),
+    )
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _bar_line(bar: Bars) -> str:
+    return (
+        f"{bar.system}: error bars on {bar.level} are {bar.range:.2f} (range), {bar.pitch:.2f} "
+        f"(pitch), {bar.yaw:.2f} (yaw) times those of the same frames on {_CLEAR}"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,7 +39,7 @@ class Hello(_Message):
     token: Annotated[str, Field(max_length=200)] = ""
 
 
-class Shown(_Message):
+class PictureShown(_Message):
     """The page has shown a picture and can take the next."""
 
     kind: Literal["shown"]
@@ -60,7 +60,9 @@ class SetpointCommand(_Message):
     yaw_deg: float = 0.0
 
 
-Message = Annotated[Hello | Shown | RecordCommand | SetpointCommand, Field(discriminator="kind")]
+Message = Annotated[
+    Hello | PictureShown | RecordCommand | SetpointCommand, Field(discriminator="kind")
+]
 Command = RecordCommand | SetpointCommand
 _ADAPTER: TypeAdapter[Message] = TypeAdapter(Message)
 

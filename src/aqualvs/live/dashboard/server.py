@@ -37,7 +37,7 @@ from aqualvs.live.dashboard.access import (
     Controls,
     Hello,
     Peer,
-    Shown,
+    PictureShown,
     TokenGate,
     are_addresses,
     parse_message,
@@ -163,7 +163,7 @@ _ON_THE_WAY = 2
 
 
 @dataclass(slots=True, eq=False)
-class Watcher:
+class PageClient:
     """One page.
 
     Attributes
@@ -214,14 +214,14 @@ class Hub:
 
     def __init__(self) -> None:
         # In the order of their arrival.
-        self._watchers: dict[Watcher, None] = {}
+        self._watchers: dict[PageClient, None] = {}
 
     @property
     def n_watchers(self) -> int:
         """Pages that are open."""
         return len(self._watchers)
 
-    def join(self, watcher: Watcher) -> bool:
+    def join(self, watcher: PageClient) -> bool:
         """Add a page; False if there are too many.
 
         A page that may command takes the place of the oldest one that may not.
@@ -235,7 +235,7 @@ class Hub:
         self._watchers[watcher] = None
         return True
 
-    def leave(self, watcher: Watcher) -> None:
+    def leave(self, watcher: PageClient) -> None:
         """Remove a page."""
         self._watchers.pop(watcher, None)
 
@@ -366,7 +366,7 @@ class DashboardServer:
             # The page has closed, which is normal.
             return
 
-    async def _welcome(self, socket: WebSocket, peer: str) -> Watcher | None:
+    async def _welcome(self, socket: WebSocket, peer: str) -> PageClient | None:
         """Read the greeting; None if the page may not stay."""
         try:
             hello = parse_message(await asyncio.wait_for(socket.receive_text(), _HELLO_S))
@@ -375,7 +375,7 @@ class DashboardServer:
             return None
         token = hello.token if isinstance(hello, Hello) else ""
         known = bool(token) and await self._is_right(socket, token)
-        watcher = Watcher(may_command=known)
+        watcher = PageClient(may_command=known)
         why = self._why_not(token, watcher)
         if why:
             await _refuse(socket, peer, why)
@@ -395,7 +395,7 @@ class DashboardServer:
         asking.cancel()
         raise WebSocketDisconnect
 
-    def _why_not(self, token: str, watcher: Watcher) -> str:
+    def _why_not(self, token: str, watcher: PageClient) -> str:
         """Let a page in, or return why not."""
         if token and not watcher.may_command:
             return "wrong token"
@@ -403,7 +403,7 @@ class DashboardServer:
             return "no token"
         return "" if self.hub.join(watcher) else "too many pages are open"
 
-    async def _attend(self, socket: WebSocket, watcher: Watcher, peer: str) -> None:
+    async def _attend(self, socket: WebSocket, watcher: PageClient, peer: str) -> None:
         """Send news and receive messages until the page closes."""
         beside = [
             asyncio.create_task(_send_news(socket, watcher)),
@@ -419,9 +419,9 @@ class DashboardServer:
             for task in beside:
                 task.cancel()
 
-    async def _hear(self, socket: WebSocket, watcher: Watcher, peer: str, text: str) -> None:
+    async def _hear(self, socket: WebSocket, watcher: PageClient, peer: str, text: str) -> None:
         message = parse_message(text)
-        if isinstance(message, Shown):
+        if isinstance(message, PictureShown):
             watcher.shown()
         elif isinstance(message, Hello):
             return
@@ -436,7 +436,7 @@ class DashboardServer:
                 await socket.send_json({"kind": "refused", "why": str(fault)})
 
 
-async def _send_news(socket: WebSocket, watcher: Watcher) -> None:
+async def _send_news(socket: WebSocket, watcher: PageClient) -> None:
     while True:
         state, picture = await watcher.next()
         if state is not None:
@@ -445,7 +445,7 @@ async def _send_news(socket: WebSocket, watcher: Watcher) -> None:
             await socket.send_bytes(picture)
 
 
-async def _make_room(socket: WebSocket, watcher: Watcher, peer: str) -> None:
+async def _make_room(socket: WebSocket, watcher: PageClient, peer: str) -> None:
     await watcher.gone.wait()
     await _refuse(socket, peer, "a page with the token took this place")
 

@@ -22,7 +22,7 @@ from aqualvs.live.outputs.ros2_messages import (
     range_has_variance,
     to_ros2,
 )
-from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
+from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
@@ -40,35 +40,35 @@ _DEFINITIONS = {
     _QUATERNION: "float64 x, float64 y, float64 z, float64 w",
     _POSE: f"{_POINT} position, {_QUATERNION} orientation",
     _POSE_COV: f"{_POSE} pose, float64[36] covariance",
-    TYPE_NAMES[Topic.POSTURE]: f"{_HEADER} header, {_POSE_COV} pose",
-    TYPE_NAMES[Topic.RANGE]: (
+    TYPE_NAMES[PublishedTopic.POSTURE]: f"{_HEADER} header, {_POSE_COV} pose",
+    TYPE_NAMES[PublishedTopic.RANGE]: (
         f"{_HEADER} header, uint8 radiation_type, float32 field_of_view, "
         "float32 min_range, float32 max_range, float32 range, float32 variance"
     ),
     _FIELD: "string name, uint32 offset, uint8 datatype, uint32 count",
-    TYPE_NAMES[Topic.CLOUD]: (
+    TYPE_NAMES[PublishedTopic.CLOUD]: (
         f"{_HEADER} header, uint32 height, uint32 width, {_FIELD}[] fields, bool is_bigendian, "
         "uint32 point_step, uint32 row_step, uint8[] data, bool is_dense"
     ),
     _PAIR: "string key, string value",
     _STATUS: f"uint8 level, string name, string message, string hardware_id, {_PAIR}[] values",
-    TYPE_NAMES[Topic.DIAGNOSTICS]: f"{_HEADER} header, {_STATUS}[] status",
+    TYPE_NAMES[PublishedTopic.DIAGNOSTICS]: f"{_HEADER} header, {_STATUS}[] status",
 }
 
 _HASHES = {
-    Topic.POSTURE: "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
-    Topic.RANGE: "b42b62562e93cbfe9d42b82fe5994dfa3d63d7d5c90a317981703f7388adff3a",
-    Topic.CLOUD: "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
-    Topic.DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    PublishedTopic.POSTURE: "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+    PublishedTopic.RANGE: "b42b62562e93cbfe9d42b82fe5994dfa3d63d7d5c90a317981703f7388adff3a",
+    PublishedTopic.CLOUD: "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+    PublishedTopic.DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
 }
 
 
-def type_hash(topic: Topic) -> bytes:
+def type_hash(topic: PublishedTopic) -> bytes:
     """Return the user data that identify the version of a topic's type since ROS 2 Iron.
 
     Subscribers match without it, but warn (ROS REP-2016).
     """
-    kind = Topic.POSTURE if topic is Topic.FILTERED else topic
+    kind = PublishedTopic.POSTURE if topic is PublishedTopic.FILTERED else topic
     return f"typehash=RIHS01_{_HASHES[kind]};".encode()
 
 
@@ -95,7 +95,7 @@ def dds_types(distro: str) -> Ros2Types:
         if not with_variance:
             members.pop("variance", None)
         classes[name] = make_idl_struct(f"{short}_", f"{package}.{kind}.dds_.{short}_", members)
-    classes[TYPE_NAMES[Topic.CLOUD]].serialize = _serialize_cloud
+    classes[TYPE_NAMES[PublishedTopic.CLOUD]].serialize = _serialize_cloud
     return Ros2Types(
         classes=classes, range_has_variance=with_variance, octet=int, octets=_unchanged
     )
@@ -162,9 +162,9 @@ class _Link:
 
     domain: Any
     participant: Any
-    writers: dict[Topic, Any]
+    writers: dict[PublishedTopic, Any]
 
-    def wanted(self) -> frozenset[Topic]:
+    def wanted(self) -> frozenset[PublishedTopic]:
         """Return the topics that have subscribers."""
         return frozenset(
             topic
@@ -327,7 +327,7 @@ def _join(domain_id: int, options: RosOptions, types: Ros2Types) -> _Link:
     domain = _domain(domain_id)
     participant = DomainParticipant(domain_id)
     writers = {}
-    for topic in Topic:
+    for topic in PublishedTopic:
         kind = types.classes[TYPE_NAMES[topic]]
         offered = DdsTopic(participant, f"rt{options.topic_name(topic)}", kind)
         writers[topic] = DataWriter(participant, offered, _quality(topic, options, types))
@@ -348,10 +348,10 @@ def _domain(domain_id: int) -> Any:
         raise
 
 
-def _quality(topic: Topic, options: RosOptions, types: Ros2Types) -> Any:
+def _quality(topic: PublishedTopic, options: RosOptions, types: Ros2Types) -> Any:
     from cyclonedds.qos import Policy, Qos
 
-    reliable = options.reliable or topic is Topic.DIAGNOSTICS
+    reliable = options.reliable or topic is PublishedTopic.DIAGNOSTICS
     policies = [
         Policy.Reliability.Reliable(max_blocking_time=_MAX_BLOCKING_NS)
         if reliable

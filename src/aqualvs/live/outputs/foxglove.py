@@ -18,7 +18,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.recording import messages
-from aqualvs.recording.encoding import HEALTH, PICTURE, POINTS, POSTURE, RIG, Topic, jpeg_of
+from aqualvs.recording.encoding import HEALTH, PICTURE, POINTS, POSTURE, RIG, RecordedTopic, jpeg_of
 from aqualvs.recording.messages import FRAME_ID, RecordClock
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
@@ -340,7 +340,11 @@ class FoxgloveOutput:
         )
 
     def _log(
-        self, topic: Topic, at_ns: int, content: Callable[[], bytes], due: "_Rate | None" = None
+        self,
+        topic: RecordedTopic,
+        at_ns: int,
+        content: Callable[[], bytes],
+        due: "_Rate | None" = None,
     ) -> None:
         """Send a message if its topic has viewers and it is due."""
         channel = self._channels[topic]
@@ -410,7 +414,7 @@ def _sdk() -> Any:
     return foxglove
 
 
-def _channel(foxglove: Any, topic: Topic, context: Any) -> "Channel":
+def _channel(foxglove: Any, topic: RecordedTopic, context: Any) -> "Channel":
     schema = foxglove.Schema(
         name=topic.kind, encoding="ros2msg", data=topic.definition.encode("utf-8")
     )

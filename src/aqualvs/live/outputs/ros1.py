@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from aqualvs.errors import OptionError
 from aqualvs.live.outputs.ros1_links import ROS1_TYPES, Ros1Links, Ros1Type, to_ros1
-from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
+from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
@@ -325,10 +325,10 @@ class Ros1Output:
             raise OptionError(f"ROS node {node_name!r}: use letters, digits and _")
         options = options or RosOptions()
         master = master_uri or environment.get("ROS_MASTER_URI") or DEFAULT_MASTER
-        self._names = {topic: options.topic_name(topic) for topic in Topic}
+        self._names = {topic: options.topic_name(topic) for topic in PublishedTopic}
         self._topics = {name: topic for topic, name in self._names.items()}
         self._maker = MessageMaker(options)
-        self._n_sent: Counter[Topic] = Counter()
+        self._n_sent: Counter[PublishedTopic] = Counter()
         self._closed = False
         types = {self._names[topic]: kind for topic, kind in ROS1_TYPES.items()}
         self._node = Ros1Node(f"/{node_name}", types, master, environment)

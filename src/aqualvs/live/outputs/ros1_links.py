@@ -24,11 +24,11 @@ from aqualvs.live.outputs.ros_messages import (
     POINT_TYPE,
     CloudMessage,
     DiagnosticsMessage,
+    DiagnosticStatus,
     Message,
     PoseMessage,
+    PublishedTopic,
     RangeMessage,
-    Status,
-    Topic,
 )
 
 _INFRARED = 1
@@ -90,23 +90,23 @@ _POSE_TYPE = _type(
 )
 
 ROS1_TYPES = {
-    Topic.POSTURE: _POSE_TYPE,
-    Topic.FILTERED: _POSE_TYPE,
-    Topic.RANGE: _type(
+    PublishedTopic.POSTURE: _POSE_TYPE,
+    PublishedTopic.FILTERED: _POSE_TYPE,
+    PublishedTopic.RANGE: _type(
         "sensor_msgs/Range",
         "Header header\nuint8 ULTRASOUND=0\nuint8 INFRARED=1\nuint8 radiation_type\n"
         "float32 field_of_view\nfloat32 min_range\nfloat32 max_range\nfloat32 range",
         ("std_msgs/Header",),
         "c005c34273dc426c67a020a87bc24148",
     ),
-    Topic.CLOUD: _type(
+    PublishedTopic.CLOUD: _type(
         "sensor_msgs/PointCloud2",
         "Header header\nuint32 height\nuint32 width\nPointField[] fields\nbool is_bigendian\n"
         "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense",
         ("std_msgs/Header", "sensor_msgs/PointField"),
         "1158d486dd51d683ce2f1be655c3c181",
     ),
-    Topic.DIAGNOSTICS: _type(
+    PublishedTopic.DIAGNOSTICS: _type(
         "diagnostic_msgs/DiagnosticArray",
         "Header header\nDiagnosticStatus[] status",
         ("std_msgs/Header", "diagnostic_msgs/DiagnosticStatus", "diagnostic_msgs/KeyValue"),
@@ -193,7 +193,7 @@ def _diagnostics(message: DiagnosticsMessage, seq: int) -> bytes:
     )
 
 
-def _status(status: Status) -> bytes:
+def _status(status: DiagnosticStatus) -> bytes:
     return b"".join(
         (
             struct.pack("<b", status.level),

@@ -10,11 +10,11 @@ from aqualvs.live.outputs.ros_messages import (
     POINT_TYPE,
     CloudMessage,
     DiagnosticsMessage,
+    DiagnosticStatus,
     Message,
     PoseMessage,
+    PublishedTopic,
     RangeMessage,
-    Status,
-    Topic,
 )
 
 INFRARED = 1
@@ -26,11 +26,11 @@ _WITHOUT_VARIANCE = frozenset(
 )
 
 TYPE_NAMES = {
-    Topic.POSTURE: "geometry_msgs/msg/PoseWithCovarianceStamped",
-    Topic.FILTERED: "geometry_msgs/msg/PoseWithCovarianceStamped",
-    Topic.RANGE: "sensor_msgs/msg/Range",
-    Topic.CLOUD: "sensor_msgs/msg/PointCloud2",
-    Topic.DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    PublishedTopic.POSTURE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    PublishedTopic.FILTERED: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    PublishedTopic.RANGE: "sensor_msgs/msg/Range",
+    PublishedTopic.CLOUD: "sensor_msgs/msg/PointCloud2",
+    PublishedTopic.DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
 }
 """Type of each topic."""
 
@@ -99,7 +99,7 @@ def _pose(types: Ros2Types, message: PoseMessage) -> Any:
         orientation=types.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
     )
     return types.make(
-        TYPE_NAMES[Topic.POSTURE],
+        TYPE_NAMES[PublishedTopic.POSTURE],
         header=_header(types, message.stamp_ns, message.frame_id),
         pose=types.make(
             "geometry_msgs/msg/PoseWithCovariance",
@@ -112,7 +112,7 @@ def _pose(types: Ros2Types, message: PoseMessage) -> Any:
 def _range(types: Ros2Types, message: RangeMessage) -> Any:
     extra = {"variance": message.variance} if types.range_has_variance else {}
     return types.make(
-        TYPE_NAMES[Topic.RANGE],
+        TYPE_NAMES[PublishedTopic.RANGE],
         header=_header(types, message.stamp_ns, message.frame_id),
         radiation_type=INFRARED,
         field_of_view=message.field_of_view,
@@ -126,7 +126,7 @@ def _range(types: Ros2Types, message: RangeMessage) -> Any:
 def _cloud(types: Ros2Types, message: CloudMessage) -> Any:
     step = POINT_TYPE.itemsize
     return types.make(
-        TYPE_NAMES[Topic.CLOUD],
+        TYPE_NAMES[PublishedTopic.CLOUD],
         header=_header(types, message.stamp_ns, message.frame_id),
         height=1,
         width=message.width,
@@ -150,13 +150,13 @@ def _cloud(types: Ros2Types, message: CloudMessage) -> Any:
 
 def _diagnostics(types: Ros2Types, message: DiagnosticsMessage) -> Any:
     return types.make(
-        TYPE_NAMES[Topic.DIAGNOSTICS],
+        TYPE_NAMES[PublishedTopic.DIAGNOSTICS],
         header=_header(types, message.stamp_ns, ""),
         status=[_status(types, status) for status in message.statuses],
     )
 
 
-def _status(types: Ros2Types, status: Status) -> Any:
+def _status(types: Ros2Types, status: DiagnosticStatus) -> Any:
     return types.make(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=types.octet(status.level),

@@ -175,7 +175,7 @@ _LEVELS = {State.OK: Level.OK, State.WARN: Level.WARN, State.FAULT: Level.ERROR}
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class DiagnosticStatus:
     """As diagnostic_msgs/DiagnosticStatus; `values` are pairs of key and value."""
 
     level: Level
@@ -190,7 +190,7 @@ class DiagnosticsMessage:
     """As diagnostic_msgs/DiagnosticArray; its header names no frame."""
 
     stamp_ns: int
-    statuses: tuple[Status, ...]
+    statuses: tuple[DiagnosticStatus, ...]
 
 
 def diagnostics_message(sample: LiveSample) -> DiagnosticsMessage:
@@ -211,17 +211,17 @@ def diagnostics_message(sample: LiveSample) -> DiagnosticsMessage:
     )
 
 
-def _posture_status(sample: LiveSample) -> Status:
+def _posture_status(sample: LiveSample) -> DiagnosticStatus:
     name, rig, posture = f"{_PREFIX}posture", sample.rig.name, sample.scan.posture
     if not posture:
         told = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
-        return Status(Level.WARN, name, told, rig, (("reason", str(posture.reason)),))
+        return DiagnosticStatus(Level.WARN, name, told, rig, (("reason", str(posture.reason)),))
     pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
     frame, whole = (
         [math.sqrt(covariance[i, i]) for i in range(3)]
         for covariance in (posture.covariance, posture.total_covariance)
     )
-    return Status(
+    return DiagnosticStatus(
         Level.OK,
         name,
         f"{posture.range:.3f} m, pitch {pitch:+.1f} deg, yaw {yaw:+.1f} deg",
@@ -243,14 +243,14 @@ def _posture_status(sample: LiveSample) -> Status:
     )
 
 
-def _pipeline_status(health: Health, rig: str) -> Status:
+def _pipeline_status(health: Health, rig: str) -> DiagnosticStatus:
     share = "" if math.isnan(health.valid_share) else f", {health.valid_share:.0%} with a posture"
     delays = {
         f"{stage.name}_{which}_ms": 1e3 * delay_s
         for stage in health.delays
         for which, delay_s in (("median", stage.median_s), ("p99", stage.p99_s))
     }
-    return Status(
+    return DiagnosticStatus(
         Level.OK if health.rate_hz > 0.0 else Level.WARN,
         f"{_PREFIX}pipeline",
         f"{health.rate_hz:.1f} frames/s{share}",
@@ -269,9 +269,9 @@ def _pipeline_status(health: Health, rig: str) -> Status:
     )
 
 
-def _part_status(name: str, part: PartHealth, rig: str) -> Status:
+def _part_status(name: str, part: PartHealth, rig: str) -> DiagnosticStatus:
     idle = part.state is State.OFF
-    return Status(
+    return DiagnosticStatus(
         Level.OK if idle else _LEVELS[part.state],
         f"{_PREFIX}{name}",
         (f"not in use: {part.detail}" if part.detail else "not in use") if idle else part.detail,
@@ -322,7 +322,7 @@ POINT_TYPE = np.dtype(
 """One point of the cloud as it lies in `CloudMessage.data`."""
 
 
-class Topic(StrEnum):
+class PublishedTopic(StrEnum):
     """Published topic; the value is the last part of its name."""
 
     POSTURE = "posture"
@@ -368,9 +368,11 @@ class RosOptions:
         if not self.diagnostics_period_s > 0.0:
             raise OptionError(f"period of diagnostics {self.diagnostics_period_s:g} s: not above 0")
 
-    def topic_name(self, topic: Topic) -> str:
+    def topic_name(self, topic: PublishedTopic) -> str:
         """Return the full name of a topic."""
-        return "/diagnostics" if topic is Topic.DIAGNOSTICS else f"/{self.namespace}/{topic}"
+        return (
+            "/diagnostics" if topic is PublishedTopic.DIAGNOSTICS else f"/{self.namespace}/{topic}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,17 +428,17 @@ class MessageMaker:
         self._next_diagnostics_ns: int | None = None
 
     def messages(
-        self, sample: LiveSample, wanted: Collection[Topic]
-    ) -> Iterator[tuple[Topic, Message]]:
+        self, sample: LiveSample, wanted: Collection[PublishedTopic]
+    ) -> Iterator[tuple[PublishedTopic, Message]]:
         """Yield the messages of a sample, on the topics that have subscribers.
 
         Without a posture there is no pose, and the range is not a number.
         """
         stamp, frame = sample.utc_ns, self._options.frame_id
         posture, filtered = sample.scan.posture, sample.filtered
-        if Topic.POSTURE in wanted and posture:
+        if PublishedTopic.POSTURE in wanted and posture:
             yield (
-                Topic.POSTURE,
+                PublishedTopic.POSTURE,
                 _pose_message(
                     stamp,
                     frame,
@@ -446,18 +448,18 @@ class MessageMaker:
                     posture.total_covariance,
                 ),
             )
-        if Topic.FILTERED in wanted and filtered is not None:
+        if PublishedTopic.FILTERED in wanted and filtered is not None:
             cov = filtered.total_covariance
             yield (
-                Topic.FILTERED,
+                PublishedTopic.FILTERED,
                 _pose_message(stamp, frame, filtered.range, filtered.pitch, filtered.yaw, cov),
             )
-        if Topic.RANGE in wanted:
-            yield Topic.RANGE, self._range_message(sample)
-        if Topic.CLOUD in wanted:
-            yield Topic.CLOUD, cloud_message(stamp, frame, sample.scan.points)
-        if Topic.DIAGNOSTICS in wanted and self._diagnostics_are_due(sample):
-            yield Topic.DIAGNOSTICS, diagnostics_message(sample)
+        if PublishedTopic.RANGE in wanted:
+            yield PublishedTopic.RANGE, self._range_message(sample)
+        if PublishedTopic.CLOUD in wanted:
+            yield PublishedTopic.CLOUD, cloud_message(stamp, frame, sample.scan.points)
+        if PublishedTopic.DIAGNOSTICS in wanted and self._diagnostics_are_due(sample):
+            yield PublishedTopic.DIAGNOSTICS, diagnostics_message(sample)
 
     def _range_message(self, sample: LiveSample) -> RangeMessage:
         rig, posture = sample.rig, sample.scan.posture

@@ -15,41 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, mesh_filter
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import Returns, ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 
 _LEVELS = 256
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ThresholdOptions:
-    """Options of the threshold detector.
-
-    Attributes
-    ----------
-    level : int
-        Pixels at least this bright are laser light, in grey levels.
-    max_returns, max_pixels : int
-        Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where
-        there are more, the lowest higher level is used at which there are not; if even white is
-        too much, the frame has no returns.
-    """
-
-    level: int = 140
-    max_returns: int = 16384
-    max_pixels: int = 131072
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
-        if not 1 <= self.level <= 255:
-            raise OptionError(f"threshold level is {self.level}; use 1 to 255 grey levels")
 
 
 class ThresholdDetector:

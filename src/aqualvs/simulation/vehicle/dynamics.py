@@ -255,7 +255,7 @@ _MOST_TURN_ERROR = float(np.deg2rad(30.0))
 _MOST_DEPTH_ERROR = 0.5
 
 
-class Pilot(NamedTuple):
+class PackedAutopilot(NamedTuple):
     """Numbers and working memory of an autopilot, for kernels.
 
     Attributes
@@ -279,13 +279,13 @@ class Pilot(NamedTuple):
     wanted: FloatArray
 
 
-def pack_pilot(model: VehicleModel) -> Pilot:
+def pack_pilot(model: VehicleModel) -> PackedAutopilot:
     """Return a model's autopilot for kernels."""
     own, sticks, curve = model.autopilot, model.sticks, model.curve
     gains = [own.angle, *own.rate, *own.rate_integral, own.depth, own.climb, own.climb_integral]
     gains += [own.input_time, own.acceleration, own.settle]
     gains += [sticks.turning_rate, sticks.climb_rate]
-    return Pilot(
+    return PackedAutopilot(
         np.array(gains),
         model.mixing(),
         np.array([curve.forward, curve.reverse, curve.dead_band, curve.linear]),
@@ -320,7 +320,13 @@ def _wrapped(angle: float) -> float:
 
 @inline_borrowing_kernel
 def _rate_loop(
-    axis: int, wanted: float, rate: float, most: float, h: float, memory: FloatArray, pilot: Pilot
+    axis: int,
+    wanted: float,
+    rate: float,
+    most: float,
+    h: float,
+    memory: FloatArray,
+    pilot: PackedAutopilot,
 ) -> None:
     error = wanted - rate
     integral = memory[INTEGRAL + axis] + pilot.gains[_RATE_I + axis] * error * h
@@ -372,7 +378,7 @@ def euler_of(r: tuple[Vec, Vec, Vec]) -> Vec:
 
 
 @inline_borrowing_kernel
-def mix_inputs(pilot: Pilot) -> None:
+def mix_inputs(pilot: PackedAutopilot) -> None:
     """Convert `pilot.inputs` to `pilot.wanted` like ArduSub's AP_Motors6DOF.
 
     Roll, pitch and depth are one group, yaw, forward and right another; a group that exceeds the
@@ -394,7 +400,9 @@ def mix_inputs(pilot: Pilot) -> None:
 
 
 @inline_borrowing_kernel
-def steer(y: FloatArray, effort: FloatArray, h: float, memory: FloatArray, pilot: Pilot) -> None:
+def steer(
+    y: FloatArray, effort: FloatArray, h: float, memory: FloatArray, pilot: PackedAutopilot
+) -> None:
     """Write the thrusts requested by the autopilot to `pilot.wanted`."""
     g = pilot.gains
     r = turn_of(y)
@@ -424,7 +432,7 @@ def fly(
     t: float,
     h: float,
     n: int,
-    pilot: Pilot,
+    pilot: PackedAutopilot,
     body: Body,
     flow: Flow,
     work: Work,

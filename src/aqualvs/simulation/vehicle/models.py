@@ -78,7 +78,7 @@ class ThrustCurve:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sticks:
+class StickInput:
     """Response of the vehicle to stick positions, as of ArduSub 4.5 and later to MANUAL_CONTROL.
 
     Its parameters are RCn_MIN 1100 and RCn_MAX 1900 us and, except for those below, ArduSub's after
@@ -237,7 +237,7 @@ class VehicleModel:
         Any number; all with the same curve.
     curve : ThrustCurve
         Of every thruster.
-    sticks : Sticks
+    sticks : StickInput
         Response to the sticks.
     autopilot : Autopilot
         Gains of the vehicle's own loops.
@@ -257,7 +257,7 @@ class VehicleModel:
     quadratic_drag: Six
     thrusters: Sequence[Thruster]
     curve: ThrustCurve = field(default_factory=ThrustCurve)
-    sticks: Sticks = field(default_factory=Sticks)
+    sticks: StickInput = field(default_factory=StickInput)
     autopilot: Autopilot = field(default_factory=Autopilot)
     dome_position: Vec = (0.20, 0.0, 0.0)
     half_size: Vec = (0.2286, 0.169, 0.127)

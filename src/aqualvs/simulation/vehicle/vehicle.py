@@ -34,7 +34,7 @@ from aqualvs.simulation.vehicle.water_motion import GRAVITY, WaterMotion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sensor:
+class SensorErrors:
     """Errors of a sensor, in the unit of its quantity.
 
     Attributes
@@ -71,17 +71,17 @@ class Sensors:
 
     Attributes
     ----------
-    depth : Sensor
+    depth : SensorErrors
         Metres. The default noise is a Bar30's with the sea on top.
-    heading, tilt : Sensor
+    heading, tilt : SensorErrors
         Radians; tilt is roll and pitch.
     """
 
-    depth: Sensor = field(default_factory=lambda: Sensor(noise=0.005))
-    heading: Sensor = field(
-        default_factory=lambda: Sensor(noise=math.radians(0.2), wander=math.radians(1.0))
+    depth: SensorErrors = field(default_factory=lambda: SensorErrors(noise=0.005))
+    heading: SensorErrors = field(
+        default_factory=lambda: SensorErrors(noise=math.radians(0.2), wander=math.radians(1.0))
     )
-    tilt: Sensor = field(default_factory=lambda: Sensor(noise=math.radians(0.2)))
+    tilt: SensorErrors = field(default_factory=lambda: SensorErrors(noise=math.radians(0.2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,13 +118,13 @@ class Reading:
 
     Parameters
     ----------
-    sensor : Sensor
+    sensor : SensorErrors
         Its errors.
     rng : Generator
         Source of its noise.
     """
 
-    def __init__(self, sensor: Sensor, rng: np.random.Generator) -> None:
+    def __init__(self, sensor: SensorErrors, rng: np.random.Generator) -> None:
         self._sensor = sensor
         self._rng = rng
         self._slow = sensor.wander * rng.normal()
