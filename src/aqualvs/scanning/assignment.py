@@ -140,13 +140,30 @@ class AssignmentTest:
         for one in surfaces:
             if one is not target:
                 others |= one.members
-        plane = np.append(target.plane.normal, target.plane.offset)
-        light = light_left(readings.source, readings.trust, chunk_index, target.members, others)
         # A plane needs two lasers: the surplus of one is no evidence for it.
-        light *= target.support / chunks.light[target.members].sum()
-        most, faint = seen_of(plane, target.members, chunks.n_lines, chunks.laser, self._bands)
+        light = light_left(
+            readings.source,
+            readings.trust,
+            chunk_index,
+            target.members,
+            others,
+            chunks.light,
+            target.support,
+        )
+        if target.is_mesh and light >= _LITTLE_LIGHT:
+            return False
+        most, faint = self._seen_of(target, chunks)
         small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not target.is_mesh)
         return small and faint > _MAY_BE_FAINT
+
+    def _seen_of(self, surface: Surface, chunks: Chunks) -> tuple[float, float]:
+        """Return the share of its best stripe that a surface shows, and that of faint lasers."""
+        packed = np.empty(4)
+        packed[:3], packed[3] = surface.plane.normal, surface.plane.offset
+        seen: tuple[float, float] = seen_of(
+            packed, surface.members, chunks.n_lines, chunks.laser, self._bands
+        )
+        return seen
 
     def outweighed(
         self, chunks: Chunks, surfaces: Sequence[Surface], target: Surface
@@ -166,21 +183,20 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
-        voice, plane = chunks.table[WEIGHT], target.plane
-        near = plane.normal @ chunks.table[X : Z + 1] < plane.offset
-        nearer = [
+        rivals = [
             one
             for one in surfaces
-            if one is not target
-            and one.is_mesh
-            and one.voice >= target.voice
-            and voice[one.members & near].sum() > 0.5 * voice[one.members].sum()
+            if target.is_mesh and one is not target and one.is_mesh and one.voice >= target.voice
         ]
-        if not (target.is_mesh and nearer):
+        if not rivals:
             return None
-        packed = np.append(plane.normal, plane.offset)
-        _, faint = seen_of(packed, target.members, chunks.n_lines, chunks.laser, self._bands)
-        return nearer[0] if faint > _MAY_BE_FAINT else None
+        voice, plane = chunks.table[WEIGHT], target.plane
+        near = plane.normal @ chunks.table[X : Z + 1] < plane.offset
+        for one in rivals:
+            if voice[one.members & near].sum() > 0.5 * voice[one.members].sum():
+                _, faint = self._seen_of(target, chunks)
+                return one if faint > _MAY_BE_FAINT else None
+        return None
 
     def test(
         self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surface: Surface
