@@ -149,7 +149,7 @@ def test_windows_and_the_water_in_front_of_them_count() -> None:
     laser, ones = np.repeat([0, 1], 50), np.ones(100)
     m = np.array([0.0, 1.0 / 0.6, 0.0])
     plane = fitted_plane(m, points)
-    found = errors.jacobian(plane, errors.sums(plane, pixels, laser, points, ones, 50))
+    found = errors.jacobian(plane, pixels, laser, points, ones, 50)
     for i, name in enumerate(errors.names):
         h = sigmas[name]
         read = []

@@ -14,7 +14,14 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.stripe import Returns, StripeOptions
+from aqualvs.scanning.stripe import (
+    HEIGHT,
+    N_MEASURES,
+    PeakFinder,
+    Returns,
+    SearchImage,
+    StripeOptions,
+)
 from aqualvs.simulation.scenarios import bluerov2_rig
 
 U8 = NDArray[np.uint8]
@@ -399,3 +406,21 @@ def test_an_impossible_contrast_is_refused(value: int) -> None:
 def test_an_impossible_reach_is_refused(value: float) -> None:
     with pytest.raises(OptionError, match="reach_share is"):
         StripeOptions(reach_share=value)
+
+
+@pytest.mark.parametrize("reach_px", [8, 9, 16, 17, 33, 64, 86])
+def test_the_background_is_the_higher_of_the_least_pixels_on_either_side(reach_px: int) -> None:
+    rng, length = np.random.default_rng(reach_px), 301
+    picture = rng.integers(40, 90, (60, length), np.uint8)
+    peak = rng.integers(reach_px, length - reach_px, len(picture))
+    picture[np.arange(len(picture)), peak] = 200
+    anywhere, no_chroma = np.zeros(len(picture), np.int64), np.empty((0, 0), np.uint8)
+    finder = PeakFinder(length, anywhere, anywhere + length - 1, reach_px, np.zeros((1, 2)))
+    line, table = np.empty(100, np.int64), np.empty((N_MEASURES, 100))
+    n = finder.find(SearchImage(picture, no_chroma, no_chroma, 1, True), 100, 1, line, table)
+    expected = [
+        200 - max(row[p - reach_px + 1 : p + 1].min(), row[p : p + reach_px].min())
+        for row, p in zip(picture, peak, strict=True)
+    ]
+    assert line[:n].tolist() == list(range(len(picture)))
+    assert table[HEIGHT, :n].tolist() == expected

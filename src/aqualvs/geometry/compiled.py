@@ -10,11 +10,16 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 # What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
 _LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
 if _LOADS_LIGHTLY:
     from aqualvs.geometry.kernel_loading import load_lightly
+
+ZERO = cast(int, np.int64(0))
+"""Initial value of a count that kernels pass on and get back; they would be compiled once more for
+a literal 0."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -163,13 +163,9 @@ class PostureErrors:
             Points that it was fitted to, ordered along the stripes; weights are 1 over the variance
             of the residual, or 0.
         """
-        found = np.zeros((3, 3))
-        if len(self.names):
-            jacobian = self.jacobian(surface, self.sums(surface, pixels, laser, points, weights))
-            _propagate(jacobian, self.covariance, found)
-        return found
+        return self._propagated(surface, pixels, laser, points, weights, None)[1]
 
-    def sums(
+    def jacobian(
         self,
         surface: FittedSurface,
         pixels: FloatArray,
@@ -177,47 +173,48 @@ class PostureErrors:
         points: FloatArray,
         weights: FloatArray,
         each: int | None = None,
-    ) -> StripeSums:
-        """Return a few segments that represent the stripes; parameters as in `covariance_of`.
-
-        `each` is the largest number of them per laser.
-        """
-        each = each or max(_LEAST_BINS, -(-_BINS // max(self._n_lasers, 1)))
-        room, k = each * self._n_lasers, len(surface.prior)
-        sums = StripeSums(
-            np.zeros((room, 2)),
-            np.zeros((room, 3)),
-            np.zeros(room, np.int64),
-            np.zeros((room, k)),
-            np.diag(surface.prior),
-        )
-        n = _sum_up(pixels, laser, points, weights, surface.terms, self._n_lasers, each, *sums)
-        return StripeSums(
-            sums.pixels[:n], sums.points[:n], sums.laser[:n], sums.pulls[:n], sums.matrix
-        )
-
-    def jacobian(self, surface: FittedSurface, sums: StripeSums) -> FloatArray:
+    ) -> FloatArray:
         """Return the derivatives (3, P) of range, pitch and yaw by the rig's parameters.
 
-        NaN where the points do not determine the surface.
+        Parameters as in `covariance_of`; `each` is the largest number of short segments that
+        represent the stripes of a laser. NaN where the points do not determine the surface.
         """
-        found, moves = np.empty((3, len(self.names))), self._moves
-        _jacobian(
-            surface.normal,
-            surface.bend,
-            surface.posture,
-            *sums,
-            *self._lattice,
-            moves.sheets,
-            moves.first,
-            moves.column,
-            moves.ahead,
-            moves.behind,
-            moves.step,
-            self._camera_columns,
-            found,
-        )
-        return found
+        return self._propagated(surface, pixels, laser, points, weights, each)[0]
+
+    def _propagated(
+        self,
+        surface: FittedSurface,
+        pixels: FloatArray,
+        laser: IntArray,
+        points: FloatArray,
+        weights: FloatArray,
+        each: int | None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives (3, P) and covariance (3, 3)."""
+        n, moves = len(self.names), self._moves
+        jacobian, covariance = np.empty((3, n)), np.zeros((3, 3))
+        if n:
+            _propagate(
+                *surface,
+                pixels,
+                laser,
+                points,
+                weights,
+                self._n_lasers,
+                each or max(_LEAST_BINS, -(-_BINS // max(self._n_lasers, 1))),
+                *self._lattice,
+                moves.sheets,
+                moves.first,
+                moves.column,
+                moves.ahead,
+                moves.behind,
+                moves.step,
+                self._camera_columns,
+                self.covariance,
+                jacobian,
+                covariance,
+            )
+        return jacobian, covariance
 
     def _derivatives_on_lattice(self) -> "_Lattice":
         width, height = self._camera.size_px
@@ -286,29 +283,31 @@ def _sum_up(
     points: FloatArray,
     weights: FloatArray,
     terms: FloatArray,
+    prior: FloatArray,
     n_lasers: int,
     each: int,
-    mean_pixels: FloatArray,
-    mean_points: FloatArray,
-    owner: IntArray,
-    pulls: FloatArray,
-    matrix: FloatArray,
-) -> int:
-    """Write sums over runs of equally many points, at most `each` runs per laser; return the count.
+) -> StripeSums:
+    """Return sums over runs of equally many points, at most `each` runs per laser.
 
     If there are many points, only every second or third is summed, for its neighbours too.
     """
+    room, n_terms = each * n_lasers, terms.shape[1]
+    mean_pixels, mean_points = np.zeros((room, 2)), np.zeros((room, 3))
+    owner, pulls = np.zeros(room, np.int64), np.zeros((room, n_terms))
+    matrix = np.zeros((n_terms, n_terms))
+    for j in range(n_terms):
+        matrix[j, j] = prior[j]
     chosen, n_chosen = np.empty(laser.shape[0], np.int64), 0
     for i in range(laser.shape[0]):
         chosen[n_chosen] = i
         n_chosen += weights[i] > 0.0
     stride = max(1, n_chosen // _ENOUGH)
-    share, n_terms = np.zeros(n_lasers), terms.shape[1]
+    share = np.zeros(n_lasers)
     for c in range(0, n_chosen, stride):
         share[laser[chosen[c]]] += 1.0
     for own in range(n_lasers):
         share[own] = each / share[own] if share[own] > 0.0 else 0.0
-    done, total = np.zeros(n_lasers), np.zeros(owner.shape[0])
+    done, total = np.zeros(n_lasers), np.zeros(room)
     for c in range(0, n_chosen, stride):
         i = chosen[c]
         own, w = laser[i], weights[i]
@@ -325,7 +324,7 @@ def _sum_up(
             for k in range(j + 1):
                 matrix[j, k] += part * terms[i, k]
     n = 0
-    for run in range(total.shape[0]):
+    for run in range(room):
         if total[run] > 0.0:
             for j in range(2):
                 mean_pixels[n, j] = mean_pixels[run, j] / total[run]
@@ -335,32 +334,22 @@ def _sum_up(
                 pulls[n, j] = pulls[run, j]
             owner[n] = run // each
             n += 1
-    return n
+    return StripeSums(mean_pixels[:n], mean_points[:n], owner[:n], pulls[:n], matrix)
 
 
 @kernel
-def _propagate(jacobian: FloatArray, covariance: FloatArray, out: FloatArray) -> None:
-    """Add J C J^T (3, 3) to `out`."""
-    n = covariance.shape[0]
-    for i in range(3):
-        for p in range(n):
-            passed = 0.0
-            for k in range(n):
-                passed += jacobian[i, k] * covariance[k, p]
-            for j in range(3):
-                out[i, j] += passed * jacobian[j, p]
-
-
-@kernel
-def _jacobian(
+def _propagate(
+    terms: FloatArray,
+    prior: FloatArray,
     normal: FloatArray,
     bend: FloatArray,
     posture: FloatArray,
     pixels: FloatArray,
-    points: FloatArray,
     laser: IntArray,
-    pulls: FloatArray,
-    matrix: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    n_lasers: int,
+    each: int,
     table: FloatArray,
     scale: FloatArray,
     sheets: FloatArray,
@@ -370,19 +359,43 @@ def _jacobian(
     behind: FloatArray,
     step: FloatArray,
     camera_columns: IntArray,
-    out: FloatArray,
+    rig_covariance: FloatArray,
+    jacobian: FloatArray,
+    covariance: FloatArray,
 ) -> None:
-    """Write the derivatives (3, P) of range, pitch and yaw by the rig's parameters."""
+    """Write the derivatives J (3, P) of range, pitch and yaw by the rig's parameters, and J C J^T.
+
+    Parameters
+    ----------
+    terms, prior, normal, bend, posture
+        As in `FittedSurface`.
+    pixels, laser, points, weights
+        As in `PostureErrors.covariance_of`.
+    n_lasers, each : int
+        Number of lasers, and the largest number of short segments for each.
+    table, scale
+        As in `_Lattice`.
+    sheets, first, column, ahead, behind, step
+        As in `_SheetMoves`.
+    camera_columns : int array
+        Which of the P parameters are the camera's.
+    rig_covariance : array, shape (P, P)
+        Covariance of the parameters.
+    jacobian : array, shape (3, P), covariance : array, shape (3, 3)
+        Written; the second zero at first.
+    """
     # Bundled here: every call from outside with a named tuple would keep some memory for good.
-    sums, lattice = StripeSums(pixels, points, laser, pulls, matrix), _Lattice(table, scale)
+    sums = _sum_up(pixels, laser, points, weights, terms, prior, n_lasers, each)
+    lattice = _Lattice(table, scale)
     moves = _SheetMoves(sheets, first, column, ahead, behind, step)
-    n, n_terms = out.shape[1], sums.pulls.shape[1]
+    n, n_terms = jacobian.shape[1], terms.shape[1]
     factor, gain, slopes = np.empty((n_terms, n_terms)), posture.copy(), np.empty(n)
     scratch = np.empty(15)
     if not factorise(sums.matrix, 0.0, _LEAST_PIVOT, factor):
-        out[:] = np.nan
+        jacobian[:] = np.nan
+        covariance[:] = np.nan
         return
-    out[:] = 0.0
+    jacobian[:] = 0.0
     for i in range(3):
         solve_factorised(factor, gain[i], gain[i])
     for b in range(sums.laser.shape[0]):
@@ -392,7 +405,14 @@ def _jacobian(
             for j in range(n_terms):
                 pull += gain[i, j] * sums.pulls[b, j]
             for p in range(n):
-                out[i, p] += pull * slopes[p]
+                jacobian[i, p] += pull * slopes[p]
+    for i in range(3):
+        for p in range(n):
+            passed = 0.0
+            for k in range(n):
+                passed += jacobian[i, k] * rig_covariance[k, p]
+            for j in range(3):
+                covariance[i, j] += passed * jacobian[j, p]
 
 
 @kernel

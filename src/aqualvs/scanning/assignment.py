@@ -192,13 +192,28 @@ class AssignmentTest:
         for one in surfaces:
             if one is not surface:
                 others |= one.members
-        plane = np.append(surface.plane.normal, surface.plane.offset)
-        light = light_left(readings.source, readings.trust, chunk_index, surface.members, others)
         # A plane needs two lasers: the surplus of one is no evidence for it.
-        light *= surface.support / chunks.light[surface.members].sum()
-        most, faint = seen_of(plane, surface.members, chunks.n_lines, chunks.laser, self._bands)
+        light = light_left(
+            readings.source,
+            readings.trust,
+            chunk_index,
+            surface.members,
+            others,
+            chunks.light,
+            surface.support,
+        )
+        most, faint = self._seen_of(surface, chunks)
         small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not surface.is_mesh)
         return small, faint
+
+    def _seen_of(self, surface: Surface, chunks: Chunks) -> tuple[float, float]:
+        """Return the share of its best stripe that a surface shows, and that of faint lasers."""
+        packed = np.empty(4)
+        packed[:3], packed[3] = surface.plane.normal, surface.plane.offset
+        seen: tuple[float, float] = seen_of(
+            packed, surface.members, chunks.n_lines, chunks.laser, self._bands
+        )
+        return seen
 
     def outweighed(
         self, chunks: Chunks, surfaces: Sequence[Surface], target: Surface
@@ -218,20 +233,14 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
-        plane = target.plane
-        nearer = [
-            one
-            for one in surfaces
-            if one is not target
-            and one.is_mesh
-            and one.voice >= target.voice
-            and _is_nearer(one, target, chunks)
-        ]
-        if not (target.is_mesh and nearer):
+        if not target.is_mesh:
             return None
-        packed = np.append(plane.normal, plane.offset)
-        _, faint = seen_of(packed, target.members, chunks.n_lines, chunks.laser, self._bands)
-        return nearer[0] if faint > _MAY_BE_FAINT else None
+        for one in surfaces:
+            rivals = one is not target and one.is_mesh and one.voice >= target.voice
+            if rivals and _is_nearer(one, target, chunks):
+                _, faint = self._seen_of(target, chunks)
+                return one if faint > _MAY_BE_FAINT else None
+        return None
 
     def test(
         self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surface: Surface

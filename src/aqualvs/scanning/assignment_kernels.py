@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.plane_search import (
     JX,
@@ -102,7 +102,7 @@ def find_rivals(
         return 0
     seeds = _choose_seeds(sums, place)
     score = np.zeros(planes.shape[0])
-    n = 0
+    n = ZERO
     for p in range(seeds.shape[0]):
         for q in range(p + 1, seeds.shape[0]):
             n = _try_pair(sums, seeds[p], seeds[q], nearest, farthest, total, planes, score, n)
@@ -484,6 +484,8 @@ def light_left(
     chunk_index: IntArray,
     members: BoolArray,
     others: BoolArray,
+    chunk_light: FloatArray,
+    support: float,
 ) -> float:
     """Return the share of the light on a surface, without light on other surfaces.
 
@@ -495,6 +497,10 @@ def light_left(
         Row of each reading's chunk.
     members, others : bool array, shape (C,)
         Chunks on the surface, and on other surfaces.
+    chunk_light : array, shape (C,)
+        Of each chunk.
+    support : float
+        The part of the surface's light that counts.
     """
     last = 0
     for i in range(source.shape[0]):
@@ -508,7 +514,10 @@ def light_left(
     for r in range(last + 1):
         total += light[r] if owner[r] != 1 else 0.0
         on += light[r] if owner[r] == 2 else 0.0
-    return on / max(total, 1e-12)
+    of_members = 0.0
+    for c in range(members.shape[0]):
+        of_members += chunk_light[c] if members[c] else 0.0
+    return on / max(total, 1e-12) * (support / of_members)
 
 
 @kernel
@@ -540,7 +549,7 @@ def seen_of(
             way[laser[c]] += n_lines[c]
     most, asked, faint = 0.0, 0, 0
     for i in range(n_lasers):
-        cells = np.sum(expected[i])
+        cells = np.count_nonzero(expected[i])
         way[i] = way[i] / (CELL_LINES * cells) if cells >= _LEAST_CELLS else np.nan
         if way[i] > most:
             most = way[i]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.quantile import element_at
 from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
 from aqualvs.scanning.segments import (
@@ -167,7 +167,7 @@ def chunk_readings(
     array, shape (6, S)
         The stretches as described by `describe_stretches`.
     """
-    begin = 0
+    begin = ZERO
     for c in range(light.shape[0]):
         end = run_end(chunk, begin)
         for i in range(begin, end):

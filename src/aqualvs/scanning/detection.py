@@ -267,8 +267,9 @@ class FrameDetector:
         _, sample, _ = self._find(images, options.min_contrast, _SAMPLE_EVERY)
         contrast, paint = self._survey(sample, frame.chroma is not None)
         line, table, ends = self._find(images, max(contrast, options.min_contrast))
-        likelihood = np.ones(len(line))
-        if frame.chroma is not None:
+        if frame.chroma is None:
+            likelihood = np.ones(len(line))
+        else:
             likelihood = self._likelihood(table, paint, self._n_possible)
         rows = select_returns(
             line, table, likelihood, ends, options.min_likelihood, options.min_share
@@ -323,8 +324,9 @@ class FrameDetector:
         """
         n_possible = self._n_possible / _SAMPLE_EVERY
         most = _MOST_PEAKS * n_possible
-        heights = np.sort(sample[HEIGHT])[::-1]
-        crowded = round(min(heights[int(most)], HIGHEST_USEFUL)) if len(heights) > most else 0
+        heights = np.sort(sample[HEIGHT])
+        n = len(heights)
+        crowded = round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)) if n > most else 0
         if not has_colour:
             return crowded, None
         paint = learn_paint(sample, n_possible)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.geometry.quantile import element_at
+from aqualvs.geometry.quantile import element_at, sum_of
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
@@ -379,7 +379,7 @@ def _learn_paint(
     across = math.hypot(spread_u, spread_v)
     if size > _LEAST_SPREAD:
         across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
-    return u, v, spread_u, spread_v, across, int(np.sum(near))
+    return u, v, spread_u, spread_v, across, int(np.count_nonzero(near))
 
 
 @kernel
@@ -525,7 +525,7 @@ def _weigh(
             lines[kind[i]] += likelihood[i]
             peaks[kind[i]] += 1.0
         # The number of lines is limited to the number that the lasers can make.
-        share = lines / peaks * min(n_possible / np.sum(lines), 1.0)
+        share = lines / peaks * min(n_possible / sum_of(lines), 1.0)
     for i in range(n):
         if table[TOP, i] >= WHITE and table[WIDTH, i] <= widest_white_px:
             likelihood[i] = max(likelihood[i], 0.5)

@@ -88,7 +88,7 @@ def _turns(
     plane is one that a fold makes.
     """
     rows = np.flatnonzero(first | second)
-    order = rows[np.argsort(laser[rows] * 1_000_000 + first_line[rows])]
+    order = rows[np.argsort(laser[rows] * 1e6 + first_line[rows])]
     turns, met, n, n_second = 0, 0, 0, 0
     at_random = 0.0
     for k in range(order.shape[0]):

@@ -287,7 +287,9 @@ def grow(
     for _ in range(_STEPS):
         for i in range(n):
             weight[i] = 1.0 / (gate[i] * gate[i]) if inside[i] else 0.0
-        if np.sum(inside) < MIN_PIECES or not _solve(terms, height, weight, factor, coefficients):
+        if np.count_nonzero(inside) < MIN_PIECES or not _solve(
+            terms, height, weight, factor, coefficients
+        ):
             return False
         if np.abs(coefficients[3:]).max() > _STRONGEST:
             return False
@@ -301,7 +303,7 @@ def grow(
             inside[i] = now
         if not changed:
             break
-    return bool(np.sum(inside) >= MIN_PIECES)
+    return bool(np.count_nonzero(inside) >= MIN_PIECES)
 
 
 @kernel

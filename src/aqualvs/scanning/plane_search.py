@@ -20,6 +20,7 @@ from aqualvs.geometry.compiled import (
     kernel,
 )
 from aqualvs.geometry.linear_algebra import solve_symmetric
+from aqualvs.geometry.quantile import sum_of
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), voice (search lines)."""
@@ -208,7 +209,7 @@ def _guide(voice_up_to: FloatArray, guide: IntArray) -> None:
 def _middle_voice(voice: FloatArray) -> float:
     """Return the weighted median of the sampling weights."""
     values = voice.copy()
-    wanted, below = 0.5 * np.sum(voice), 0.0
+    wanted, below = 0.5 * sum_of(voice), 0.0
     low, high = 0, values.shape[0]
     while high - low > 1:
         pivot = values[(low + high) // 2]
@@ -281,7 +282,9 @@ def search_plane(
     best_rough = 0.0
     loud = _loud(table[WEIGHT])
     n_loud = loud.shape[0]
-    voice_up_to = np.cumsum(table[WEIGHT][loud])
+    voice_up_to = table[WEIGHT][loud]
+    for k in range(1, n_loud):
+        voice_up_to[k] += voice_up_to[k - 1]
     guide = np.empty(n_loud, np.int64)
     _guide(voice_up_to, guide)
     voice_after = np.zeros(n + 1)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.laser_bands import SLOPE_CELL, StripeSearch
 from aqualvs.scanning.stripe import Returns
@@ -196,7 +196,7 @@ def _measure_stretches(
     last: IntArray,
 ) -> None:
     """Sum lines, widths and heights, and find the readings at the ends."""
-    begin = 0
+    begin = ZERO
     while begin < stretch.shape[0]:
         s, end = stretch[begin], run_end(stretch, begin)
         widths, heights = 0.0, 0.0
@@ -228,7 +228,7 @@ def _fit_parabolas(
     """Fit a parabola over the chord of each stretch that is long enough to have a shape."""
     n = shapes.n_lines.shape[0]
     sums = np.zeros((n, _N_SUMS))
-    begin = 0
+    begin = ZERO
     while begin < stretch.shape[0]:
         s, end = stretch[begin], run_end(stretch, begin)
         if shapes.n_lines[s] >= _LEAST_LINES and shapes.size[s] > 0.0:
@@ -298,6 +298,9 @@ def _add_powers(
     sums[_MOMENTS + 2] += m2
     sums[_SQUARES] += squares
 
+
+# Beyond any position on a search line.
+_ANYWHERE = 1 << 40
 
 CHUNK_LINES = 16
 """A long segment is cut into chunks of at most this many returns."""
@@ -375,8 +378,8 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     n_lines = line[n - 1] + 1 if n else 0
     segment_of = np.empty(n, np.int64)
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    anywhere = np.full(n_lines, -np.inf), np.full(n_lines, np.inf)
-    _link(line, position, anywhere[0], anywhere[1], segment_of, first, last, count)
+    lowest, highest = np.full(n_lines, -_ANYWHERE), np.full(n_lines, _ANYWHERE)
+    _link(line, position, lowest, highest, segment_of, first, last, count)
     long = np.empty(n, np.bool_)
     for i in range(n):
         long[i] = count[segment_of[i]] >= CHUNK_LINES
@@ -435,8 +438,8 @@ def _still_due(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: Fl
 def _link(
     line: IntArray,
     position: FloatArray,
-    lowest: IntArray | FloatArray,
-    highest: IntArray | FloatArray,
+    lowest: IntArray,
+    highest: IntArray,
     segment_of: IntArray,
     first: IntArray,
     last: IntArray,
@@ -447,7 +450,7 @@ def _link(
     # Active segments: number and last line; last position, slope and the largest change of it by
     # the next return; and the predicted position on this search line.
     alive, track, due = np.empty((2, n), np.int64), np.empty((3, n)), np.empty(n)
-    n_alive = 0
+    n_alive = ZERO
     n_segments = 0
     here = -1
     for i in range(n):

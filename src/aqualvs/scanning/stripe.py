@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
+from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel
 
 U8Array: TypeAlias = NDArray[np.uint8]
 
@@ -28,6 +28,8 @@ _WORD = 8
 _NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
 _EACH_BYTE, _BYTE_NUMBERS = np.uint64(0x0101010101010101), np.uint64(0x0001020304050607)
 _BRIGHT = np.uint8(255)
+# Bytes that compiled loops work on at a time, or a multiple of them.
+_VECTOR = 128
 # Luma of flanks that are dark; black is 16.
 _DARK = 36.0
 _THIRD = 1.0 / 3.0
@@ -191,9 +193,10 @@ class PeakFinder:
     ) -> None:
         self._lowest, self._highest = lowest, highest
         self._reach_px, self._directions = reach_px, directions
-        padded, minima, spare = np.full((3, length + 2 * reach_px), 255, np.uint8)
+        # Lines are worked on in whole vectors, whatever stands after their last pixel.
+        padded, minima, spare = np.full((3, length + 2 * reach_px + _VECTOR), 255, np.uint8)
         # There is room for a gap and a mark after the last pixel.
-        background, above = np.zeros((2, (length // _WORD + 3) * _WORD), np.uint8)
+        background, above = np.zeros((2, (length + _VECTOR) // _WORD * _WORD + 3 * _WORD), np.uint8)
         words = above.view(np.uint64)
         self._scratch = _Scratch(padded, minima, spare, background, above, words)
 
@@ -253,7 +256,7 @@ def _find_peaks(
     table: FloatArray,
 ) -> int:
     """Write the search line and the measures of each peak; return the number of peaks."""
-    n = 0
+    n = ZERO
     for x in range(0, lowest.shape[0], every):
         if lowest[x] > highest[x]:
             continue
@@ -262,7 +265,7 @@ def _find_peaks(
         first = max(lowest[x] - reach_px, 0)
         end = min(highest[x] + reach_px + 1, row.shape[0])
         _mark_above(row, first, end, min_contrast, reach_px, scratch)
-        start = _next_with(_MARKED, scratch.words, 0)
+        start = _next_with(_MARKED, scratch.words, ZERO)
         while start < end - first:
             stop = _next_with(_UNMARKED, scratch.words, start)
             if first + start <= highest[x] and first + stop > lowest[x]:
@@ -283,33 +286,58 @@ def _mark_above(
     """Mark the pixels [first, end) that stand above the background; index 0 is `first`."""
     n = end - first
     # Slices from 0 on: LLVM sees that no index is negative, and uses vector instructions.
-    padded, pixels = scratch.padded[: n + 2 * reach_px], scratch.padded[reach_px : reach_px + n]
+    padded = scratch.padded[: n + 2 * reach_px]
     # Pixels beyond the border count as bright: one flank is not visible there, so no peak is found.
-    before, after = min(reach_px, first), min(reach_px, row.shape[0] - end)
-    padded[: reach_px - before] = _BRIGHT
-    _copy(row[first - before : end + after], padded[reach_px - before :])
-    padded[reach_px + n + after :] = _BRIGHT
-    # Minima over windows that grow to `reach_px`: twice as wide each time.
-    here, there, other = padded, scratch.minima, scratch.spare
+    seen, ahead = min(reach_px, first), min(reach_px, row.shape[0] - end)
+    padded[: reach_px - seen] = _BRIGHT
+    _copy(row[first - seen : end + ahead], padded[reach_px - seen :])
+    padded[reach_px + n + ahead :] = _BRIGHT
+    # Minima over windows that grow towards `reach_px`: four times as wide each time.
+    here, there = scratch.padded, scratch.minima
     span = 1
-    while span < reach_px:
-        step = min(span, reach_px - span)
-        ahead = here[step : n + 2 * reach_px - span + 1]
-        for i in range(ahead.shape[0]):
-            one, two = here[i], ahead[i]
-            there[i] = one if one < two else two
-        here, there, other = there, other, there
-        span += step
-    left, right = here[1:], here[reach_px:]
-    background, above = scratch.background, scratch.above
+    while 2 * span < reach_px:
+        grown = min(4 * span, reach_px)
+        last = grown - span
+        _least_of_four(
+            here,
+            here[min(span, last) :],
+            here[min(2 * span, last) :],
+            here[last:],
+            _whole_vectors(n + 2 * reach_px - grown + 1),
+            there,
+        )
+        here, there = there, here if span > 1 else scratch.spare
+        span = grown
+    # The last step is taken here, for the windows before and behind a pixel.
+    near_before, near_behind = here[1:], here[reach_px:]
+    far_before, far_behind = here[1 + reach_px - span :], here[2 * reach_px - span :]
+    pixels, background, above = scratch.padded[reach_px:], scratch.background, scratch.above
     least = np.uint8(min_contrast)
-    for i in range(pixels.shape[0]):
-        base = left[i] if left[i] > right[i] else right[i]
+    for i in range(_whole_vectors(n)):
+        before = near_before[i] if near_before[i] < far_before[i] else far_before[i]
+        behind = near_behind[i] if near_behind[i] < far_behind[i] else far_behind[i]
+        base = before if before > behind else behind
         background[i] = base
         above[i] = np.uint8(np.uint8(pixels[i] - base) >= least)
     # A gap, then a mark that ends the search for the next run.
     above[n : n + _WORD] = np.uint8(0)
     above[n + _WORD] = np.uint8(1)
+
+
+@inline_borrowing_kernel
+def _whole_vectors(n: int) -> int:
+    """Round a number of pixels up: what remains after the last vector is slow, one by one."""
+    return (n + _VECTOR - 1) // _VECTOR * _VECTOR
+
+
+@inline_borrowing_kernel
+def _least_of_four(
+    one: U8Array, two: U8Array, three: U8Array, four: U8Array, n: int, least: U8Array
+) -> None:
+    for i in range(n):
+        first = one[i] if one[i] < two[i] else two[i]
+        second = three[i] if three[i] < four[i] else four[i]
+        least[i] = first if first < second else second
 
 
 @inline_borrowing_kernel

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.quantile import sum_of
 from aqualvs.scanning.candidates import Chunks
 from aqualvs.scanning.net_surfaces import continues, describe_pattern, joined_plane, seen_through
 from aqualvs.scanning.plane_search import (
@@ -163,18 +164,18 @@ def search_surfaces(
     by_laser = np.empty((3, n_lasers))
     for found in range(MOST_SURFACES):
         rows = np.flatnonzero(free)
-        if np.sum(n_lines[rows]) < enough or rows.shape[0] < _MIN_CHUNKS:
+        if sum_of(n_lines[rows]) < enough or rows.shape[0] < _MIN_CHUNKS:
             return found
         if not _find_plane(table, laser, rows, n_lasers, nearest, farthest, found, planes[found]):
             return found
         by_laser[:] = 0.0
         mine = members[found]
         n = _collect(table, rows, planes[found], n_lines, light, laser, mine, by_laser)
-        supporting = np.sum(by_laser[LINES] >= MIN_LINES_PER_LASER)
-        sums[found, LINES] = np.sum(by_laser[LINES])
+        supporting = np.count_nonzero(by_laser[LINES] >= MIN_LINES_PER_LASER)
+        sums[found, LINES] = sum_of(by_laser[LINES])
         if n < _MIN_CHUNKS or supporting < 2 or sums[found, LINES] < _MIN_LINES:
             return found
-        if np.sum(by_laser[SUPPORT]) < _LEAST_SHARE * np.sum(light):
+        if sum_of(by_laser[SUPPORT]) < _LEAST_SHARE * sum_of(light):
             return found
         sums[found, SUPPORT] = on_two(by_laser[SUPPORT])
         sums[found, VOICE] = on_two(by_laser[VOICE])
@@ -267,7 +268,7 @@ def collect_surface(
     by_laser = np.zeros((3, n_lasers))
     rows = np.arange(laser.shape[0])
     _collect(table, rows, plane, n_lines, light, laser, members, by_laser)
-    sums[LINES] = np.sum(by_laser[LINES])
+    sums[LINES] = sum_of(by_laser[LINES])
     sums[SUPPORT] = on_two(by_laser[SUPPORT])
     sums[VOICE] = on_two(by_laser[VOICE])
 
