@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+import aqualvs
+from aqualvs.calibration.water_index.state import IndexPrior
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import calibration_commands
 from aqualvs.geometry.transforms import rotvec_from_rotation
@@ -154,3 +156,44 @@ def test_a_damaged_set_changes_the_result(calibrated, tmp_path):
     arguments = [str(files.camera), "--board", str(tmp_path / "board.yaml"), "-o", str(wrong)]
     code = main(["calibrate", "camera", *arguments])
     assert code == 2 or load_rig(wrong, need_lasers=False).lens != load_rig(out / "rig.yaml").lens
+
+
+def test_the_functions_find_what_the_commands_find(calibrated):
+    """The same rig, from pixels in memory, with residuals and reasons by picture."""
+    out, files, _, _ = calibrated
+    rig = load_rig(out / "rig.yaml")
+    pictures = [cv2.imread(str(path)) for path in sorted(files.camera.glob("view_*"))]
+    blank = np.full_like(pictures[0], 128)
+    camera = aqualvs.calibrate_camera([*pictures, blank], files.board, nominal=files.nominal)
+    dome = aqualvs.calibrate_dome(
+        sorted(files.dome.glob("view_*")), files.rail_board, camera.rig, poses=files.poses
+    )
+    lasers = aqualvs.calibrate_lasers(
+        sorted(files.box.glob("view_*")), dome.rig, box=files.box_file, n_lasers=3, medium="air"
+    )
+    np.testing.assert_allclose(lasers.rig.lens.fx, rig.lens.fx, rtol=1e-6)
+    for found, written in zip(lasers.rig.lasers, rig.lasers, strict=True):
+        np.testing.assert_allclose(found.plane.normal, written.plane.normal, atol=2e-5)
+        assert found.plane.offset == pytest.approx(written.plane.offset, abs=2e-5)
+    assert list(camera.left_out) == ["picture 8"]
+    assert camera.left_out["picture 8"]
+    assert list(camera.residuals_px) == [f"picture {i}" for i in range(8)]
+    assert 0.0 < camera.rms_px < 0.3
+    for one in (camera, dome, lasers):
+        n = len(one.uncertainty.names)
+        assert one.uncertainty.covariance.shape == (n, n)
+        assert np.linalg.eigvalsh(one.uncertainty.covariance).min() > -1e-12
+    assert {"fx", "cx"} < set(camera.uncertainty.names)
+    assert "lens_x" in dome.uncertainty.names
+
+
+def test_the_function_of_the_water_says_what_it_needs(calibrated):
+    out, files, _, _ = calibrated
+    pictures = sorted(files.index.rglob("view_*"))
+    with pytest.raises(aqualvs.AqualvsError, match="the index is known to"):
+        aqualvs.calibrate_water(pictures, files.target, load_rig(out / "rig.yaml"))
+    prior = IndexPrior.seawater(15.0, 35.0, n_air=1.0003)
+    done = aqualvs.calibrate_water(pictures, files.target, out / "rig.yaml", prior=prior)
+    assert "n_water" in done.uncertainty.names
+    assert done.rms_px < 1.0
+    assert len(done.residuals_px) == len(pictures)
