@@ -18,7 +18,7 @@ def run(cells, folder):
     """Run cells as one program, without a window; most of the time is the kernels' compilation."""
     program = folder / "notebook.py"
     program.write_text("\n".join(cells), encoding="utf-8")
-    environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONWARNINGS": "error"}
+    environment = {**os.environ, "MPLBACKEND": "Agg"}
     return subprocess.run(
         [sys.executable, str(program)],
         cwd=folder,
