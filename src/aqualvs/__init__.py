@@ -10,6 +10,11 @@ import os
 # Ctrl-C.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from aqualvs.calibrate.camera import calibrate_camera as calibrate_camera
+    from aqualvs.calibrate.common import Calibration as Calibration
+    from aqualvs.calibrate.dome import calibrate_dome as calibrate_dome
+    from aqualvs.calibrate.lasers import calibrate_lasers as calibrate_lasers
+    from aqualvs.calibrate.water import calibrate_water as calibrate_water
     from aqualvs.errors import AqualvsError as AqualvsError
     from aqualvs.optics.rig import Rig as Rig
     from aqualvs.optics.rigfile import load_rig as load_rig
@@ -21,29 +26,46 @@ if TYPE_CHECKING:
     from aqualvs.scanner import Scanner as Scanner
     from aqualvs.scanner import ScannerOptions as ScannerOptions
     from aqualvs.scanning.posture import Posture as Posture
+    from aqualvs.scanning.posture import Reason as Reason
     from aqualvs.scanning.posture import Refusal as Refusal
     from aqualvs.scanning.scan import Frame as Frame
+    from aqualvs.scanning.scan import Label as Label
     from aqualvs.scanning.scan import Scan as Scan
+    from aqualvs.scanning.scan import ScanPoints as ScanPoints
+    from aqualvs.simulation.calibration_set import CalibrationFiles as CalibrationFiles
+    from aqualvs.simulation.calibration_set import SetSize as SetSize
+    from aqualvs.simulation.calibration_set import simulate_calibration as simulate_calibration
     from aqualvs.sources import open_source as open_source
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "AqualvsError": "aqualvs.errors",
+    "Calibration": "aqualvs.calibrate.common",
+    "CalibrationFiles": "aqualvs.simulation.calibration_set",
     "Frame": "aqualvs.scanning.scan",
+    "Label": "aqualvs.scanning.scan",
     "Posture": "aqualvs.scanning.posture",
+    "Reason": "aqualvs.scanning.posture",
     "Refusal": "aqualvs.scanning.posture",
     "Rig": "aqualvs.optics.rig",
     "RunRequest": "aqualvs.results.run_request",
     "RunResult": "aqualvs.pipeline",
     "Scan": "aqualvs.scanning.scan",
+    "ScanPoints": "aqualvs.scanning.scan",
     "Scanner": "aqualvs.scanner",
     "ScannerOptions": "aqualvs.scanner",
+    "SetSize": "aqualvs.simulation.calibration_set",
+    "calibrate_camera": "aqualvs.calibrate.camera",
+    "calibrate_dome": "aqualvs.calibrate.dome",
+    "calibrate_lasers": "aqualvs.calibrate.lasers",
+    "calibrate_water": "aqualvs.calibrate.water",
     "load_rig": "aqualvs.optics.rigfile",
     "open_source": "aqualvs.sources",
     "read_run": "aqualvs.results.net_survey",
     "run": "aqualvs.pipeline",
     "save_rig": "aqualvs.optics.rigfile",
+    "simulate_calibration": "aqualvs.simulation.calibration_set",
 }
 
 __all__ = sorted(_MODULES)

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+import aqualvs
+from aqualvs.calibration.water_index.state import IndexPrior
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import calibration_commands
 from aqualvs.geometry.transforms import rotvec_from_rotation
@@ -154,3 +156,53 @@ def test_a_damaged_set_changes_the_result(calibrated, tmp_path):
     arguments = [str(files.camera), "--board", str(tmp_path / "board.yaml"), "-o", str(wrong)]
     code = main(["calibrate", "camera", *arguments])
     assert code == 2 or load_rig(wrong, need_lasers=False).lens != load_rig(out / "rig.yaml").lens
+
+
+def test_the_functions_find_what_the_commands_find(calibrated):
+    """The same rig, from pixels in memory, with residuals and reasons by picture."""
+    out, files, _, _ = calibrated
+    rig = load_rig(out / "rig.yaml")
+    paths = sorted(files.camera.glob("view_*"))
+    pictures = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
+    blank = np.full_like(pictures[0], 128)
+    camera = aqualvs.calibrate_camera([*pictures, blank], files.board, nominal=files.nominal)
+    dome = aqualvs.calibrate_dome(
+        sorted(files.dome.glob("view_*")), files.rail_board, camera.rig, poses=files.poses
+    )
+    lasers = aqualvs.calibrate_lasers(
+        sorted(files.box.glob("view_*")), dome.rig, box=files.box_file, n_lasers=3, medium="air"
+    )
+    # A rig file rounds, and the commands hand files on.
+    assert lasers.rig.lens.fx == pytest.approx(
+        rig.lens.fx, abs=0.1 * camera.uncertainty.sigmas["fx"]
+    )
+    for found, figures, written in zip(
+        lasers.rig.lasers, lasers.solution.lasers, rig.lasers, strict=True
+    ):
+        off = np.linalg.norm(found.plane.normal - written.plane.normal)
+        assert off < 0.1 * figures.sigma_normal
+        assert found.plane.offset == pytest.approx(
+            written.plane.offset, abs=0.1 * figures.sigma_offset
+        )
+    assert list(camera.left_out) == ["picture 8"]
+    assert camera.left_out["picture 8"]
+    assert list(camera.residuals_px) == [f"picture {i}" for i in range(8)]
+    assert 0.0 < camera.rms_px < 0.3
+    for one in (camera, dome, lasers):
+        n = len(one.uncertainty.names)
+        assert one.uncertainty.covariance.shape == (n, n)
+        assert np.linalg.eigvalsh(one.uncertainty.covariance).min() > -1e-12
+    assert {"fx", "cx"} < set(camera.uncertainty.names)
+    assert "lens_x" in dome.uncertainty.names
+
+
+def test_the_function_of_the_water_says_what_it_needs(calibrated):
+    out, files, _, _ = calibrated
+    pictures = sorted(files.index.rglob("*.png"))
+    with pytest.raises(aqualvs.AqualvsError, match="the index is known to"):
+        aqualvs.calibrate_water(pictures, files.target, load_rig(out / "rig.yaml"))
+    prior = IndexPrior.seawater(15.0, 35.0, n_air=1.0003)
+    done = aqualvs.calibrate_water(pictures, files.target, out / "rig.yaml", prior=prior)
+    assert "n_water" in done.uncertainty.names
+    assert done.rms_px < 1.0
+    assert len(done.residuals_px) == len(pictures)

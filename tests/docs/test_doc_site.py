@@ -1,11 +1,13 @@
 """The site builds without a network, and no link inside it is dead."""
 
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 
+import aqualvs
 from doc_blocks import ROOT
 
 pytest.importorskip("material", reason="the site needs the dev extra")
@@ -26,6 +28,12 @@ def test_the_site_builds_and_links_hold(tmp_path):
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     assert "aqualvs" in page
+    formulas = (tmp_path / "site" / "mathematics.html").read_text(encoding="utf-8")
+    assert "<mfrac>" in formulas
+    assert "```" not in formulas
+    reference = (tmp_path / "site" / "reference.html").read_text(encoding="utf-8")
+    missing = [name for name in aqualvs.__all__ if f'id="aqualvs.{name}"' not in reference]
+    assert not missing
     # What a page loads comes with it.
     loads = [part.split('"')[0] for part in page.split('src="')[1:]]
     loads += [part.split('href="')[1].split('"')[0] for part in page.split("<link ")[1:]]
@@ -38,6 +46,7 @@ def test_a_dead_link_is_found(tmp_path):
     docs.mkdir()
     (docs / "index.md").write_text("[gone](gone.md)\n", encoding="utf-8")
     config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("nav:\n")[0]
+    shutil.copytree(ROOT / "tools", tmp_path / "tools")
     (tmp_path / "mkdocs.yml").write_text(config, encoding="utf-8")
     done = build(tmp_path / "site", tmp_path / "mkdocs.yml")
     assert done.returncode != 0

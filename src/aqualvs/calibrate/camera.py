@@ -1,5 +1,6 @@
 """`aqualvs calibrate camera`: intrinsics in air, without the dome."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,19 +9,25 @@ import numpy as np
 from aqualvs.calibrate.common import (
     N_LASERS,
     WAVELENGTH_NM,
+    Calibration,
     Found,
     Nominal,
+    Picture,
     Tell,
     corner_residuals,
     corner_rows,
     find_targets,
     finish,
     load_nominal,
+    named,
+    residuals_of,
 )
-from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
+from aqualvs.calibration.camera.calibrate import CameraCalibration
+from aqualvs.calibration.camera.calibrate import camera as solve_camera
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_board
+from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import LensModel
@@ -47,30 +54,79 @@ class CameraRequest:
     n_coefficients: int | None
 
 
-def calibrate_camera(request: CameraRequest, tell: Tell) -> None:
-    """Solve the intrinsics from pictures and write the rig and its report.
+def calibrate_camera(
+    pictures: Sequence[Picture],
+    board: Board | str | Path,
+    *,
+    nominal: Nominal | str | Path | None = None,
+    model: LensModel | str = LensModel.OPENCV,
+    n_coefficients: int | None = None,
+) -> Calibration[CameraCalibration]:
+    """Solve the intrinsics from pictures of a board in air, without the dome.
+
+    Parameters
+    ----------
+    pictures : sequence of str, Path or array
+        Files, or pixels (grey, or blue, green, red), all of one size; the board tilted by 20 to 40
+        degrees in most of them.
+    board : Board, str or Path
+        The board or its file.
+    nominal : Nominal, str or Path, optional
+        What is known of the rig beforehand, or its file: name, dome, number of lasers.
+    model : LensModel or str
+        Distortion model: "opencv" or "fisheye".
+    n_coefficients : int, optional
+        Number of distortion coefficients; by default as many as the pictures support.
+
+    Returns
+    -------
+    Calibration
+        `solution` is a `CameraCalibration`.
 
     Raises
     ------
     AqualvsError
         If a file, a picture or its content cannot be used.
     """
-    check_rig_place(request.out)
-    nominal = Nominal() if request.nominal is None else load_nominal(request.nominal)
-    board = load_board(request.board)
+    known = load_nominal(Path(nominal)) if isinstance(nominal, str | Path) else nominal or Nominal()
+    pattern = board if isinstance(board, Board) else load_board(board)
     found = find_targets(
-        picture_paths(request.images),
-        lambda path, image: detect_board(image, board, path.name),
-        request.board.name,
+        pictures,
+        lambda name, image: detect_board(image, pattern, name),
+        named(board, "the board"),
     )
-    _check_size(found, nominal, request)
-    result = camera(
-        found.views,
-        found.size_px,
-        model=LensModel(request.model),
+    _check_size(found, known, nominal)
+    result = solve_camera(
+        found.views, found.size_px, model=LensModel(model), n_coefficients=n_coefficients
+    )
+    return Calibration(
+        rig=_rig(result, known),
+        uncertainty=result.uncertainty,
+        residuals_px=residuals_of(result.views),
+        left_out={**found.missed, **result.left_out},
+        notes=(*found.notes, *result.findings),
+        solution=result,
+        found=(found,),
+    )
+
+
+def run_camera(request: CameraRequest, tell: Tell) -> None:
+    """Calibrate the camera and write the rig and its report.
+
+    Raises
+    ------
+    AqualvsError
+        As `calibrate_camera`, or if an output cannot be written.
+    """
+    check_rig_place(request.out)
+    done = calibrate_camera(
+        picture_paths(request.images),
+        request.board,
+        nominal=request.nominal,
+        model=request.model,
         n_coefficients=request.n_coefficients,
     )
-    rig = _rig(result, nominal)
+    result, found = done.solution, done.found[0]
     n_pictures = len(found.views) + len(found.missed)
     of = f" of {n_pictures}" if len(result.views) < n_pictures else ""
     tell(
@@ -79,14 +135,15 @@ def calibrate_camera(request: CameraRequest, tell: Tell) -> None:
     )
     for line in (*found.remarks, *result.findings):
         tell(line)
-    finish(rig, _page(rig, result, found, request), request.out, "camera", tell)
+    finish(done.rig, _page(done.rig, result, found, request), request.out, "camera", tell)
 
 
-def _check_size(found: Found, nominal: Nominal, request: CameraRequest) -> None:
+def _check_size(found: Found, nominal: Nominal, source: object) -> None:
     if nominal.size_px is not None and nominal.size_px != found.size_px:
         (w, h), (nw, nh) = found.size_px, nominal.size_px
+        said_by = source if isinstance(source, str | Path) else "the nominal rig"
         raise CalibrationError(
-            f"{found.paths[0]}: {w}x{h} px, but {request.nominal} says {nw}x{nh} px; calibrate at "
+            f"{found.first}: {w}x{h} px, but {said_by} says {nw}x{nh} px; calibrate at "
             "the size that the camera is used at, or correct that file"
         )
 

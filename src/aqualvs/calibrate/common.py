@@ -1,13 +1,15 @@
-"""Common parts of all calibrations: nominal rig, target detection in pictures, output of the rig.
+"""Common parts of all calibrations: nominal rig, target detection in pictures, result, output.
 
 The nominal rig (`load_nominal`) is known before any calibration: name, picture size, dome, lasers.
+`Calibration` is what the functions `calibrate_camera`, `calibrate_dome`, `calibrate_lasers` and
+`calibrate_water` return; the commands of `aqualvs calibrate` write it down.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Generic, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -17,8 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from aqualvs.calibration.solver.result import ViewFit
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, OptionError, RigError
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Dome
-from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
 from aqualvs.report.calibration_material import ResidualMap, ViewRow, missed_rows, residual_map
@@ -157,8 +160,10 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
 
 Tell: TypeAlias = Callable[[str], object]
 Image: TypeAlias = NDArray[np.uint8]
-Detect: TypeAlias = Callable[[Path, Image], View | str]
-"""Finder of a target in a grey picture; returns a clause if there is none."""
+Picture: TypeAlias = str | Path | Image
+"""A picture's file, or its pixels: grey, or blue, green, red."""
+Detect: TypeAlias = Callable[[str, Image], View | str]
+"""Finder of a target in a named grey picture; returns a clause if there is none."""
 
 # Greatest useful number of threads on small pictures.
 _THREADS = 4
@@ -174,30 +179,43 @@ class Found:
     ----------
     views : tuple of View
         Of the pictures in which the target was found.
-    paths : tuple of Path
-        Theirs.
+    pictures : tuple of Picture
+        Those pictures.
     size_px : (int, int)
         Width and height of every picture.
     missed : dict
         Names of pictures in which it was not found, with the reason.
+    pose_notes : tuple of str
+        Remarks on the poses that were given for them.
     """
 
     views: tuple[View, ...]
-    paths: tuple[Path, ...]
+    pictures: tuple[Picture, ...]
     size_px: tuple[int, int]
     missed: dict[str, str]
+    pose_notes: tuple[str, ...] = ()
+
+    @property
+    def first(self) -> str:
+        """File or name of the first picture in which the target was found."""
+        first = self.pictures[0]
+        return str(first) if isinstance(first, str | Path) else self.views[0].name
 
     @property
     def remarks(self) -> list[str]:
         """Warnings."""
         return [
-            *self.notes,
+            *self._detection_notes(),
             *(f"{name}: left out, {why}" for name, why in self.missed.items()),
+            *self.pose_notes,
         ]
 
     @property
     def notes(self) -> list[str]:
-        """Notes on the detection, each with its pictures."""
+        """Notes on the detection, each with its pictures, and on the poses."""
+        return [*self._detection_notes(), *self.pose_notes]
+
+    def _detection_notes(self) -> list[str]:
         names: dict[str, list[str]] = {}
         for view in self.views:
             for note in view.notes:
@@ -210,13 +228,65 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-def find_targets(paths: Sequence[Path], detect: Detect, target: str) -> Found:
+SolutionT = TypeVar("SolutionT")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration(Generic[SolutionT]):
+    """Result of a calibration from pictures.
+
+    Attributes
+    ----------
+    rig : Rig
+        The rig with the solved numbers, their covariance and a note of the step. `save_rig` writes
+        it; the next calibration takes it.
+    uncertainty : RigUncertainty
+        Names of the numbers that the calibration solved or relied on, and their joint covariance.
+    residuals_px : dict
+        By the name of each used picture: measured minus predicted pixels, shape (N, 2), of its
+        corners.
+    left_out : dict
+        By the name of each picture that was not used: the reason.
+    notes : tuple of str
+        Remarks on the pictures and on the result, in plain words.
+    solution : CameraCalibration, DomeCalibration, LaserCalibration or WaterCalibration
+        Details of the solve.
+    found : tuple of Found
+        Targets found, one for each set of pictures.
+    """
+
+    rig: Rig
+    uncertainty: RigUncertainty
+    residuals_px: dict[str, FloatArray]
+    left_out: dict[str, str]
+    notes: tuple[str, ...]
+    solution: SolutionT
+    found: tuple[Found, ...]
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the residuals."""
+        stacked = np.concatenate(list(self.residuals_px.values()))
+        return float(np.sqrt(np.mean(np.sum(stacked**2, axis=1))))
+
+
+def residuals_of(views: Iterable[ViewFit]) -> dict[str, FloatArray]:
+    """Return the residuals of fitted views, by the names of their pictures."""
+    return {view.label: view.residuals for view in views}
+
+
+def all_missed(found: Iterable[Found]) -> dict[str, str]:
+    """Return the pictures of several sets in which no target was found, with the reasons."""
+    return {name: why for one in found for name, why in one.missed.items()}
+
+
+def find_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> Found:
     """Find a target in every picture.
 
     Parameters
     ----------
-    paths : sequence of Path
-        Pictures.
+    pictures : sequence of Picture
+        Files or pixels; pixels are named by their number.
     detect : callable
         Finds the target in one picture.
     target : str
@@ -228,30 +298,50 @@ def find_targets(paths: Sequence[Path], detect: Detect, target: str) -> Found:
         If the target is in none of the pictures, or they differ in size.
     """
     with (
-        progress(f"looking for {target}", len(paths), unit="pictures") as tick,
+        progress(f"looking for {target}", len(pictures), unit="pictures") as tick,
         ThreadPoolExecutor(_THREADS) as pool,
     ):
 
-        def look(path: Path) -> tuple[View | str, tuple[int, int]]:
-            image = read_grey(path)
-            found = detect(path, image)
+        def look(name: str, picture: Picture) -> tuple[View | str, tuple[int, int]]:
+            image = read_grey(picture)
+            found = detect(name, image)
             tick(1)
             return found, (image.shape[1], image.shape[0])
 
-        results = list(pool.map(look, paths))
-    size_px = _common_size(paths, [size for _, size in results])
-    views = [(path, view) for path, (view, _) in zip(paths, results, strict=True)]
-    missed = {path.name: why for path, why in views if isinstance(why, str)}
-    found = [(path, view) for path, view in views if isinstance(view, View)]
+        names = [_name_of(picture, i) for i, picture in enumerate(pictures)]
+        results = list(pool.map(look, names, pictures))
+    if not results:
+        raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
+    size_px = _common_size(
+        [
+            picture if isinstance(picture, str | Path) else name
+            for name, picture in zip(names, pictures, strict=True)
+        ],
+        [size for _, size in results],
+    )
+    views = [view for view, _ in results]
+    missed = {name: why for name, why in zip(names, views, strict=True) if isinstance(why, str)}
+    found = [
+        (one, view) for one, view in zip(pictures, views, strict=True) if isinstance(view, View)
+    ]
     if not found:
         name, why = next(iter(missed.items()))
-        raise CalibrationError(f"{target}: found in none of {len(paths)} pictures; {name}: {why}")
-    return Found(
-        tuple(view for _, view in found), tuple(path for path, _ in found), size_px, missed
-    )
+        raise CalibrationError(
+            f"{target}: found in none of {len(pictures)} pictures; {name}: {why}"
+        )
+    return Found(tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed)
 
 
-def read_grey(path: Path) -> Image:
+def named(target: object, what: str) -> str:
+    """Return the name of a target's file for messages; `what` it is if it was given itself."""
+    return Path(target).name if isinstance(target, str | Path) else what
+
+
+def _name_of(picture: Picture, i: int) -> str:
+    return Path(picture).name if isinstance(picture, str | Path) else f"picture {i}"
+
+
+def read_grey(picture: Picture) -> Image:
     """Read a picture as grey.
 
     Raises
@@ -259,10 +349,12 @@ def read_grey(path: Path) -> Image:
     CalibrationError
         If it is no picture.
     """
-    return _read(path, cv2.IMREAD_GRAYSCALE)
+    if isinstance(picture, str | Path):
+        return _read(Path(picture), cv2.IMREAD_GRAYSCALE)
+    return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
 
 
-def read_colour(path: Path) -> Image:
+def read_colour(picture: Picture) -> Image:
     """Read a picture as blue, green, red.
 
     Raises
@@ -270,10 +362,12 @@ def read_colour(path: Path) -> Image:
     CalibrationError
         If it is no picture.
     """
-    return _read(path, cv2.IMREAD_COLOR)
+    if isinstance(picture, str | Path):
+        return _read(Path(picture), cv2.IMREAD_COLOR)
+    return picture if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
 
 
-def medium_index(word: str | None, rig: Rig, default: float) -> float:
+def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
     """Return the index of `--medium`: "air", "water" (the rig's), or a number.
 
     Raises
@@ -353,7 +447,7 @@ def check_same_size(rig: Rig, found: Found) -> None:
     if found.size_px != rig.size_px:
         (w, h), (rw, rh) = found.size_px, rig.size_px
         raise CalibrationError(
-            f"{found.paths[0]}: {w}x{h} px, but the rig's camera was calibrated at {rw}x{rh} px; "
+            f"{found.first}: {w}x{h} px, but the rig's camera was calibrated at {rw}x{rh} px; "
             "take the pictures at that size, or calibrate the camera again"
         )
 
@@ -367,12 +461,12 @@ def _read(path: Path, how: int) -> Image:
     return image
 
 
-def _common_size(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+def _common_size(names: Sequence[object], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
     usual = max(set(sizes), key=sizes.count)
-    for path, size in zip(paths, sizes, strict=True):
+    for name, size in zip(names, sizes, strict=True):
         if size != usual:
             raise CalibrationError(
-                f"{path}: {size[0]}x{size[1]} px, but the other pictures have "
+                f"{name}: {size[0]}x{size[1]} px, but the other pictures have "
                 f"{usual[0]}x{usual[1]} px; one calibration takes pictures of one size"
             )
     return usual

@@ -5,21 +5,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aqualvs.calibrate.common import (
+    Calibration,
     Found,
+    Picture,
     Tell,
+    all_missed,
     check_same_size,
     corner_residuals,
     corner_rows,
     find_targets,
     finish,
     medium_index,
+    named,
+    residuals_of,
 )
 from aqualvs.calibration.detection.detection import detect_board
-from aqualvs.calibration.dome.calibrate import dome
+from aqualvs.calibration.dome.calibrate import dome as solve_dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
 from aqualvs.calibration.solver.result import DomeCalibration
 from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses, picture_paths
 from aqualvs.calibration.targets.target_files import load_board
+from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import OptionError
 from aqualvs.optics.camera import DOME_PARAMETERS, POSE_PARAMETERS, Dome
 from aqualvs.optics.rig import Rig
@@ -67,53 +73,108 @@ class DomeRequest:
     refine_intrinsics: bool
 
 
-@dataclass(frozen=True, slots=True)
-class _Shots:
-    """One set of pictures with the boards found in them."""
+def calibrate_dome(
+    pictures: Sequence[Picture],
+    board: Board | str | Path,
+    rig: Rig | str | Path,
+    *,
+    poses: str | Path | None = None,
+    medium: str | float = "air",
+    water_pictures: Sequence[Picture] = (),
+    water_board: Board | str | Path | None = None,
+    water_poses: str | Path | None = None,
+    options: DomeOptions | None = None,
+) -> Calibration[DomeCalibration]:
+    """Solve the lens's position in the dome and the camera's rotation, from boards outside it.
 
-    found: Found
-    board_set: BoardSet
-    notes: tuple[str, ...]
+    Parameters
+    ----------
+    pictures : sequence of str, Path or array
+        Files, or pixels (grey, or blue, green, red), of the size that the rig's camera has.
+    board : Board, str or Path
+        The board or its file.
+    rig : Rig, str or Path
+        Rig with intrinsics and a nominal dome, or its file.
+    poses : str or Path, optional
+        File of what is known of the boards' poses: distances, or full poses.
+    medium : str or float
+        Outside of the dome: "air", "water" (the rig's), or an index.
+    water_pictures, water_board, water_poses : optional
+        Further pictures, taken in the rig's water; their board, if it is another one; their poses.
+    options : DomeOptions, optional
+        Tolerances of the dome and of the distances.
 
-
-def calibrate_dome(request: DomeRequest, tell: Tell) -> None:
-    """Solve the dome from pictures and write the rig and its report.
+    Returns
+    -------
+    Calibration
+        `solution` is a `DomeCalibration`.
 
     Raises
     ------
     AqualvsError
         If a file, a picture or its content cannot be used.
     """
-    check_rig_place(request.out)
-    rig = _with_dome(load_rig(request.rig, need_lasers=False), request)
-    shots = _all_shots(request, rig)
-    known = rig_uncertainty(rig)
-    if not set(known.names) & set(rig.lens.parameter_names):
+    before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
+    first = _board_set(pictures, board, poses, before, medium_index(medium, before, before.n_air))
+    sets = [first]
+    if water_pictures:
+        in_water = water_board or board
+        sets.append(_board_set(water_pictures, in_water, water_poses, before, before.n_water))
+    elif water_board is not None or water_poses is not None:
+        raise OptionError("--water-images: missing; --water-board and --water-poses need them")
+    known = rig_uncertainty(before)
+    if not set(known.names) & set(before.lens.parameter_names):
         # Intrinsics that were written by hand are not exact either.
-        given = completed_uncertainty(rig).only(rig.lens.parameter_names)
+        given = completed_uncertainty(before).only(before.lens.parameter_names)
         known = merged(known, given)
-    result = dome(rig, [one.board_set for one in shots], _options(request), known)
-    solved = _noted(rig, result)
-    for line in (*_summary(result, shots), *result.findings):
-        tell(line)
-    finish(
-        solved,
-        _page(rig, solved, result, shots, request),
-        request.out,
-        "dome",
-        tell,
-        comments_of=request.rig,
+    result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
+    found = tuple(one for one, _ in sets)
+    return Calibration(
+        rig=_noted(before, result),
+        uncertainty=result.uncertainty,
+        residuals_px=residuals_of(result.views),
+        left_out={**all_missed(found), **result.left_out},
+        notes=(*(note for one in found for note in one.notes), *result.findings),
+        solution=result,
+        found=found,
     )
 
 
-def _summary(result: DomeCalibration, shots: Sequence[_Shots]) -> list[str]:
+def run_dome(request: DomeRequest, tell: Tell) -> None:
+    """Calibrate the dome and write the rig and its report.
+
+    Raises
+    ------
+    AqualvsError
+        As `calibrate_dome`, or if an output cannot be written.
+    """
+    check_rig_place(request.out)
+    rig = _with_dome(load_rig(request.rig, need_lasers=False), request)
+    done = calibrate_dome(
+        picture_paths(request.images),
+        request.board,
+        rig,
+        poses=request.poses,
+        medium=request.medium,
+        water_pictures=picture_paths(request.water_images) if request.water_images else (),
+        water_board=request.water_board,
+        water_poses=request.water_poses,
+        options=_options(request),
+    )
+    for line in (*_summary(done), *done.solution.findings):
+        tell(line)
+    finish(done.rig, _page(rig, done, request), request.out, "dome", tell, comments_of=request.rig)
+
+
+def _summary(done: Calibration[DomeCalibration]) -> list[str]:
     """Return the numbers of pictures used and left out, the residual and the reasons."""
-    n_pictures = sum(len(one.found.views) + len(one.found.missed) for one in shots)
+    result = done.solution
+    n_pictures = sum(len(one.views) + len(one.missed) for one in done.found)
     used = len(result.views)
     of = f" of {n_pictures}" if used < n_pictures else ""
     return [
         f"{used}{of} pictures, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
-        *(line for one in shots for line in (*one.found.remarks, *one.notes)),
+        *(line for one in done.found for line in one.remarks),
     ]
 
 
@@ -141,31 +202,24 @@ def _options(request: DomeRequest) -> DomeOptions:
     )
 
 
-def _all_shots(request: DomeRequest, rig: Rig) -> list[_Shots]:
-    n_medium = medium_index(request.medium, rig, rig.n_air)
-    first = _shots(request.images, request.board, request.poses, rig, n_medium)
-    if not request.water_images:
-        if request.water_board or request.water_poses:
-            raise OptionError("--water-images: missing; --water-board and --water-poses need them")
-        return [first]
-    board = request.water_board or request.board
-    return [first, _shots(request.water_images, board, request.water_poses, rig, rig.n_water)]
-
-
-def _shots(
-    images: Sequence[str], board_file: Path, poses_file: Path | None, rig: Rig, n_medium: float
-) -> _Shots:
-    board = load_board(board_file)
-    rows = None if poses_file is None else load_poses(poses_file)
-    paths = picture_paths(images)
+def _board_set(
+    pictures: Sequence[Picture],
+    board: Board | str | Path,
+    poses: str | Path | None,
+    rig: Rig,
+    n_medium: float,
+) -> tuple[Found, BoardSet]:
+    """Return the boards found in one set of pictures, as found and as the solver takes them."""
+    pattern = board if isinstance(board, Board) else load_board(board)
+    rows = None if poses is None else load_poses(Path(poses))
     found = find_targets(
-        paths, lambda path, image: detect_board(image, board, path.name), board_file.name
+        pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
     )
     check_same_size(rig, found)
     given: tuple[BoardPose | None, ...] = ()
-    notes: tuple[str, ...] = ()
-    if rows is not None and poses_file is not None:
-        given, notes = match_poses(rows, [view.name for view in found.views], poses_file)
+    if rows is not None and poses is not None:
+        given, notes = match_poses(rows, [view.name for view in found.views], Path(poses))
+        found = replace(found, pose_notes=notes)
     in_air = abs(n_medium - rig.n_air) < 1e-3
     board_set = BoardSet(
         name="air" if in_air else "water",
@@ -174,7 +228,7 @@ def _shots(
         n_medium=n_medium,
         sigma_medium=0.0 if in_air else rig_uncertainty(rig).sigmas.get("n_water", N_WATER),
     )
-    return _Shots(found, board_set, notes)
+    return found, board_set
 
 
 def _noted(rig: Rig, result: DomeCalibration) -> Rig:
@@ -196,9 +250,8 @@ def _noted(rig: Rig, result: DomeCalibration) -> Rig:
     return with_uncertainty(with_step(result.rig, "dome", step), uncertainty)
 
 
-def _page(
-    before: Rig, rig: Rig, result: DomeCalibration, shots: list[_Shots], request: DomeRequest
-) -> CalibrationPage:
+def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest) -> CalibrationPage:
+    rig, result = done.rig, done.solution
     sigmas = result.uncertainty.sigmas
     lens = rig.dome_from_cam.translation
     cards = [
@@ -219,15 +272,14 @@ def _page(
                 f"a bare lens: {held.bare_rms_px:.2f} px",
             )
         )
-    missed = {name: why for one in shots for name, why in one.found.missed.items()}
     dome_names = [name for name in DOME_PARAMETERS if name in sigmas]
     return CalibrationPage(
         title="Calibration of the dome",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),
         warnings=(
-            *(f"{name}: {why}" for name, why in {**missed, **result.left_out}.items()),
-            *(note for one in shots for note in (*one.found.notes, *one.notes)),
+            *(f"{name}: {why}" for name, why in done.left_out.items()),
+            *(note for one in done.found for note in one.notes),
         ),
         words=result.findings,
         expectations=expectations(rig),
@@ -238,7 +290,7 @@ def _page(
             before,
         ),
         residual_maps=(corner_residuals(result.views, rig.size_px),),
-        views=corner_rows(result.views, {**missed, **result.left_out}),
+        views=corner_rows(result.views, done.left_out),
         facts=facts(
             ("rig before", str(request.rig)),
             ("board", str(request.board)),

@@ -10,13 +10,16 @@ import numpy as np
 from aqualvs.calibrate.common import (
     N_LASERS,
     WAVELENGTH_NM,
+    Calibration,
     Found,
+    Picture,
     Tell,
     check_same_size,
     common_wavelength,
     find_targets,
     finish,
     medium_index,
+    named,
     read_colour,
 )
 from aqualvs.calibration.detection.detection import detect_board, detect_markers
@@ -32,7 +35,7 @@ from aqualvs.calibration.lasers.stripes_on_planes import (
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_board, load_box
-from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.targets.targets import Board, MarkerSet, View
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
@@ -90,51 +93,149 @@ class LasersRequest:
 class _Target:
     """Target that the lasers shine on."""
 
-    file: Path
+    name: str
     surfaces: TargetSurfaces
     found: Found
     n_medium: float
 
 
-def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
-    """Solve the lasers from pictures and write the rig and its report.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LasersResult(Calibration[LaserCalibration]):
+    """Result of `calibrate_lasers`.
+
+    Attributes
+    ----------
+    n_medium : float
+        Index outside of the dome in the pictures.
+    views : tuple of LaserView
+        Corners and stripes of every picture in which the target was found.
+    """
+
+    n_medium: float
+    views: tuple[LaserView, ...]
+
+
+def calibrate_lasers(
+    pictures: Sequence[Picture],
+    rig: Rig | str | Path,
+    *,
+    box: MarkerSet | str | Path | None = None,
+    board: Board | str | Path | None = None,
+    medium: str | float | None = None,
+    n_lasers: int | None = None,
+    names: Sequence[str] | None = None,
+    board_offset: float = 0.0,
+    refine: bool = False,
+    wavelength_nm: float | None = None,
+) -> LasersResult:
+    """Solve the lasers' planes from pictures of a box or board that they shine on.
+
+    Parameters
+    ----------
+    pictures : sequence of str, Path or array
+        Files, or pixels (blue, green, red), of the size that the rig's camera has.
+    rig : Rig, str or Path
+        Rig with camera and dome, or its file; its lasers, if any, give names and order.
+    box : MarkerSet, str or Path, optional
+        Markers with the planes that they and the stripes are on, or their file.
+    board : Board, str or Path, optional
+        Instead of a box: the board on the surface that the stripes are on, or its file.
+    medium : str, float or None
+        Outside of the dome: "air", "water" (the rig's), or an index; None for what the box's file
+        says, else the rig's water.
+    n_lasers : int, optional
+        Number of lasers that shine; by default the rig's.
+    names : sequence of str, optional
+        Names of the lasers.
+    board_offset : float
+        Thickness of the board above the surface, in metres.
+    refine : bool
+        Whether the camera's uncertain numbers are solved too.
+    wavelength_nm : float, optional
+        Of the lasers; by default what the rig says.
+
+    Returns
+    -------
+    LasersResult
+        `solution` is a `LaserCalibration`.
 
     Raises
     ------
     AqualvsError
         If a file, a picture or its content cannot be used.
     """
-    check_rig_place(request.out)
-    before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
-    wavelength_nm = _wavelength(request, before)
-    target = _target(request, before)
-    check_same_size(before, target.found)
-    views = [
-        LaserView(view, _stripes(path, view.name, wavelength_nm))
-        for view, path in zip(target.found.views, target.found.paths, strict=True)
-    ]
-    in_air = abs(target.n_medium - before.n_air) < 1e-3
+    before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
+    before = _coloured(before, wavelength_nm)
+    colour_nm = _wavelength(wavelength_nm, before)
+    seen = _target(pictures, before, box, board, medium, board_offset)
+    check_same_size(before, seen.found)
+    views = tuple(
+        LaserView(view, _stripes(picture, view.name, colour_nm))
+        for view, picture in zip(seen.found.views, seen.found.pictures, strict=True)
+    )
+    in_air = abs(seen.n_medium - before.n_air) < 1e-3
+    elsewhere = in_air or medium is not None
+    expected = len(names) if n_lasers is None and names is not None else n_lasers
     result = solve_lasers(
         before,
         views,
-        target.surfaces,
+        seen.surfaces,
         options=LaserOptions(
-            n_lasers=_expected(request, before),
-            n_medium=target.n_medium if in_air or request.medium else None,
-            refine=request.refine,
+            n_lasers=_noted_count(before) if expected is None else expected,
+            n_medium=seen.n_medium if elsewhere else None,
+            refine=refine,
         ),
-        uncertainty=_known(before, request, in_air=in_air),
+        uncertainty=_known(before, refine=refine, elsewhere=elsewhere),
     )
     if len(result.lasers) != len(before.lasers):
-        result = replace(result, rig=_coloured(result.rig, wavelength_nm))
-    rig = _noted(before, result, request, target)
-    for warning in result.warnings:
+        result = replace(result, rig=_coloured(result.rig, colour_nm))
+    solved = _noted(before, result, seen)
+    return LasersResult(
+        rig=solved if names is None else _with_names(solved, names),
+        uncertainty=result.uncertainty,
+        residuals_px={one.name: one.corner_residuals_px for one in result.views},
+        left_out={
+            **seen.found.missed,
+            **{name: why for name, _, why in (one.partition(": ") for one in result.left_out)},
+        },
+        notes=(*seen.found.notes, *result.warnings),
+        solution=result,
+        found=(seen.found,),
+        n_medium=seen.n_medium,
+        views=views,
+    )
+
+
+def run_lasers(request: LasersRequest, tell: Tell) -> None:
+    """Calibrate the lasers and write the rig and its report.
+
+    Raises
+    ------
+    AqualvsError
+        As `calibrate_lasers`, or if an output cannot be written.
+    """
+    check_rig_place(request.out)
+    before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
+    _wavelength(request.wavelength_nm, before)
+    done = calibrate_lasers(
+        picture_paths(request.images),
+        before,
+        box=request.box,
+        board=request.board,
+        medium=request.medium,
+        n_lasers=request.n_lasers,
+        names=request.names,
+        board_offset=request.board_offset_mm / 1e3,
+        refine=request.refine,
+        wavelength_nm=request.wavelength_nm,
+    )
+    for warning in done.solution.warnings:
         tell(f"note: {warning}")
-    for figures, laser in zip(result.lasers, rig.lasers, strict=True):
+    for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         tell(_words(figures, laser))
     finish(
-        rig,
-        _page(before, rig, result, target, views, request),
+        done.rig,
+        _page(before, done, request),
         request.out,
         "lasers",
         tell,
@@ -142,17 +243,16 @@ def calibrate_lasers(request: LasersRequest, tell: Tell) -> None:
     )
 
 
-def _known(rig: Rig, request: LasersRequest, *, in_air: bool) -> RigUncertainty:
+def _known(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
     """Return the camera's uncertainty, with defaults for numbers that were written by hand.
 
     This makes lasers and camera correlated, as they are found together. Priors of a refinement are
     the rig's own only, and an index that is only assumed is left to the water of the dive.
     """
     own = rig_uncertainty(rig)
-    if request.refine:
+    if refine:
         return own
     known = completed_uncertainty(rig)
-    elsewhere = in_air or request.medium is not None
     left_out = {"n_water"} - set(own.names) if elsewhere else set()
     return known.only([name for name in known.names if name not in left_out])
 
@@ -166,9 +266,8 @@ def _coloured(rig: Rig, wavelength_nm: float | None) -> Rig:
     )
 
 
-def _wavelength(request: LasersRequest, rig: Rig) -> float | None:
+def _wavelength(given: float | None, rig: Rig) -> float | None:
     """Return the lasers' wavelength in nanometres from the first source that gives it."""
-    given = request.wavelength_nm
     if given is not None and not LASER_NM[0] <= given <= LASER_NM[1]:
         raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
     noted = rig.solved_from.get(WAVELENGTH_NM)
@@ -177,37 +276,35 @@ def _wavelength(request: LasersRequest, rig: Rig) -> float | None:
     return common_wavelength(rig.lasers) if given is None else given
 
 
-def _expected(request: LasersRequest, rig: Rig) -> int | None:
-    """Return the number of lasers by request or by the rig's notes; None for the rig's own."""
-    if request.n_lasers is not None:
-        return request.n_lasers
-    if request.names is not None:
-        return len(request.names)
+def _noted_count(rig: Rig) -> int | None:
+    """Return the number of lasers by the rig's notes; None for the rig's own."""
     noted = rig.solved_from.get(N_LASERS)
     return noted if isinstance(noted, int) and not rig.lasers else None
 
 
-def _target(request: LasersRequest, rig: Rig) -> _Target:
-    paths = picture_paths(request.images)
-    if (request.box is None) == (request.board is None):
+def _target(
+    pictures: Sequence[Picture],
+    rig: Rig,
+    box: MarkerSet | str | Path | None,
+    board: Board | str | Path | None,
+    medium: str | float | None,
+    board_offset: float,
+) -> _Target:
+    if (box is None) == (board is None):
         raise OptionError("--box or --board: give one of them, the file of what the lasers hit")
-    if request.box is not None:
-        markers, n_nominal = load_box(request.box)
+    if box is not None:
+        markers, n_nominal = (box, None) if isinstance(box, MarkerSet) else load_box(box)
+        name = named(box, "the box")
         surfaces = box_surfaces(markers.planes, markers.points())
         default = rig.n_water if n_nominal is None else _nearer(n_nominal, rig)
-        found = find_targets(
-            paths, lambda path, image: detect_markers(image, markers, path.name), request.box.name
-        )
-        n_medium = medium_index(request.medium, rig, default)
-        return _Target(request.box, surfaces, found, n_medium)
-    assert request.board is not None
-    board = load_board(request.board)
-    found = find_targets(
-        paths, lambda path, image: detect_board(image, board, path.name), request.board.name
-    )
-    n_medium = medium_index(request.medium, rig, rig.n_water)
-    surface = board_surface(thickness=request.board_offset_mm / 1e3)
-    return _Target(request.board, surface, found, n_medium)
+        found = find_targets(pictures, lambda one, image: detect_markers(image, markers, one), name)
+        return _Target(name, surfaces, found, medium_index(medium, rig, default))
+    assert board is not None
+    pattern = board if isinstance(board, Board) else load_board(board)
+    name = named(board, "the board")
+    found = find_targets(pictures, lambda one, image: detect_board(image, pattern, one), name)
+    n_medium = medium_index(medium, rig, rig.n_water)
+    return _Target(name, board_surface(thickness=board_offset), found, n_medium)
 
 
 def _nearer(n_nominal: float, rig: Rig) -> float:
@@ -215,14 +312,12 @@ def _nearer(n_nominal: float, rig: Rig) -> float:
     return min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
 
 
-def _stripes(path: Path, name: str, wavelength_nm: float | None) -> StripePoints:
-    found = find_stripes(read_colour(path), WholePictureOptions(wavelength_nm=wavelength_nm))
+def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:
+    found = find_stripes(read_colour(picture), WholePictureOptions(wavelength_nm=wavelength_nm))
     return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
 
 
-def _noted(before: Rig, result: LaserCalibration, request: LasersRequest, target: _Target) -> Rig:
-    names = request.names
-    lasers = result.rig.lasers
+def _noted(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
     old = rig_uncertainty(before)
     assumed = [name for name in result.uncertainty.names if ":" not in name]
     assumed = [file_parameter_name(name) for name in assumed if name not in old.names]
@@ -231,7 +326,7 @@ def _noted(before: Rig, result: LaserCalibration, request: LasersRequest, target
         points=sum(figures.n_points for figures in result.lasers),
         rms_px=float(np.sqrt(np.mean([figures.rms_px**2 for figures in result.lasers]))),
         extras={
-            "target": target.file.name,
+            "target": target.name,
             "n_medium": round(target.n_medium, 6),
             "surfaces": sorted({s for figures in result.lasers for s in figures.surfaces}),
             "refined": result.refined,
@@ -239,15 +334,17 @@ def _noted(before: Rig, result: LaserCalibration, request: LasersRequest, target
         },
     )
     noted = with_step(result.rig, "lasers", step)
-    noted = with_uncertainty(noted, merged(old, result.uncertainty))
-    if names is None:
-        return noted
+    return with_uncertainty(noted, merged(old, result.uncertainty))
+
+
+def _with_names(rig: Rig, names: Sequence[str]) -> Rig:
+    lasers = rig.lasers
     if len(names) != len(lasers) or len(set(names)) != len(names):
         raise OptionError(
             f"--names {','.join(names)}: {len(names)} for {len(lasers)} lasers; give each a name "
             "of its own"
         )
-    return _renamed(noted, names)
+    return _renamed(rig, names)
 
 
 def _renamed(rig: Rig, names: Sequence[str]) -> Rig:
@@ -296,14 +393,10 @@ def _moved(laser: Laser, before: Rig) -> str:
     return f"{_DEG * math.acos(min(cosine, 1.0)):.3f}°, {shift:+.2f} mm"
 
 
-def _page(
-    before: Rig,
-    rig: Rig,
-    result: LaserCalibration,
-    target: _Target,
-    views: Sequence[LaserView],
-    request: LasersRequest,
-) -> CalibrationPage:
+def _page(before: Rig, done: LasersResult, request: LasersRequest) -> CalibrationPage:
+    rig, result, found = done.rig, done.solution, done.found[0]
+    target = request.box or request.board
+    assert target is not None
     used = {one.name for one in result.views}
     rows = [
         ViewRow(
@@ -319,7 +412,7 @@ def _page(
     worst = max(figures.sigma_normal for figures in result.lasers)
     return CalibrationPage(
         title="Calibration of the lasers",
-        subtitle=f"Rig “{rig.name}”, {target.file.name}, index outside {target.n_medium:.4f}",
+        subtitle=f"Rig “{rig.name}”, {target.name}, index outside {done.n_medium:.4f}",
         cards=(
             Card("lasers", str(len(rig.lasers)), f"in {len(result.views)} pictures"),
             Card("normals known to", f"{_DEG * worst:.3f}°", "one sigma, the worst laser"),
@@ -329,7 +422,7 @@ def _page(
                 "rms residual, the worst laser",
             ),
         ),
-        warnings=(*result.warnings, *result.left_out, *target.found.remarks),
+        warnings=(*result.warnings, *result.left_out, *found.remarks),
         words=tuple(
             _words(figures, laser) for figures, laser in zip(result.lasers, rig.lasers, strict=True)
         ),
@@ -348,13 +441,13 @@ def _page(
                 [one.corner_inliers for one in result.views],
             ),
         ),
-        views=(*rows, *missed_rows(target.found.missed)),
+        views=(*rows, *missed_rows(found.missed)),
         pictures=tuple(
-            _shot(view, path)
-            for view, path in zip(views, target.found.paths, strict=True)
+            _shot(view, picture)
+            for view, picture in zip(done.views, found.pictures, strict=True)
             if view.view.name in used
         )[:_SHOTS],
-        facts=facts(("rig before", str(request.rig)), ("target", str(target.file))),
+        facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
 
 
@@ -368,10 +461,10 @@ def _corners_of(name: str, pixels: FloatArray) -> View:
     return View(name, np.arange(len(pixels)), np.zeros((len(pixels), 3)), pixels)
 
 
-def _shot(view: LaserView, path: Path) -> PictureShot:
+def _shot(view: LaserView, picture: Picture) -> PictureShot:
     return PictureShot(
         caption=view.view.name,
-        image=read_colour(path),
+        image=read_colour(picture),
         points=(
             Overlay(pixels=view.view.pixels, colour="#ff9800", kind="circle", label="corners"),
             Overlay(

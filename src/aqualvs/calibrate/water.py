@@ -1,12 +1,21 @@
 """`aqualvs calibrate water`: the index of the water, from a target fixed on the vehicle."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from aqualvs.calibrate.common import Tell, finish
+from aqualvs.calibrate.common import (
+    Calibration,
+    Found,
+    Picture,
+    Tell,
+    check_same_size,
+    find_targets,
+    finish,
+    named,
+)
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_target
@@ -35,7 +44,7 @@ from aqualvs.report.html import Card
 from aqualvs.results.run_request import check_fits
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
-from aqualvs.terminal import Tick, progress
+from aqualvs.terminal import progress
 
 _FPS = 25.0
 
@@ -55,48 +64,128 @@ class WaterRequest:
     turn_sigma_deg: float
 
 
-def calibrate_water(request: WaterRequest, tell: Tell) -> None:
-    """Estimate the index and write the rig in that water, and its report.
+def calibrate_water(
+    pictures: Sequence[Picture] | FrameSource,
+    target: MarkerSet | str | Path,
+    rig: Rig | str | Path,
+    *,
+    prior: IndexPrior | None = None,
+    options: IndexOptions | None = None,
+) -> Calibration[WaterCalibration]:
+    """Estimate the water's index from pictures of markers that are fixed to the vehicle.
+
+    Parameters
+    ----------
+    pictures : sequence of str, Path or array, or FrameSource
+        Files, pixels (grey, or blue, green, red), or an opened video, of the size that the rig's
+        camera has. A source's frames have times, so that changes of the index are followed.
+    target : MarkerSet, str or Path
+        Markers in the dome's frame, or their file.
+    rig : Rig, str or Path
+        Rig with camera and dome, or its file.
+    prior : IndexPrior, optional
+        What is known of the index beforehand, such as `IndexPrior.seawater`.
+    options : IndexOptions, optional
+        Assumptions about the target's fixing and the water.
+
+    Returns
+    -------
+    Calibration
+        `solution` is a `WaterCalibration`.
 
     Raises
     ------
     AqualvsError
         If a file, a picture or its content cannot be used.
     """
-    check_rig_place(request.out)
-    rig = load_rig(request.rig, need_lasers=False)
-    markers = load_target(request.target)
-    prior = _prior(request, rig)
-    with _source(request) as source:
-        check_fits(source, rig)
-        with progress(f"looking for {request.target.name}", source.n_frames) as tick:
-            shots = list(_shots(source, markers, tick))
-    if not shots:
-        raise CalibrationError(
-            f"{request.target}: its markers are in no picture of {' '.join(request.source[:3])}; "
-            "check its family and ids, and that the camera sees the target sharp"
+    before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
+    markers = target if isinstance(target, MarkerSet) else load_target(target)
+    if isinstance(pictures, Sequence):
+        found = find_targets(
+            pictures,
+            lambda name, image: detect_markers(image, markers, name),
+            named(target, "the target"),
         )
+        check_same_size(before, found)
+        times = None
+    else:
+        found, times = _found_in(pictures, markers, before, target)
     result = solve_water(
-        rig,
-        [view for _, view in shots],
-        [time_s for time_s, _ in shots],
-        uncertainty=rig_uncertainty(rig),
+        before,
+        found.views,
+        times,
+        uncertainty=rig_uncertainty(before),
         prior=prior,
-        options=IndexOptions.of_target(request.place_sigma_mm, request.turn_sigma_deg),
+        options=options or IndexOptions(),
     )
     _check(result)
-    solved = _noted(rig, result)
-    tell(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(shots)} pictures")
-    for line in (*result.remarks, *(step.text() for step in result.steps)):
+    return Calibration(
+        rig=_noted(before, result),
+        uncertainty=result.uncertainty,
+        residuals_px=result.residuals,
+        left_out={**found.missed, **{one.name: one.refused for one in result.readings if not one}},
+        notes=(*found.notes, *result.remarks, *(step.text() for step in result.steps)),
+        solution=result,
+        found=(found,),
+    )
+
+
+def run_water(request: WaterRequest, tell: Tell) -> None:
+    """Calibrate the water's index and write the rig in that water, and its report.
+
+    Raises
+    ------
+    AqualvsError
+        As `calibrate_water`, or if an output cannot be written.
+    """
+    check_rig_place(request.out)
+    rig = load_rig(request.rig, need_lasers=False)
+    prior = _prior(request, rig)
+    with _source(request) as source:
+        done = calibrate_water(
+            source,
+            request.target,
+            rig,
+            prior=prior,
+            options=IndexOptions.of_target(request.place_sigma_mm, request.turn_sigma_deg),
+        )
+    result = done.solution
+    tell(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(result.readings)} pictures")
+    for line in done.notes:
         tell(line)
     finish(
-        solved,
-        _page(solved, result, prior, request),
+        done.rig,
+        _page(done.rig, result, prior, request),
         request.out,
         "water",
         tell,
         comments_of=request.rig,
     )
+
+
+def _found_in(
+    source: FrameSource, markers: MarkerSet, rig: Rig, target: object
+) -> tuple[Found, list[float]]:
+    """Return the markers found in the frames of a source, and the times of those frames."""
+    check_fits(source, rig)
+    name = named(target, "the target")
+    views, times, missed = [], [], {}
+    with progress(f"looking for {name}", source.n_frames) as tick:
+        for frame in source:
+            image = np.ascontiguousarray(frame.luma)
+            view = detect_markers(image, markers, f"frame {frame.index}")
+            if isinstance(view, View):
+                views.append(view)
+                times.append(frame.time_s)
+            else:
+                missed[f"frame {frame.index}"] = view
+            tick(1)
+    if not views:
+        raise CalibrationError(
+            f"{target if isinstance(target, str | Path) else name}: its markers are in no picture "
+            f"of {source.name}; check its family and ids, and that the camera sees the target sharp"
+        )
+    return Found(tuple(views), (), rig.size_px, missed), times
 
 
 def _check(result: WaterCalibration) -> None:
@@ -124,14 +213,6 @@ def _source(request: WaterRequest) -> FrameSource:
         return ImageSource(picture_paths(request.source), fps=request.fps or _FPS)
     fps = request.fps or (_FPS if Path(only).is_dir() else None)
     return open_source(only, fps=fps)
-
-
-def _shots(source: FrameSource, markers: MarkerSet, tick: Tick) -> Iterator[tuple[float, View]]:
-    for frame in source:
-        found = detect_markers(np.ascontiguousarray(frame.luma), markers, f"frame {frame.index}")
-        if isinstance(found, View):
-            yield frame.time_s, found
-        tick(1)
 
 
 def _noted(rig: Rig, result: WaterCalibration) -> Rig:

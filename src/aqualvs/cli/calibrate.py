@@ -69,7 +69,7 @@ def camera(
     """Calibrate the camera."""
     from aqualvs.calibrate import camera as body
 
-    body.calibrate_camera(
+    body.run_camera(
         body.CameraRequest(
             images=tuple(images),
             board=board,
@@ -145,7 +145,7 @@ def dome(
     """Calibrate the dome."""
     from aqualvs.calibrate import dome as body
 
-    body.calibrate_dome(
+    body.run_dome(
         body.DomeRequest(
             images=tuple(images),
             board=board,
@@ -214,7 +214,7 @@ def lasers(
     """Calibrate the lasers."""
     from aqualvs.calibrate import lasers as body
 
-    body.calibrate_lasers(
+    body.run_lasers(
         body.LasersRequest(
             images=tuple(images),
             rig=rig,
@@ -262,7 +262,7 @@ def water(
     """Calibrate the water."""
     from aqualvs.calibrate import water as body
 
-    body.calibrate_water(
+    body.run_water(
         body.WaterRequest(
             source=tuple(source),
             target=target,

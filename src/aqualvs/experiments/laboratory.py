@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from aqualvs.calibrate.camera import CameraRequest, calibrate_camera
-from aqualvs.calibrate.dome import DomeRequest, calibrate_dome
-from aqualvs.calibrate.lasers import LasersRequest, calibrate_lasers
+from aqualvs.calibrate.camera import CameraRequest, run_camera
+from aqualvs.calibrate.dome import DomeRequest, run_dome
+from aqualvs.calibrate.lasers import LasersRequest, run_lasers
 from aqualvs.experiments.experiment import DataColumns, ExperimentRow
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
@@ -435,7 +435,7 @@ def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:
 
 
 def _camera(files: CalibrationFiles, rig: Path) -> None:
-    calibrate_camera(
+    run_camera(
         CameraRequest(
             images=(str(files.camera),),
             board=files.board,
@@ -449,7 +449,7 @@ def _camera(files: CalibrationFiles, rig: Path) -> None:
 
 
 def _dome(files: CalibrationFiles, rig: Path) -> None:
-    calibrate_dome(
+    run_dome(
         DomeRequest(
             images=(str(files.dome),),
             board=files.rail_board,
@@ -474,7 +474,7 @@ def _dome(files: CalibrationFiles, rig: Path) -> None:
 
 
 def _lasers(files: CalibrationFiles, draft: Path, rig: Path, n_lasers: int) -> None:
-    calibrate_lasers(
+    run_lasers(
         LasersRequest(
             images=(str(files.box),),
             rig=draft,

@@ -435,6 +435,9 @@ class WaterCalibration:
         Estimate after each picture.
     rms_px : float
         Root mean square residual of the used corners.
+    residuals : dict
+        By the name of each used picture: measured minus predicted pixels (M, 2) by the last
+        estimate.
     remarks : tuple of str
         Remarks for the user, one sentence each.
     """
@@ -447,6 +450,7 @@ class WaterCalibration:
     steps: tuple[IndexStep, ...]
     readings: tuple[IndexReading, ...] = field(repr=False)
     rms_px: float
+    residuals: dict[str, FloatArray] = field(repr=False)
     remarks: tuple[str, ...]
 
     @property
@@ -509,6 +513,11 @@ def calibrate_water(
         steps=tuple(estimator.steps),
         readings=readings,
         rms_px=_rms(readings),
+        residuals={
+            view.name: estimator.residuals(view)
+            for view, reading in zip(views, readings, strict=True)
+            if reading
+        },
         remarks=last.remarks,
     )
 
