@@ -17,19 +17,24 @@ setup: $(STAMP) ## Make .venv with the package and the tools of developers
 demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
 	$(BIN)/aqualvs demo -o out/demo --overwrite
 
-# Three files at a time: on two cores, one that works while others wait. In the order of the folders,
-# since the longest files are those of cli, docs and recovery; by their number of tests, which is
-# what xdist would go by, files of few and long tests would be left to the end.
-test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one folder (PART=cli)
+# Three files at a time: on two cores, one that works while others wait. In the order of
+# tests/conftest.py, not by their number of tests: files of few and long tests would be left to the
+# end.
+PARTS := $(filter-out helpers data,$(patsubst tests/%/,%,$(wildcard tests/*/))) \
+  $(patsubst tests/test_%.py,%,$(wildcard tests/test_*.py))
+FILES = $(wildcard tests/$(PART)/test_*.py tests/$(PART)/*/test_*.py tests/test_$(PART).py)
+
+test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one part (PART=scanning)
+	$(if $(PART),$(if $(FILES),,$(error no tests of `$(PART)`; parts are: $(sort $(PARTS)))))
 	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
 	  --durations=30 --durations-min=5 \
-	  $(if $(PART),tests/$(PART))
+	  $(if $(PART),$(FILES))
 
 fuzz: $(STAMP) ## Try 2,000 malformed files and options (SEED=1 CASES=2000); lists what is not refused
-	PYTHONPATH=tests $(BIN)/python tests/fuzz_cases.py --seed $(or $(SEED),1) --cases $(or $(CASES),2000)
+	PYTHONPATH=tests/helpers:. $(BIN)/python tests/helpers/fuzz_cases.py --seed $(or $(SEED),1) --cases $(or $(CASES),2000)
 
 kills: $(STAMP) ## Kill run, batch, live and follow at 100 random moments (SEED=1 CASES=100)
-	PYTHONPATH=tests $(BIN)/python tests/kill_cases.py --seed $(or $(SEED),1) --kills $(or $(CASES),100)
+	PYTHONPATH=tests/helpers:. $(BIN)/python tests/helpers/kill_cases.py --seed $(or $(SEED),1) --kills $(or $(CASES),100)
 
 lint: $(STAMP) ## Check style, types and the direction of imports
 	$(BIN)/ruff check $(CODE)

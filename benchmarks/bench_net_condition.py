@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from tests.net_cases import NetCamera
-from tests.net_dives import (
+from tests.helpers.net_cases import NetCamera
+from tests.helpers.net_dives import (
     Dive,
     long_dive,
     passed_holes,
@@ -23,7 +23,7 @@ from tests.net_dives import (
     shown_holes,
     true_solidity,
 )
-from tests.quick_pictures import quick_scans
+from tests.helpers.quick_pictures import quick_scans
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.condition import NetCondition, NetStretch

@@ -5,6 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from repository import ROOT
+
+# Folders of the longest tests.
+LONG = ("recovery", "cli", "docs")
+
 # As the command line does it, and before any test imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -12,8 +17,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 @pytest.fixture(scope="session")
 def samples() -> Path:
     """Folder of the independently rendered samples; skips where they are absent."""
-    default = Path(__file__).resolve().parents[2] / "shared" / "samples"
+    default = ROOT.parent / "shared" / "samples"
     folder = Path(os.environ.get("AQUALVS_SAMPLES", default))
     if not folder.is_dir():
         pytest.skip(f"no independent samples at {folder} (set AQUALVS_SAMPLES)")
     return folder
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put long files first: of several processes, none is left with one at the end."""
+    long = [ROOT / "tests" / name for name in LONG]
+    items.sort(key=lambda item: not any(item.path.is_relative_to(folder) for folder in long))

@@ -1,6 +1,6 @@
 """The command `aqualvs run`: from a dive to posture, points and report.
 
-`agreement_of` sets up the check of the lasers against each other during the run.
+`run` is the whole way; `open_dive` and `summary_for` are shared with `aqualvs batch`.
 """
 
 import time
@@ -9,11 +9,12 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from aqualvs.closing import Closing
 from aqualvs.errors import AqualvsError, OptionError, RigError, SourceError
 from aqualvs.nets.target_file import net_check
 from aqualvs.optics.rig import Rig
 from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig
-from aqualvs.results.summary import Tally, TruthComparison, read_truth
+from aqualvs.results.summary import RunSummary, TruthComparison, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, open_source
@@ -24,31 +25,8 @@ from aqualvs.workers.replay import Replay, replay_of
 from aqualvs.workers.run_frames import RunMeasuring
 from aqualvs.workers.water_index import WaterFollowingScanner
 
-
-def agreement_of(rig: Rig, path: Path) -> LaserAgreement | None:
-    """Return the check of a rig's lasers against each other, None if there is nothing to check.
-
-    One laser agrees with itself; and where refraction at the dome is left out, the lasers disagree
-    for that reason alone.
-
-    Parameters
-    ----------
-    rig : Rig
-        As the run uses it.
-    path : Path
-        Its file, for messages.
-
-    Raises
-    ------
-    RigError
-        If the rig's uncertainty cannot be parsed.
-    """
-    if len(rig.lasers) < 2:
-        return None
-    try:
-        return LaserAgreement(rig)
-    except RigError as error:
-        raise RigError(f"{path}: {error}") from None
+ScannerFor = Callable[[Rig, ScannerOptions], ScansFrames]
+"""Constructor of a scanner."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,13 +39,9 @@ class RunResult:
         0, or 128 + signal.
     stopped_by : str
         Name of the signal that stopped it, or empty.
-    tally : Tally
-    dome_lines : list of str
-        Effect of the dome model, as lines of text.
-    water_lines : list of str
-        Result for the water's index, as lines of text; empty where it was given.
-    net_lines : list of str
-        State of the net, as lines of text; empty if not requested.
+    summary : RunSummary
+    lines : list of str
+        Results on the water's index, the dome's effect and the net, as far as requested.
     elapsed_s : float
         From the first frame to the complete folder, without the report.
     report : Path or None
@@ -78,21 +52,15 @@ class RunResult:
 
     exit_code: int
     stopped_by: str
-    tally: Tally
-    dome_lines: list[str]
-    water_lines: list[str]
-    net_lines: list[str]
+    summary: RunSummary
+    lines: list[str]
     elapsed_s: float
     report: Path | None
     comparison: TruthComparison | None
     fault: AqualvsError | None
 
 
-def run(
-    request: RunRequest,
-    *,
-    scanner_for: Callable[[Rig, ScannerOptions], ScansFrames] = Scanner,
-) -> RunResult:
+def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
     """Run a dive and write its folder.
 
     A source that breaks off is no exception but the result's `fault`: what came before it has been
@@ -103,52 +71,45 @@ def run(
     AqualvsError
         If an input cannot be used, or an output not be written; what exists stays readable.
     """
-    replay = _replay(request)
-    if replay is None:
-        rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)
-    else:
-        rig, request = replay.rig, replace(request, scanner=replay.options)
-    if request.truth is not None:
-        read_truth(request.truth)
-    fault: AqualvsError | None = None
-    with replay or open_source(request.source, fps=request.fps) as source:
-        check_fits(source, rig)
-        alone = replay is not None or scanner_for is not Scanner
-        work = None if alone else _crew_work(request, source, rig)
-        with RunMeasuring(source, rig, request.frames, work, request.n_processes) as measuring:
-            # While other processes measure the first frames, this one gets ready to write.
-            from aqualvs import run_outputs as folder
-            from aqualvs.run_outputs import RunNet
+    with (
+        open_dive(request) as dive,
+        RunMeasuring(
+            dive.source,
+            dive.rig,
+            request.frames,
+            _shared_work(dive, scanner_for),
+            request.n_processes,
+        ) as measuring,
+    ):
+        # While other processes measure the first frames, this one gets ready to write.
+        from aqualvs import run_outputs as outputs
 
-            following = following_for(request, rig)
-            scanner = following or replay or scanner_for(rig, request.scanner)
-            net, agreement = RunNet(rig, request.net), agreement_for(request, rig)
-            check = net_check(request.target, rig)
-            measuring.await_first()
-            claim = folder.prepare(request)
-            started = time.perf_counter()
-            try:
-                with (
-                    folder.writers(request, rig, source, net) as writers,
-                    StopSignals() as stop,
-                    progress(source.name, request.frames.n_frames(source.n_frames)) as tick,
-                ):
-                    writers.tally.agreement, writers.tally.net_check = agreement, check
-                    scanner = writers.recorded(scanner)
-                    with closing(measuring.blocks(scanner, one_by_one=request.mcap)) as blocks:
-                        folder.write_all(blocks, writers, stop, tick)
-            except SourceError as broken_off:
-                fault = broken_off
+        scanner, summary = dive.scanner(scanner_for), summary_for(dive)
+        net = outputs.RunNet(dive.rig, request.net)
+        measuring.await_first()
+        claim = outputs.prepare(request)
+        started, fault = time.perf_counter(), None
+        try:
+            with (
+                outputs.writers(dive.request, dive.rig, dive.source, net, summary) as writers,
+                StopSignals() as stop,
+                progress(dive.source.name, request.frames.n_frames(dive.source.n_frames)) as tick,
+                closing(
+                    measuring.blocks(writers.recorded(scanner), one_by_one=request.mcap)
+                ) as blocks,
+            ):
+                outputs.write_all(blocks, writers, stop, tick)
+        except SourceError as broken_off:
+            fault = broken_off
+    water = scanner.lines() if isinstance(scanner, WaterFollowingScanner) else []
     result = RunResult(
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
-        tally=writers.tally,
-        dome_lines=writers.dome_lines(),
-        water_lines=following.lines() if following else [],
-        net_lines=writers.net_lines(request.out, request.source),
+        summary=summary,
+        lines=[*water, *writers.dome_lines(), *net.write(request.out, request.source)],
         elapsed_s=time.perf_counter() - started,
-        report=folder.report(request),
-        comparison=folder.comparison(request),
+        report=outputs.report(request),
+        comparison=outputs.comparison(request),
         fault=fault,
     )
     claim.close()
@@ -173,60 +134,117 @@ def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
 
 def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
     """Return the lines that the command prints at the end."""
-    lines = [f"{request.source}: {result.tally.n_frames} frames in {result.elapsed_s:.1f} s"]
-    lines += result.tally.lines()
-    lines += result.water_lines
-    lines += result.dome_lines
-    lines += result.net_lines
+    n_frames = result.summary.n_frames
+    lines = [f"{request.source}: {n_frames} frames in {result.elapsed_s:.1f} s"]
+    lines += [*result.summary.lines(), *result.lines]
     if result.comparison is not None:
         lines += result.comparison.lines()
     if result.stopped_by:
         lines.append(
-            f"stopped by {result.stopped_by} after {result.tally.n_frames} frames; "
+            f"stopped by {result.stopped_by} after {n_frames} frames; "
             f"what was measured is complete in {request.out}"
         )
     lines.append(f"report: {result.report}" if result.report else f"results: {request.out}")
     return lines
 
 
-def _replay(request: RunRequest) -> Replay | None:
-    replay = replay_of(request)
-    if replay is not None and request.fps is not None:
-        raise OptionError(f"--fps: {request.source} has its own clock; leave the frame rate out")
-    return replay
+@dataclass(slots=True)
+class OpenDive(Closing):
+    """A dive that is ready to be measured; a context manager that closes its source.
+
+    Attributes
+    ----------
+    source : FrameSource or Replay
+    rig : Rig
+        In the water of the dive.
+    request : RunRequest
+        With the options that count, which a recording may bring itself.
+    """
+
+    source: FrameSource
+    rig: Rig
+    request: RunRequest
+
+    @property
+    def is_replay(self) -> bool:
+        """True if the source is a recording."""
+        return isinstance(self.source, Replay)
+
+    def scanner(self, scanner_for: ScannerFor = Scanner) -> ScansFrames:
+        """Return what measures the frames: the recording itself, or a scanner.
+
+        Raises
+        ------
+        AqualvsError
+            If the target for the water's index cannot be used.
+        """
+        request, rig = self.request, self.rig
+        if request.index_target is not None:
+            if rig.dome is None:
+                raise OptionError("--index-target: without a dome the water's index cannot be seen")
+            return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
+        if isinstance(self.source, Replay):
+            return self.source
+        return scanner_for(rig, request.scanner)
+
+    def close(self) -> None:
+        """Close the source."""
+        self.source.__exit__(None, None, None)
 
 
-def following_for(request: RunRequest, rig: Rig) -> WaterFollowingScanner | None:
-    """Return the scanner that tracks the water's index, None if that is not requested.
+def open_dive(request: RunRequest) -> OpenDive:
+    """Open the source of a dive and load its rig.
 
     Raises
     ------
     AqualvsError
-        If the target for the water's index cannot be used.
+        If one of them, or the truth, cannot be used, or they do not belong together.
     """
-    if request.index_target is None:
-        return None
-    if rig.dome is None:
-        raise OptionError("--index-target: without a dome the water's index cannot be seen")
-    return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
+    replay = replay_of(request)
+    if replay is not None and request.fps is not None:
+        raise OptionError(f"--fps: {request.source} has its own clock; leave the frame rate out")
+    rig = (
+        replay.rig if replay else prepared_rig(request.rig, request.water, no_dome=request.no_dome)
+    )
+    if request.truth is not None:
+        read_truth(request.truth)
+    if replay:
+        dive = OpenDive(replay, rig, replace(request, scanner=replay.options))
+    else:
+        dive = OpenDive(open_source(request.source, fps=request.fps), rig, request)
+    try:
+        check_fits(dive.source, rig)
+    except BaseException:
+        dive.close()
+        raise
+    return dive
 
 
-def _crew_work(request: RunRequest, source: FrameSource, rig: Rig) -> CrewWork | None:
-    """Return how processes can share the dive; None where one process must measure all of it."""
-    alone = request.overlay or request.mcap or request.index_target is not None
-    if alone or request.n_processes < 2:
-        return None
-    return crew_work(source, request.frames, rig, request.scanner)
+def summary_for(dive: OpenDive) -> RunSummary:
+    """Return an empty summary with the monitors that a run of the dive has.
 
-
-def agreement_for(request: RunRequest, rig: Rig) -> LaserAgreement | None:
-    """Return the check of a dive's lasers against each other, None if there is none.
+    One laser agrees with itself; and where refraction at the dome is left out, the lasers disagree
+    for that reason alone.
 
     Raises
     ------
-    RigError
-        If the rig's uncertainty cannot be parsed.
+    AqualvsError
+        If the uncertainty of the rig, or the target file, cannot be used.
     """
-    if request.no_dome:
+    request, rig = dive.request, dive.rig
+    agreement = None
+    if len(rig.lasers) > 1 and not request.no_dome:
+        try:
+            agreement = LaserAgreement(rig)
+        except RigError as error:
+            raise RigError(f"{request.rig or request.source}: {error}") from None
+    return RunSummary(agreement=agreement, net_check=net_check(request.target, rig))
+
+
+def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> CrewWork | None:
+    """Return how processes can share the dive; None where one process must measure all of it."""
+    request = dive.request
+    alone = request.overlay or request.mcap or request.index_target is not None
+    if alone or dive.is_replay or scanner_for is not Scanner or request.n_processes < 2:
         return None
-    return agreement_of(rig, request.rig or Path(request.source))
+    return crew_work(dive.source, request.frames, dive.rig, request.scanner)

@@ -40,7 +40,7 @@ from aqualvs.results.folder import (
 )
 from aqualvs.results.net_survey import NetPass
 from aqualvs.results.run_request import RunRequest, Status, source_facts
-from aqualvs.results.summary import Tally, TruthComparison, compare_with_truth
+from aqualvs.results.summary import RunSummary, TruthComparison, compare_with_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Posture
@@ -336,11 +336,6 @@ class RunWriters:
         self._outputs, self._overlay, self._bare_lens = outputs, overlay, bare_lens
         self._mcap, self._net = mcap, net
 
-    @property
-    def tally(self) -> Tally:
-        """Summary so far."""
-        return self._outputs.tally
-
     def recorded(self, scanner: ScansFrames) -> ScansFrames:
         """Return the scanner to measure with, which records its results if requested."""
         return self._mcap.recorded(scanner)
@@ -364,10 +359,6 @@ class RunWriters:
         """Return the effect of the dome model as lines of text."""
         return self._bare_lens.lines()
 
-    def net_lines(self, folder: Path, source: str) -> list[str]:
-        """Write the state of the net, if requested, and return it as lines of text."""
-        return self._net.write(folder, source)
-
 
 def prepare(request: RunRequest) -> Claim:
     """Make sure that the run can be written; returns the claim to be closed at its end.
@@ -383,12 +374,18 @@ def prepare(request: RunRequest) -> Claim:
 
 @contextmanager
 def writers(
-    request: RunRequest, rig: Rig, source: FrameSource, net: RunNet
+    request: RunRequest, rig: Rig, source: FrameSource, net: RunNet, summary: RunSummary
 ) -> Iterator[RunWriters]:
     """Open everything that the run writes; it is completed however the run ends."""
-    facts, options = source_facts(source), request.facts()
+    outputs = RunOutputs(
+        request.out,
+        source=source_facts(source),
+        rig=rig_to_mapping(rig),
+        options=request.facts(),
+        summary=summary,
+    )
     with (
-        RunOutputs(request.out, source=facts, rig=rig_to_mapping(rig), options=options) as outputs,
+        outputs,
         RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
         RunBareLens(request.out, rig) as bare_lens,
         RunMcap(request.out, rig, request.scanner, wanted=request.mcap) as mcap,

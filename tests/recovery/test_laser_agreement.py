@@ -1,6 +1,5 @@
 """Render, scan with a rig that is wrong about one laser, and see whether that one is named."""
 
-import importlib.util
 from functools import cache
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.sources import open_source
+from rig_from_sample_truth import load_truth
 
-_TOOL = Path(__file__).resolve().parents[2] / "tools" / "rig_from_sample_truth.py"
 _TIMES = np.linspace(0.1, 3.7, 8)
 _DIVES = ("wall", "wall_yaw", "wall_pitch", "wall_range", "net_diamond", "net_clutter")
 
@@ -83,13 +82,7 @@ def test_a_turn_is_found_on_a_net_too() -> None:
 
 @pytest.fixture(scope="module")
 def sample_rig(samples: Path) -> Rig:
-    spec = importlib.util.spec_from_file_location("rig_from_sample_truth", _TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    rig: Rig = tool.load_truth(samples / "lab-paper" / "truth" / "rig_truth.json")
-    return rig
+    return load_truth(samples / "lab-paper" / "truth" / "rig_truth.json")
 
 
 def watched_sample(samples: Path, name: str, rig: Rig, every: int) -> AgreementVerdict:

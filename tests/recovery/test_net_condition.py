@@ -1,6 +1,5 @@
 """The condition of simulated nets against what they are, and of independently rendered ones."""
 
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -14,8 +13,6 @@ from aqualvs.simulation.scenarios import Difficulty, example_rig
 from aqualvs.sources import open_source
 from net_cases import NetCamera
 from net_dives import Dive, passed_holes, random_dive, scans_of, true_solidity
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 from rig_from_sample_truth import load_truth
 
 RIG = example_rig()

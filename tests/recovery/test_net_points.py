@@ -1,6 +1,5 @@
 """What points are found to lie on, against the truth of independent and of simulated pictures."""
 
-import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -27,8 +26,6 @@ from aqualvs.simulation.scene import Label as Kind
 from aqualvs.simulation.scene import Net, Scene, Wall
 from aqualvs.simulation.truth import visible_fit
 from aqualvs.sources import open_source
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 from rig_from_sample_truth import load_truth
 
 DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")

@@ -7,28 +7,27 @@ than those of rendered pictures: the board itself may be a millimetre or a degre
 import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+import real_lines
+import real_wall as wall
 from aqualvs.calibrate import lasers
 from aqualvs.scanning.whole_picture import find_stripes
-from real_light_cases import CROP, PHOTOGRAPHS, tool
+from repository import ROOT
 
 PICTURES = ("image2", "image5")
+PHOTOGRAPHS = ROOT / "tests" / "data" / "real-wall"
+# Of the photographs, in those they were cropped from: x, y, width, height.
+CROP = (100, 60, 1400, 1070)
 FORMATS = ("png", "jpg80", "crf18", "crf23", "crf28")
 
 
 @pytest.fixture(scope="module")
-def wall() -> ModuleType:
-    return tool("real_wall")
-
-
-@pytest.fixture(scope="module")
-def measured(wall, tmp_path_factory) -> dict[tuple[str, str], Any]:
+def measured(tmp_path_factory) -> dict[tuple[str, str], Any]:
     """The repository's photographs in all formats, by the rig that is stored beside them."""
     results = {}
     for picture in PICTURES:
@@ -81,7 +80,7 @@ def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     assert len(find_stripes(np.ascontiguousarray(image[:, :700]))) == 0
 
 
-def test_two_photographs_of_fifteen_lines_are_too_few(wall, tmp_path) -> None:
+def test_two_photographs_of_fifteen_lines_are_too_few(tmp_path) -> None:
     """Two boards do not tell which of 15 lines belong together; nothing is written."""
     pictures = sorted(PHOTOGRAPHS.glob("*.jpg"))
     assert wall.calibrate(pictures, tmp_path, rig=wall.rig_text(CROP)) is None
@@ -108,7 +107,7 @@ LEFT_OUT_FORMATS = ("png", "crf23", "crf28")
 
 
 @pytest.fixture(scope="module")
-def left_out(samples: Path, wall, tmp_path_factory) -> dict[str, list]:
+def left_out(samples: Path, tmp_path_factory) -> dict[str, list]:
     """Every photograph of the set by lasers of the eight others, by format.
 
     Each photograph is among the others eight times; what is found in it is the same each time.
@@ -142,7 +141,7 @@ def test_nine_photographs_leaving_one_out(left_out, fmt: str) -> None:
 
 
 def lines(samples: Path, fmt: str) -> Iterator:
-    for shot in tool("real_lines").shots(samples / "real-laser-lines", [fmt]):
+    for shot in real_lines.shots(samples / "real-laser-lines", [fmt]):
         yield from shot.scores
 
 

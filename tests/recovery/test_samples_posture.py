@@ -1,7 +1,6 @@
 """Postures in independently rendered dives, against their truth."""
 
 import csv
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +13,12 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.sources import open_source
+from rig_from_sample_truth import load_truth
 
 pytestmark = pytest.mark.samples
 
 _WALLS = ("wall", "wall_yaw", "wall_pitch")
 _COLUMNS = ("range_mm", "pitch_deg", "yaw_deg")
-_TOOL = Path(__file__).resolve().parents[2] / "tools" / "rig_from_sample_truth.py"
 
 
 @dataclass(frozen=True)
@@ -73,13 +72,7 @@ def _p95(values: FloatArray) -> float:
 
 @pytest.fixture(scope="module")
 def rig(samples: Path) -> Rig:
-    spec = importlib.util.spec_from_file_location("rig_from_sample_truth", _TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    loaded: Rig = tool.load_truth(samples / "lab-paper" / "truth" / "rig_truth.json")
-    return loaded
+    return load_truth(samples / "lab-paper" / "truth" / "rig_truth.json")
 
 
 @pytest.fixture(scope="module")

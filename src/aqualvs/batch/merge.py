@@ -1,32 +1,21 @@
 """Merge of a dive's pieces into its folder, equal to what `aqualvs run` would have written.
 
-Rows and points are joined in order; the summary comes from the notes of the pieces.
+Rows and points are joined in order; the summaries of the pieces add up.
 """
 
 import os
 import shutil
 import time
-from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from aqualvs.batch.dataset import clear, drop_net, holds_dive, put_dive, scratch, seal, sealed
-from aqualvs.batch.parts import (
-    NOTES,
-    PieceResult,
-    peak_bytes,
-    piece_folder,
-    piece_key,
-    stand_ins,
-    stored_bars,
-    stored_ranges,
-)
+from aqualvs.batch.parts import SUMMARY, PieceResult, peak_bytes, piece_folder, piece_key
 from aqualvs.batch.summary_page import range_steps
-from aqualvs.batch.work import DiveWork, OpenDive, Survey, open_dive
-from aqualvs.nets.target_file import net_check
+from aqualvs.batch.work import DiveWork, Survey
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.pipeline import agreement_for
+from aqualvs.pipeline import OpenDive, open_dive, summary_for
 from aqualvs.report.run_page import write_report
 from aqualvs.results.files import writing
 from aqualvs.results.folder import (
@@ -42,10 +31,10 @@ from aqualvs.results.folder import (
 )
 from aqualvs.results.points import export_batches, read_journal
 from aqualvs.results.run_request import RunFile, Status
-from aqualvs.results.summary import Tally
+from aqualvs.results.summary import RunSummary
 
 
-def joined_tally(dive: OpenDive, pieces: Sequence[Path]) -> Tally:
+def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:
     """Return the summary that a run of the whole dive would have gathered.
 
     Parameters
@@ -53,29 +42,11 @@ def joined_tally(dive: OpenDive, pieces: Sequence[Path]) -> Tally:
     dive : OpenDive
     pieces : sequence of Path
         Folders of all pieces, in order.
-
-    Raises
-    ------
-    UnlikeSurveyError
-        If a watcher asks for what the pieces did not keep.
     """
-    tally = Tally(agreement=agreement_for(dive.request, dive.rig))
+    summary = summary_for(dive)
     for piece in pieces:
-        for scan in stand_ins(piece / NOTES):
-            tally.add(scan)
-    tally.net_check = net_check(dive.request.target, dive.rig)
-    if tally.net_check is not None:
-        for piece in pieces:
-            tally.net_check.bars.extend(stored_bars(piece / NOTES))
-    return tally
-
-
-def joined_ranges(pieces: Sequence[Path]) -> "array[float]":
-    """Return the range of every frame in metres, NaN without a posture."""
-    found = array("d")
-    for piece in pieces:
-        found.extend(stored_ranges(piece / NOTES))
-    return found
+        summary.extend(piece / SUMMARY)
+    return summary
 
 
 JOINED = "joined"
@@ -120,8 +91,6 @@ def join_dive(work: DiveWork, survey: Survey, results: Sequence[PieceResult]) ->
     ------
     PieceLostError
         If a piece must be measured again.
-    UnlikeSurveyError
-        If the pieces do not tell all that the whole dive's run would know.
     AqualvsError
         If the dive's folder cannot be written.
     """
@@ -158,19 +127,18 @@ def _write_run_file(
     folder: Path,
 ) -> dict[str, Any]:
     """Write `run.yaml`; returns the facts of the dive."""
-    dive = open_dive(work.request)
-    with dive.source:
-        tally = joined_tally(dive, pieces)
-    fault, summary, rig = results[-1].fault, tally.facts(), rig_to_mapping(dive.rig)
+    with open_dive(work.request) as dive:
+        summary = joined_summary(dive, pieces)
+    fault, facts, rig = results[-1].fault, summary.facts(), rig_to_mapping(dive.rig)
     run_file = RunFile(folder / RUN_YAML, survey.source, rig, dive.request.facts())
-    run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=summary)
+    run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=facts)
     return {
-        "n_frames": tally.n_frames,
-        "n_valid": tally.n_valid,
+        "n_frames": summary.n_frames,
+        "n_valid": summary.n_valid,
         "duration_s": results[-1].duration_s,
         "fault": fault,
-        "summary": summary,
-        "range_steps": range_steps(joined_ranges(pieces)),
+        "summary": facts,
+        "range_steps": range_steps(summary.ranges),
         "rig": str(rig.get("name", "")),
         "rig_file": str(work.request.rig or work.request.source),
         "n_water": dive.rig.n_water,

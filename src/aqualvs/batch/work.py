@@ -16,23 +16,18 @@ import av
 from aqualvs.batch.dataset import seal, sealed
 from aqualvs.errors import OptionError
 from aqualvs.nets.target_file import target_facts
-from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.pipeline import following_for
+from aqualvs.pipeline import OpenDive, open_dive
 from aqualvs.results.files import writing
-from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig, source_facts, versions
-from aqualvs.scanner import Scanner
-from aqualvs.sources import FrameSource, open_source
+from aqualvs.results.run_request import RunRequest, source_facts, versions
 from aqualvs.sources.images import ImageSource, images_in
 from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
 from aqualvs.sources.video import VideoSource
-from aqualvs.workers.frame_results import ScansFrames
-from aqualvs.workers.replay import Replay, replay_of
 
 PIECE_FRAMES = 1500
 """Frames that a piece has at least: a minute of video, seconds of work."""
 
-_FORMAT = 1
+_FORMAT = 2
 """Of what pieces hold; another one makes old pieces worthless."""
 
 
@@ -59,59 +54,6 @@ class DiveWork:
     home: Path
     dataset: Path
     piece_frames: int = PIECE_FRAMES
-
-
-@dataclass(slots=True)
-class OpenDive:
-    """A dive that is ready to be measured.
-
-    Attributes
-    ----------
-    source : FrameSource or Replay
-        A context manager.
-    rig : Rig
-    request : RunRequest
-        With the options that count, which a recording may bring itself.
-    replay : Replay or None
-        The source, where it is a recording.
-    """
-
-    source: FrameSource
-    rig: Rig
-    request: RunRequest
-    replay: Replay | None
-
-    def scanner(self) -> ScansFrames:
-        """Return what measures the frames.
-
-        Raises
-        ------
-        AqualvsError
-            If the target that tells the water's index cannot be used.
-        """
-        following = following_for(self.request, self.rig)
-        return following or self.replay or Scanner(self.rig, self.request.scanner)
-
-
-def open_dive(request: RunRequest) -> OpenDive:
-    """Open a dive's source and load its rig, as `run` does it.
-
-    Raises
-    ------
-    AqualvsError
-        If one of them cannot be used, or they do not belong together.
-    """
-    replay = replay_of(request)
-    if replay is not None:
-        return OpenDive(replay, replay.rig, replace(request, scanner=replay.options), replay)
-    rig = prepared_rig(request.rig, request.water, no_dome=request.no_dome)
-    source = open_source(request.source, fps=request.fps)
-    try:
-        check_fits(source, rig)
-    except BaseException:
-        source.__exit__(None, None, None)
-        raise
-    return OpenDive(source, rig, request, None)
 
 
 def result_key(dive: OpenDive) -> str:
@@ -220,8 +162,7 @@ def survey(work: DiveWork) -> Survey:
     AqualvsError
         If the dive or its rig cannot be used.
     """
-    dive = open_dive(work.request)
-    with dive.source:
+    with open_dive(work.request) as dive:
         found = Survey(
             source_key="",
             result_key=result_key(dive),

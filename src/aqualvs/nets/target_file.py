@@ -280,12 +280,10 @@ class NetCheck:
     source: str
     planes: Sequence[Plane]
     bars: "array[float]" = field(default_factory=lambda: array("d"))
-    _n_seen: int = 0
 
     def add(self, scan: Scan) -> None:
-        """Evaluate a frame, if it is one of the sampled ones and shows a net."""
-        self._n_seen += 1
-        if (self._n_seen - 1) % _EVERY == 0:
+        """Evaluate a frame, if it is sampled (by its number in the dive) and shows a net."""
+        if scan.index % _EVERY == 0:
             bar = bar_of(scan, self.planes, self.said)
             if bar is not None:
                 self.bars.append(bar)

@@ -27,7 +27,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.results.files import AppendFile, Claim, explain, locked_folder, writing
 from aqualvs.results.points import DRAFT, PointsExport, PointsJournal, check_idle, export_points
 from aqualvs.results.run_request import RunFile, Status, now, read_run_yaml, write_yaml
-from aqualvs.results.summary import Tally, tally_of
+from aqualvs.results.summary import RunSummary, summary_of
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
 from aqualvs.special_files import refuse_special
@@ -177,13 +177,15 @@ class RunOutputs:
         From `prepare_folder`.
     source, rig, options : mapping
         For `run.yaml`.
+    summary : RunSummary, optional
+        To which the frames are added; its monitors are those of the run.
 
     Attributes
     ----------
     status : Status
         What `run.yaml` will say if the run ends without a fault; set it before the end.
-    tally : Tally
-        Summary so far.
+    summary : RunSummary
+        So far.
 
     Raises
     ------
@@ -198,10 +200,11 @@ class RunOutputs:
         source: Mapping[str, Any],
         rig: Mapping[str, Any],
         options: Mapping[str, Any],
+        summary: RunSummary | None = None,
     ) -> None:
         self.folder = folder
         self.status = Status.FINISHED
-        self.tally = Tally()
+        self.summary = RunSummary() if summary is None else summary
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
             # First, so that only one of two runs that begin at the same moment continues.
@@ -226,7 +229,7 @@ class RunOutputs:
                 # The journal is complete: the next attempt, at the end, reports the fault.
                 self._discard_export()
         for scan in scans:
-            self.tally.add(scan)
+            self.summary.add(scan)
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -249,7 +252,9 @@ class RunOutputs:
             else:
                 self._export.finish()
             (self.folder / JOURNAL).unlink()
-            self._run_file.write(self._final(fault), error=_words(fault), summary=self._summary())
+            self._run_file.write(
+                self._final(fault), error=_words(fault), summary=self.summary.facts()
+            )
         except OSError as full:
             refusal = OutputError(explain(self.folder, full))
             self._leave_as_it_is(refusal)
@@ -261,7 +266,7 @@ class RunOutputs:
         self._points.abandon()
         self._posture.close()
         with contextlib.suppress(OSError):
-            self._run_file.write(Status.FAILED, error=str(fault), summary=self._summary())
+            self._run_file.write(Status.FAILED, error=str(fault), summary=self.summary.facts())
 
     def _discard_export(self) -> None:
         if self._export is not None:
@@ -272,9 +277,6 @@ class RunOutputs:
         if fault is None:
             return self.status
         return Status.INTERRUPTED if isinstance(fault, KeyboardInterrupt) else Status.FAILED
-
-    def _summary(self) -> dict[str, Any]:
-        return self.tally.facts()
 
 
 def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
@@ -403,7 +405,7 @@ def _mend_run_file(folder: Path) -> None:
         "started": content.get("started"),
         "error": _KILLED,
         "completed": now(),
-        "summary": tally_of(folder / POSTURE_CSV).facts(),
+        "summary": summary_of(folder / POSTURE_CSV).facts(),
     }
     write_yaml(path, head | {key: value for key, value in content.items() if key not in known})
 

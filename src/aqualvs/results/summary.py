@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray
@@ -20,6 +21,8 @@ from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
 
 _RANGE_UNITS = {"range_m": 1.0, "range_mm": 1e-3}
+_AGREEMENT = "agreement_"
+"""Begin of the names of the agreement's arrays in a stored summary."""
 _LIT_PLANE = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg")
 
 
@@ -173,36 +176,40 @@ def _deviation(values: FloatArray) -> Deviation:
 
 
 @dataclass(slots=True)
-class Tally:
-    """Counts of frames, postures and refusals, and the ranges found.
+class RunSummary:
+    """Statistics over the frames of a run: refusals, ranges, agreement of the lasers, the net.
+
+    Summaries of consecutive parts of a dive add up to that of the dive: `save` and `extend`.
 
     Attributes
     ----------
-    n_frames : int
     refused : counter
         Frames without posture, by reason.
     ranges : array of float
-        Metres, one for each valid frame.
+        Metres, one for each frame; NaN without a posture.
     agreement : LaserAgreement or None
-        What watches over the lasers, if anything does.
+        Monitor of the lasers, if they are monitored.
     net_check : NetCheck or None
-        What compares the net with the target file's, if the file describes one.
+        Comparison of the net with the target file's, if the file describes one.
     """
 
-    n_frames: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
     agreement: LaserAgreement | None = None
     net_check: NetCheck | None = None
 
     @property
-    def n_valid(self) -> int:
-        """Frames with a posture."""
+    def n_frames(self) -> int:
+        """Number of frames."""
         return len(self.ranges)
 
+    @property
+    def n_valid(self) -> int:
+        """Number of frames with a posture."""
+        return self.n_frames - self.refused.total()
+
     def add(self, scan: Scan) -> None:
-        """Count one frame."""
-        self.n_frames += 1
+        """Add one frame."""
         if self.agreement is not None:
             self.agreement.add(scan)
         if self.net_check is not None:
@@ -210,17 +217,66 @@ class Tally:
         if isinstance(scan.posture, Posture):
             self.ranges.append(scan.posture.range)
         else:
-            self.refused[scan.posture.reason.value] += 1
+            self.refuse(scan.posture.reason.value)
+
+    def refuse(self, reason: str) -> None:
+        """Add a frame without a posture."""
+        self.ranges.append(math.nan)
+        self.refused[reason] += 1
+
+    def save(self, path: Path) -> None:
+        """Write the summary of a part of a dive to a file, in NumPy's npz format.
+
+        Raises
+        ------
+        OSError
+            As the system says it.
+        """
+        stored: dict[str, NDArray[Any]] = {
+            "ranges": np.asarray(self.ranges),
+            "reasons": np.array(list(self.refused), np.str_),
+            "counts": np.array(list(self.refused.values()), np.int64),
+        }
+        if self.agreement is not None:
+            stored |= {_AGREEMENT + key: value for key, value in self.agreement.arrays().items()}
+        if self.net_check is not None:
+            stored["bars"] = np.asarray(self.net_check.bars)
+        np.savez(path, allow_pickle=False, **stored)
+
+    def extend(self, path: Path) -> None:
+        """Add the frames of a part of the dive, as `save` has written them.
+
+        Raises
+        ------
+        OSError, ValueError
+            If the file cannot be read.
+        """
+        with np.load(path) as file:
+            stored: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
+        self.ranges.extend(stored["ranges"].tolist())
+        for reason, count in zip(
+            stored["reasons"].tolist(), stored["counts"].tolist(), strict=True
+        ):
+            self.refused[reason] += count
+        if self.agreement is not None:
+            n = len(_AGREEMENT)
+            arrays = {key[n:]: value for key, value in stored.items() if key[:n] == _AGREEMENT}
+            self.agreement.extend(arrays)
+        if self.net_check is not None:
+            self.net_check.bars.extend(stored["bars"].tolist())
+
+    def _known_ranges(self) -> list[float]:
+        return [one for one in self.ranges if not math.isnan(one)]
 
     def facts(self) -> dict[str, Any]:
         """Return the summary for `run.yaml`; ranges are absent where no frame is valid."""
         found: dict[str, Any] = {"n_frames": self.n_frames, "n_valid": self.n_valid}
         if self.n_frames:
             found["valid_share"] = round(self.n_valid / self.n_frames, 4)
-        if self.ranges:
-            found["range_median_m"] = round(statistics.median(self.ranges), 6)
-            found["range_min_m"] = round(min(self.ranges), 6)
-            found["range_max_m"] = round(max(self.ranges), 6)
+        if ranges := self._known_ranges():
+            found["range_median_m"] = round(statistics.median(ranges), 6)
+            found["range_min_m"] = round(min(ranges), 6)
+            found["range_max_m"] = round(max(ranges), 6)
         if self.refused:
             found["refused"] = dict(self.refused.most_common())
         if self.agreement is not None:
@@ -235,9 +291,8 @@ class Tally:
             return ["no frame was measured"]
         share = 100 * self.n_valid / self.n_frames
         text = [f"posture in {self.n_valid} of {self.n_frames} frames ({share:.1f} %)"]
-        if self.ranges:
-            low, high = min(self.ranges), max(self.ranges)
-            middle = statistics.median(self.ranges)
+        if ranges := self._known_ranges():
+            low, high, middle = min(ranges), max(ranges), statistics.median(ranges)
             text.append(f"range {middle:.3f} m (median), from {low:.3f} to {high:.3f} m")
         if self.refused:
             counts = (f"{n} {reason}" for reason, n in self.refused.most_common())
@@ -247,9 +302,9 @@ class Tally:
         return [*text, *(words for words in (sentence, about_net) if words)]
 
 
-def tally_of(posture_csv: Path) -> Tally:
+def summary_of(posture_csv: Path) -> RunSummary:
     """Gather the summary of a run from its `posture.csv`; damaged and cut rows are left out."""
-    tally = Tally()
+    summary = RunSummary()
     with (
         posture_csv.open(newline="", encoding="ascii", errors="replace") as file,
         contextlib.suppress(csv.Error),
@@ -257,12 +312,9 @@ def tally_of(posture_csv: Path) -> Tally:
         for row in csv.DictReader(file):
             if row.get("n_water") is None:
                 continue
-            if row.get("valid") != "1":
-                tally.refused[str(row.get("reason"))] += 1
+            if row.get("valid") == "1":
+                with contextlib.suppress(ValueError):
+                    summary.ranges.append(float(row.get("range_m") or math.nan))
             else:
-                try:
-                    tally.ranges.append(float(row.get("range_m") or math.nan))
-                except ValueError:
-                    continue
-            tally.n_frames += 1
-    return tally
+                summary.refuse(str(row.get("reason")))
+    return summary

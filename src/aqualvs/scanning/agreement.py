@@ -15,7 +15,7 @@ and weights are Tukey's. `LaserAgreement` collects the frames and gives the verd
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -544,23 +544,47 @@ class LaserAgreement:
         self._known = rig_uncertainty(rig)
         axes = [search.axis for search in plan_searches(rig, self._camera)]
         self._along_x = np.array([axis is SearchAxis.ALONG_X for axis in axes], np.int64)
-        self._middles: list[FloatArray] = []
-        self._n_scans, self._every = 0, _EVERY
+        self._middles: dict[int, FloatArray] = {}
+        self._every = _EVERY
         self._verdict: AgreementVerdict | None = None
 
     def add(self, scan: Scan) -> None:
-        """Add a frame; frames without a posture are skipped."""
-        self._n_scans += 1
-        if not scan.posture or self._n_scans % self._every or len(self._along_x) < 2:
+        """Add a frame; frames without a posture, and all but a sample of the others, are skipped.
+
+        A frame is sampled by its number, so that parts of a dive, added by themselves, take the
+        same frames as the whole dive.
+        """
+        if not scan.posture or scan.index % self._every or len(self._along_x) < 2:
             return
         m = scan.posture.normal_in_dome / scan.posture.range
         middles = bin_stripes(scan.points, m, self._along_x, self._rig.size_px)
-        if np.isfinite(middles[..., 0]).sum(axis=1).min() < _MIN_PIECES:
-            return
+        if np.isfinite(middles[..., 0]).sum(axis=1).min() >= _MIN_PIECES:
+            self._sample({scan.index: middles})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the sampled frames, to be stored and given to `extend`."""
+        shape = (len(self._middles), len(self._along_x), N_BINS, 2)
+        return {
+            "every": np.array(self._every),
+            "frames": np.array(list(self._middles), np.int64),
+            "middles": np.array(list(self._middles.values())).reshape(shape),
+        }
+
+    def extend(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Add frames that another monitor of the same rig has sampled, as from `arrays`."""
+        self._every = max(self._every, int(arrays["every"]))
+        frames = arrays["frames"].tolist()
+        self._sample(dict(zip(frames, arrays["middles"], strict=True)))
+
+    def _sample(self, middles: Mapping[int, FloatArray]) -> None:
+        """Take frames into the sample; where it grows too large, every other one is dropped."""
         self._verdict = None
-        self._middles.append(middles)
-        if len(self._middles) >= 2 * _MAX_FRAMES:
-            self._middles = self._middles[::2]
+        self._middles |= middles
+        while True:
+            kept = {i: one for i, one in self._middles.items() if i % self._every == 0}
+            self._middles = kept
+            if len(kept) < 2 * _MAX_FRAMES:
+                return
             self._every *= 2
 
     def verdict(self) -> AgreementVerdict:
@@ -570,7 +594,8 @@ class LaserAgreement:
         return self._verdict
 
     def _judged(self) -> AgreementVerdict:
-        middles = self._middles[:: max(1, math.ceil(len(self._middles) / _MAX_FRAMES))]
+        thinning = max(1, math.ceil(len(self._middles) / _MAX_FRAMES))
+        middles = list(self._middles.values())[::thinning]
         n_frames = len(middles)
         if n_frames < _MIN_FRAMES:
             return AgreementVerdict(AgreementState.NOT_CHECKED, n_frames)

@@ -1,0 +1,210 @@
+"""Lasers: simulated calibrations against their promised uncertainty, samples against truth."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.lasers import calibrate
+from aqualvs.calibration.lasers.calibrate import (
+    HeldOutView,
+    LaserOptions,
+    calibrate_lasers,
+    leave_one_out,
+)
+from aqualvs.calibration.lasers.report import LaserCalibration
+from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, box_surfaces
+from aqualvs.calibration.lasers.views import LaserView
+from aqualvs.calibration.targets.target_files import load_box
+from aqualvs.calibration.targets.targets import Board, BoardKind
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.lens import Lens
+from aqualvs.optics.rig import (
+    DOME_FROM_CAM_NOMINAL,
+    LASER_PARAMETERS,
+    Rig,
+    RigUncertainty,
+    rig_moved_by,
+    tangent_basis,
+)
+from aqualvs.scanning.whole_picture import find_stripes
+from aqualvs.simulation.scenarios import example_rig
+from laser_cases import (
+    Noise,
+    board_views,
+    box,
+    box_views,
+    camera_uncertainty,
+    laser_error,
+    without_lasers,
+)
+from rig_from_sample_truth import load_truth
+
+BIAS_PX = 0.03
+
+
+def whitened(found: Rig, true: Rig, uncertainty: RigUncertainty, held: FloatArray) -> FloatArray:
+    """Errors of camera and lasers together, in standard deviations, made independent.
+
+    `held` (C,) are the errors of the camera's numbers, where they were held.
+    """
+    errors = list(held)
+    names = list(camera_uncertainty().names)
+    for a, b in zip(found.lasers, true.lasers, strict=True):
+        errors += (tangent_basis(a.plane.normal) @ b.plane.normal).tolist()
+        errors.append(b.plane.offset - a.plane.offset)
+        names += [f"{a.name}:{name}" for name in LASER_PARAMETERS]
+    covariance = uncertainty.of(names)
+    size = np.sqrt(np.diag(covariance))
+    lower = np.linalg.cholesky(covariance / np.outer(size, size))
+    independent: FloatArray = np.linalg.solve(lower, np.array(errors) / size)
+    return independent
+
+
+@pytest.mark.parametrize("target", ["box", "board"])
+def test_errors_are_as_large_as_promised(target: str) -> None:
+    """Cameras drawn from their covariance, noisy corners and stripes, stripes with a bias."""
+    given, nominal = camera_uncertainty(), example_rig()
+    lower = np.linalg.cholesky(given.covariance)
+    surfaces = box() if target == "box" else board_surface()
+    scores = []
+    for k in range(30):
+        rng = np.random.default_rng(1000 + k)
+        camera_error = lower @ rng.standard_normal(len(given.names))
+        true = rig_moved_by(nominal, given.names, camera_error)
+        bias = BIAS_PX * rng.standard_normal((3, len(surfaces.planes)))
+        noise = Noise(corner_px=0.1, stripe_px=0.1, bias_px=bias, correlation=0.3)
+        make = box_views if target == "box" else board_views
+        views = make(true, noise=noise, seed=k, spacing=0.006)
+        result = calibrate_lasers(
+            nominal,
+            views,
+            surfaces,
+            uncertainty=given,
+            options=LaserOptions(stripe_bias_px=BIAS_PX),
+        )
+        scores.append(whitened(result.rig, true, result.uncertainty, camera_error))
+    lasers = np.array(scores)[:, len(given.names) :]
+    # 270 values: their standard deviation is known to 4 % if they are independent.
+    assert 0.85 < lasers.std() < 1.15
+    assert np.abs(lasers).max() < 4.5
+
+
+def true_rig(folder: Path) -> Rig:
+    return load_truth(folder / "truth" / "rig_truth.json")
+
+
+def stripes_of(image: np.ndarray, name: str) -> StripePoints:
+    found = find_stripes(image)
+    return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize("folder", ["box", "box_water"])
+def test_lasers_of_the_sample_box(folder: str, samples: Path) -> None:
+    rig = true_rig(samples / "lab-paper")
+    markers, n_medium = load_box(samples / "lab-paper" / folder / "box.yaml")
+    views = []
+    for path in sorted((samples / "lab-paper" / folder).glob("*.png")):
+        image = cv2.imread(str(path))
+        assert image is not None
+        view = detect_markers(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), markers, path.name)
+        assert view, str(view)
+        views.append(LaserView(view, stripes_of(image, path.name)))
+    assert len(views) == 6
+    options = LaserOptions(n_lasers=3, n_medium=n_medium if folder == "box" else None)
+    surfaces = box_surfaces(markers.planes, markers.points())
+    result = calibrate_lasers(without_lasers(rig), views, surfaces, options=options)
+    assert [f.laser.name for f in result.lasers] == ["horizontal", "vertical", "diagonal"]
+    # Faint reflections on the box's sides are found too, and named in one note.
+    assert len(result.warnings) <= 1
+    for figures, laser in zip(result.lasers, rig.lasers, strict=True):
+        angle, offset = laser_error(figures.laser.plane, laser.plane)
+        assert np.rad2deg(angle) < 0.05
+        assert abs(offset) < 0.3e-3
+        assert angle < 3.0 * figures.sigma_normal
+        assert abs(offset) < 3.0 * figures.sigma_offset
+
+
+BARE = Rig(
+    name="bare",
+    size_px=(2208, 1242),
+    lens=Lens(fx=1407.86, fy=1407.12, cx=1083.25, cy=623.67),
+    dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
+    dome=None,
+    n_air=1.0,
+    n_water=1.0,
+    lasers=(),
+    working_range=(0.3, 1.0),
+)
+
+
+@pytest.fixture(scope="module")
+def wall_views(samples: Path) -> list[LaserView]:
+    board = Board(kind=BoardKind.CHESSBOARD, squares=(7, 10), square=0.02909)
+    views = []
+    for path in sorted((samples / "real-laser-on-wall").glob("*.png")):
+        image = cv2.imread(str(path))
+        assert image is not None
+        view = detect_board(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), board, path.name)
+        assert view, str(view)
+        views.append(LaserView(view, stripes_of(image, path.name)))
+    assert len(views) == 9
+    return views
+
+
+class LeftOut(NamedTuple):
+    """What `leave_one_out` returns, and the calibrations from eight photographs it made."""
+
+    views: list[HeldOutView]
+    calibrations: list[LaserCalibration]
+
+
+@pytest.fixture(scope="module")
+def left_out(wall_views: list[LaserView]) -> LeftOut:
+    """Nobody tells how many lines there are."""
+    made = []
+
+    def recorded(*inputs: Any, **options: Any) -> LaserCalibration:
+        made.append(calibrate_lasers(*inputs, **options))
+        return made[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibrate, "calibrate_lasers", recorded)
+        views = leave_one_out(BARE, wall_views, board_surface())
+    return LeftOut(views, made)
+
+
+@pytest.mark.samples
+def test_any_eight_photographs_give_the_same_fifteen_planes(
+    wall_views: list[LaserView], left_out: LeftOut
+) -> None:
+    every = calibrate_lasers(BARE, wall_views, board_surface()).rig.lasers
+    assert len(every) == 15
+    found = [calibration.rig.lasers for calibration in left_out.calibrations]
+    for i in (1, 7):
+        others = [*wall_views[:i], *wall_views[i + 1 :]]
+        told = LaserOptions(n_lasers=15)
+        found.append(calibrate_lasers(BARE, others, board_surface(), options=told).rig.lasers)
+    assert len(found) == 11
+    for lasers in found:
+        assert len(lasers) == 15
+        for laser, same in zip(lasers, every, strict=True):
+            angle, offset = laser_error(laser.plane, same.plane)
+            # Their stated sigmas are 0.06 degrees; neighbours are 1.7 degrees apart.
+            assert np.rad2deg(angle) < 0.06
+            assert abs(offset) < 0.5e-3
+
+
+@pytest.mark.samples
+def test_fifteen_lines_on_a_wall_in_real_photographs(left_out: LeftOut) -> None:
+    held = left_out.views
+    # Of eight pictures one set may leave a line undecided.
+    assert sum(h.n_lasers == 15 for h in held) >= 8
+    assert np.median([abs(h.range_error) for h in held]) < 5e-3
+    assert np.rad2deg(np.median([abs(h.yaw_error) for h in held])) < 1.2
+    assert np.rad2deg(np.median([abs(h.pitch_error) for h in held])) < 0.25

@@ -1,0 +1,378 @@
+"""`aqualvs live` as users run it: a process of its own, a real stream, faults and every end."""
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.recording import DiveRecording, is_recording
+from aqualvs.results.folder import POSTURE_COLUMNS
+from aqualvs.sources.base import bgr_of
+from live_cases import demo_frames, demo_rig
+from ports import free_port
+from repository import HELPERS
+from stream_sender import make_clip
+from waiting import PATIENCE_S, until
+
+SENDER = HELPERS / "stream_sender.py"
+N_CLIP = 60
+# A busy machine measures fewer frames than come, but never so few of sixty.
+N_AT_LEAST = 10
+# A recording grows by 8 MB at a time: the second time fails.
+LIMIT = 9_000_000
+
+
+def demo_pictures(_size: tuple[int, int], n: int) -> Iterator[Any]:
+    frames = demo_frames(N_CLIP)
+    for i in range(n):
+        yield bgr_of(frames[i % N_CLIP])
+
+
+def demo_pictures_halved(size: tuple[int, int], n: int) -> Iterator[Any]:
+    for image in demo_pictures(size, n):
+        yield cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def demo_pictures_frozen(size: tuple[int, int], n: int) -> Iterator[Any]:
+    """Half of it moves; then an encoder gets the last picture again and again."""
+    *moving, last = demo_pictures(size, n // 2)
+    yield from moving
+    for _ in range(n - len(moving)):
+        yield last
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("clips")
+    size, small = demo_rig().size_px, (360, 288)
+    # Two slices of the dive, as its range jumps where it begins again.
+    return {
+        "dive": make_clip(folder / "dive", size, N_CLIP, gop=12, content=demo_pictures),
+        "small": make_clip(folder / "small", small, 15, content=demo_pictures_halved),
+        "frozen": make_clip(folder / "frozen", size, 100, gop=12, content=demo_pictures_frozen),
+    }
+
+
+@pytest.fixture(scope="module")
+def rig_file() -> Path:
+    import importlib.resources
+
+    return Path(str(importlib.resources.files("aqualvs") / "data" / "demo" / "rig.yaml"))
+
+
+@dataclass
+class Live:
+    """The command under test, and the JSON lines that it sends."""
+
+    process: subprocess.Popen[str]
+    port: int
+    told: list[str] = field(default_factory=list)
+    lines: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
+
+    def wait(self, condition: Callable[[], object], what: str) -> None:
+        try:
+            until(condition, what)
+        except AssertionError as fault:
+            raise AssertionError(f"{fault}; it said {self.told[-12:]}") from None
+
+    def send(self, *clips: Path, **options: object) -> None:
+        command = [sys.executable, str(SENDER), *map(str, clips), "--port", str(self.port)]
+        for name, value in options.items():
+            command += ["--" + name.replace("_", "-"), str(value)]
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=True, timeout=2 * PATIENCE_S)
+
+    def valid(self, since: float = 0.0) -> list[tuple[float, dict[str, Any]]]:
+        return [(at, line) for at, line in list(self.lines) if line["valid"] and at > since]
+
+    def reasons(self, since: float = 0.0) -> list[str]:
+        return [line["reason"] for at, line in list(self.lines) if at > since and line["reason"]]
+
+    def end(self, how: signal.Signals) -> int:
+        self.process.send_signal(how)
+        return self.process.wait(PATIENCE_S)
+
+
+@contextlib.contextmanager
+def live(rig: Path, *options: str, **process: Any) -> Iterator[Live]:
+    """Run the command on a port of its own, listening to its JSON."""
+    port = free_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.bind(("127.0.0.1", 0))
+        wire.settimeout(0.2)
+        json_port = wire.getsockname()[1]
+        source = f"udp://127.0.0.1:{port}"
+        command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "live"]
+        command += [source, "--rig", str(rig), "--json", f"127.0.0.1:{json_port}", *options]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **process
+        ) as running:
+            found = Live(running, port)
+            stop = threading.Event()
+
+            def listen() -> None:
+                while not stop.is_set():
+                    with contextlib.suppress(TimeoutError):
+                        line = json.loads(wire.recv(65536))
+                        found.lines.append((time.monotonic(), line))
+
+            def read() -> None:
+                assert running.stdout is not None
+                for text in running.stdout:
+                    found.told.append(text.rstrip())
+
+            threads = [threading.Thread(target=listen), threading.Thread(target=read)]
+            for thread in threads:
+                thread.start()
+            try:
+                # Silence is told from the start: the command is ready.
+                found.wait(lambda: found.lines, "first line")
+                yield found
+            finally:
+                running.kill()
+                running.wait()
+                stop.set()
+                for thread in threads:
+                    thread.join()
+
+
+def test_a_stream_comes_goes_returns_and_the_recording_replays(
+    clips: dict[str, Path], rig_file: Path, tmp_path: Path
+) -> None:
+    options = ["--record", "--record-to", str(tmp_path / "dives"), "--filter"]
+    with live(rig_file, *options) as run:
+        run.send(clips["dive"])
+        run.wait(lambda: run.valid() and "no_frames" in run.reasons(run.valid()[-1][0]), "silence")
+        assert len(run.valid()) >= N_AT_LEAST
+        silent_s = run.lines[-1][0]
+        run.send(clips["dive"])
+        run.wait(lambda: run.valid(silent_s), "posture after the return")
+        run.send(clips["small"])
+        run.wait(lambda: "wrong_size" in run.reasons(), "other size")
+        other_s = next(at for at, line in list(run.lines) if line["reason"] == "wrong_size")
+        run.send(clips["dive"])
+        run.wait(lambda: run.valid(other_s), "posture after the other size")
+        lines = [line for _, line in run.lines]
+        assert run.end(signal.SIGTERM) == 0
+    assert [line["frame"] for line in lines] == sorted(line["frame"] for line in lines)
+    (recording,) = (tmp_path / "dives").glob("*.mcap")
+    assert is_recording(recording)
+    rows = replayed(recording, tmp_path / "run")
+    sent = {line["frame"]: line for line in lines if line["valid"]}
+    found = {int(row["frame"]): row for row in rows if row["valid"] == "1"}
+    assert set(sent) <= set(found)
+    for frame, line in sent.items():
+        assert float(found[frame]["range_m"]) == line["range_m"]
+        assert float(found[frame]["yaw_deg"]) == line["yaw_deg"]
+    assert {row["reason"] for row in rows if row["valid"] == "0"} >= {"wrong_size"}
+
+
+def replayed(recording: Path, out: Path) -> list[dict[str, str]]:
+    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "run"]
+    done = subprocess.run(
+        [*command, str(recording), "-o", str(out), "--no-report"],
+        capture_output=True,
+        text=True,
+        timeout=4 * PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    text = (out / "posture.csv").read_text().splitlines()
+    assert tuple(text[0].split(",")) == POSTURE_COLUMNS
+    return [dict(zip(POSTURE_COLUMNS, line.split(","), strict=True)) for line in text[1:]]
+
+
+def test_a_stream_that_repeats_its_picture_has_no_posture(
+    clips: dict[str, Path], rig_file: Path
+) -> None:
+    with live(rig_file) as run:
+        run.send(clips["frozen"])
+        run.wait(lambda: "frozen" in run.reasons(), "the reason")
+        lines = [line for _, line in run.lines if line["reason"] != "no_frames"]
+        assert run.end(signal.SIGTERM) == 0
+    # Time stamps run on: by these it is noticed, however busy the machine.
+    first = lines[0]["frame"]
+    told = next(line["frame"] for line in lines if line["reason"] == "frozen")
+    assert 50 < told - first <= 50 + 12
+    assert not any(line["valid"] for line in lines if line["frame"] > told)
+    assert sum(line["valid"] for line in lines) > 10
+
+
+def test_after_a_kill_the_recording_holds_all_but_the_last_moment(
+    clips: dict[str, Path], rig_file: Path, tmp_path: Path
+) -> None:
+    with live(rig_file, "--record", "--record-to", str(tmp_path / "dives")) as run:
+        sender = threading.Thread(target=run.send, args=(clips["dive"],))
+        sender.start()
+        run.wait(lambda: len(run.valid()) >= N_AT_LEAST, "postures")
+        frame = run.valid()[-1][1]["frame"]
+        (recording,) = (tmp_path / "dives").glob("*.mcap")
+        run.wait(lambda: frame in frames_of(recording), "these on the disk")
+        run.process.kill()
+        sender.join()
+    rows = replayed(recording, tmp_path / "run")
+    assert int(rows[-1]["frame"]) >= frame
+
+
+def frames_of(recording: Path) -> set[int]:
+    """Numbers of the frames in a recording that is still being written."""
+    return {frame.index for frame in DiveRecording(recording).frames(with_pictures=False)}
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(
+    clips: dict[str, Path], rig_file: Path, tmp_path: Path
+) -> None:
+    def no_more() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, LIMIT))
+
+    environment = os.environ | {"NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", "")}
+    with live(
+        rig_file,
+        "--record",
+        "--record-video",
+        "--record-to",
+        str(tmp_path / "dives"),
+        preexec_fn=no_more,
+        env=environment,
+    ) as run:
+        full = threading.Event()
+
+        def fill() -> None:
+            while not full.is_set():
+                run.send(clips["dive"])
+
+        sender = threading.Thread(target=fill)
+        sender.start()
+        try:
+            # How soon depends on how many frames a busy machine measures, and so records.
+            run.wait(lambda: any("recorder: fault" in text for text in run.told), "the fault")
+        finally:
+            full.set()
+            sender.join()
+        before = len(run.valid())
+        run.send(clips["dive"])
+        run.wait(lambda: len(run.valid()) >= before + N_AT_LEAST, "postures without a recording")
+        assert run.end(signal.SIGINT) == 0
+    (recording,) = (tmp_path / "dives").glob("*.mcap")
+    assert recording.stat().st_size <= LIMIT
+    assert replayed(recording, tmp_path / "run")
+
+
+def test_five_percent_of_loss_gives_no_false_posture(
+    clips: dict[str, Path], rig_file: Path
+) -> None:
+    with live(rig_file) as run:
+        run.send(clips["dive"], loss=0.05, seed=3, repeat=2)
+        ranges = {line["frame"]: line["range_m"] for _, line in run.valid()}
+    # A lost packet costs all pictures up to the next key frame: few are left, but these are true.
+    assert len(ranges) >= 3
+    rig = load_rig(rig_file)
+    near, far = rig.working_range
+    # The dive goes between these; a stripe patched up from another picture would leave them.
+    from aqualvs.scanner import Scanner
+
+    scanner = Scanner(rig)
+    true = [p.range for f in demo_frames(N_CLIP) if (p := scanner.process(f).posture)]
+    assert min(true) - 0.01 < min(ranges.values())
+    assert max(ranges.values()) < max(true) + 0.01
+    assert near < min(ranges.values()) < far
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["no_such.mp4"], "no_such.mp4"),
+        (["camera:77"], "video77"),
+        (["udp://127.0.0.1:1", "--mavlink", "nonsense"], "nonsense"),
+        (["udp://127.0.0.1:1", "--dashboard", "--token", "short"], "--token"),
+        (["udp://127.0.0.1:1", "--json", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_cannot_work_is_told_in_one_line(
+    arguments: list[str], words: str, rig_file: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "live"]
+    done = subprocess.run(
+        [*command, *arguments, "--rig", str(rig_file)],
+        capture_output=True,
+        text=True,
+        timeout=4 * PATIENCE_S,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 2
+    (line,) = [text for text in done.stderr.splitlines() if text.startswith("aqualvs: error")]
+    assert words in line
+    assert "Traceback" not in done.stderr
+
+
+def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
+    """As fast as they go, every frame through every cheap output, JSON and recorder included.
+
+    2000 frames; AQUALVS_SOAK_FRAMES=90000 makes it an hour of a stream of 25 frames a second.
+    """
+    n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "2000"))
+    from aqualvs.control.time_filter import PostureFilter
+    from aqualvs.live.outputs.udp_json import UdpJsonOutput
+    from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner
+    from aqualvs.recording import RecorderSwitch
+    from live_cases import Collector, ScriptedFeed, demo_scanner, renumbered
+
+    frames = demo_frames(N_CLIP)
+    sizes: list[tuple[int, int]] = []
+
+    def look(n: int) -> None:
+        if n % (n_frames // 8) == 0:
+            # What waits for the disk depends on how busy that is.
+            recorder = switch._recorder
+            until(lambda: recorder is not None and not recorder._waiting_bytes, "an idle recorder")
+            sizes.append((_resident_kb(), len(os.listdir("/proc/self/fd"))))
+            print(n, *sizes[-1])
+
+    class Looks(Collector):
+        def send(self, sample: Any) -> None:
+            self.at_s.append(float(sample.scan.index))
+            look(len(self.at_s))
+
+    class Endless(ScriptedFeed):
+        def __iter__(self) -> Iterator[Any]:
+            return (renumbered(frames[i % N_CLIP], i) for i in range(n_frames))
+
+    feed = Endless([])
+    switch = RecorderSwitch(tmp_path)
+    switch.start()
+    outputs = [Looks(), UdpJsonOutput("127.0.0.1:9"), switch]
+    LiveRunner(
+        feed,
+        FixedScanner(demo_scanner()),
+        outputs,
+        LiveOptions(keep_every=True),
+        PostureFilter(),
+    ).run(lambda: False)
+    memory, handles = np.array(sizes).T
+    assert len(memory) == 8
+    assert set(handles[2:]) == {handles[2]}
+    # After warming up: no growth that would make 100 MB an hour, but for what the recorder may
+    # have waiting for the disk at one moment or the other.
+    hours = 5 / 8 * n_frames / 90_000
+    assert memory[-1] - memory[2] < 100_000 * hours + 12_000
+
+
+def _resident_kb() -> int:
+    text = Path("/proc/self/status").read_text()
+    return int(text.split("VmRSS:")[1].split()[0])
