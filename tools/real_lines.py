@@ -22,7 +22,7 @@ import dataclasses
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -46,8 +46,11 @@ FORMATS = ("png", "jpg80", "crf23")
 NEAR_PX = {"green15-bright": 2.0, "green15-dark": 5.0, "red-charuco": 2.0}
 PAIR_PX = 1.0
 RED_NM, GREEN_NM = 650.0, 532.0
-# Weights of B, G, R when a line of a pair is centred: mostly red, but red alone saturates.
-_WEIGHTS = (0.2, 0.2, 0.6)
+# Luma and V of B, G, R. Difference of a pair: smoothing along the line; size of the surroundings
+# and what counts there at most; least of red, luma, and luma compared with the surroundings.
+_LUMA, _V = (0.114, 0.587, 0.299), (-0.081, -0.419, 0.5)
+_BLUR_ALONG_PX, _AROUND_PX, _MOST_NOISE = 2.0, (21, 61), 8.0
+_LEAST_RED, _LEAST_LUMA, _LEAST_CLEAR = 1.0, 3.0, 4.0
 # Drawing: pictures darker than this on average are brightened; space around lines, in widths;
 # width of a sheet in pixels.
 _DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1440
@@ -171,26 +174,30 @@ def score_lines(
 
 
 def pair_line(off: Image, on: Image) -> Array:
-    """Return the row (width,) of a near-horizontal red line in each column, NaN where unseen.
+    """Return the row (width,) of a near-horizontal line in each column, NaN where unseen.
 
-    Found where red rises against green by most, centred where light of any colour rises.
+    The line is where luma rises by most, compared with what differs around it. Colour only rules
+    out what turns less red: the pictures are JPEG files, whose chroma is half as fine and spreads
+    over blocks of 16 pixels, so that red reaches beyond where a line ends. Nor does a line turn
+    more red where its own light saturates the camera.
     """
-    a, b = off.astype(np.float32), on.astype(np.float32)
-    red = (b[..., 2] - a[..., 2]) - 0.5 * (b[..., 1] - a[..., 1])
-    light = sum(w * (b[..., i] - a[..., i]) for i, w in enumerate(_WEIGHTS))
-    red, light = (cv2.GaussianBlur(_high(d), (0, 0), 2.5, sigmaY=0.8) for d in (red, light))
-    noise = 1.4826 * float(np.median(np.abs(red - np.median(red))))
-    row, peak = red.argmax(axis=0), red.max(axis=0)
-    strong = peak > max(6.0 * noise, 8.0)
+    difference = on.astype(np.float32) - off
+    luma, red = (_high(difference @ np.array(weights, np.float32)) for weights in (_LUMA, _V))
+    luma = cv2.GaussianBlur(luma, (0, 0), _BLUR_ALONG_PX, sigmaY=0.6)
+    red = cv2.GaussianBlur(red, (0, 0), _BLUR_ALONG_PX)
+    around = cv2.boxFilter(np.minimum(np.abs(luma), _MOST_NOISE), -1, _AROUND_PX)
+    clear = np.where(red > -_LEAST_RED, luma / (1.5 * around + 0.5), 0.0)
+    row = clear.argmax(axis=0)
+    columns = np.arange(len(row))
+    strong = (clear[row, columns] > _LEAST_CLEAR) & (luma[row, columns] > _LEAST_LUMA)
     line = np.full(len(row), np.nan)
     for x in np.flatnonzero(strong):
-        around = slice(max(0, x - 6), x + 7)
-        if (strong[around] & (np.abs(row[around] - row[x]) <= 2)).sum() < 7:
+        beside = slice(max(0, x - 6), x + 7)
+        if (strong[beside] & (np.abs(row[beside] - row[x]) <= 2)).sum() < 7:
             continue
-        first, last = max(0, row[x] - 3), min(len(red), row[x] + 4)
-        weight = np.clip(light[first:last, x] - 0.3 * light[first:last, x].max(), 0.0, None)
-        if weight.sum() > 0.0:
-            line[x] = (weight * np.arange(first, last)).sum() / weight.sum()
+        first, last = max(0, row[x] - 3), min(len(luma), row[x] + 4)
+        weight = np.clip(luma[first:last, x] - 0.3 * luma[first:last, x].max(), 0.0, None)
+        line[x] = (weight * np.arange(first, last)).sum() / weight.sum()
     return line
 
 
@@ -223,12 +230,16 @@ class Shot:
     scores: list[Score]
 
 
-def shots(samples: Path, formats: Sequence[str]) -> Iterator[Shot]:
-    """Read, search and score every picture in every format."""
+def shots(
+    samples: Path, formats: Sequence[str], wanted: Callable[[str], bool] = lambda _: True
+) -> Iterator[Shot]:
+    """Read, search and score every picture of which the name is wanted, in every format."""
     traced = traced_lines()
     pictures = [p for p in sorted(samples.glob("*/*")) if p.suffix in (".png", ".jpg")]
     for path in pictures:
         name = f"{path.parent.name}/{path.name}"
+        if not wanted(name):
+            continue
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         red = path.parent.name.startswith("red")
         is_on = name in traced or "-b-" in path.name

@@ -162,8 +162,7 @@ def test_nine_photographs_leaving_one_out(left_out, fmt: str) -> None:
     assert (np.median(errors, axis=0) <= (4.0, 1.0, 0.25)).all()
     scores = np.array([(m.range_score, m.yaw_score, m.pitch_score) for m in good])
     rms = np.sqrt((scores**2).mean(axis=0))
-    # A paper board that leans by a degree moves its own range by 5 mm, of which 1 mm is counted.
-    assert 0.7 <= rms[0] <= 3.5
+    assert 0.7 <= rms[0] <= 1.6
     assert (rms[1:] <= 1.6).all()
 
 
@@ -180,15 +179,14 @@ def line_scores(samples: Path) -> dict[str, list]:
 @pytest.mark.samples
 @pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
 def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
-    """What is reached; a picture of faint lines loses most by compression."""
     bright = [s for s in line_scores[fmt] if s.picture.startswith("green15-bright")]
     dark = [
         s for s in line_scores[fmt] if s.picture.startswith("green15-dark") and s.group == "line"
     ]
     assert (len(bright), len(dark)) == (4, 3)
     assert {s.picture: s.found for s in bright if s.found < 0.95} == {}
-    assert {s.picture: s.weakest for s in bright if s.weakest < 0.8} == {}
-    assert {s.picture: s.found for s in dark if s.found < 0.72} == {}
+    assert {s.picture: s.weakest for s in bright if s.weakest < 0.85} == {}
+    assert {s.picture: s.found for s in dark if s.found < 0.8} == {}
 
 
 @pytest.mark.samples
@@ -200,9 +198,9 @@ def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
 
 
 @pytest.mark.samples
-@pytest.mark.xfail(strict=True, reason="thin red lines in pictures of 320 x 240 are not found")
-@pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
-def test_red_lines_of_pairs(line_scores, fmt: str) -> None:
+@pytest.mark.parametrize(("fmt", "n_least"), [("png", 8), ("jpg80", 7), ("crf23", 4)])
+def test_red_lines_of_pairs(line_scores, fmt: str, n_least: int) -> None:
+    """What is reached of 8: at 320 x 240, compression takes what colour a thin line has left."""
     pairs = [s for s in line_scores[fmt] if s.group == "pair"]
     assert len(pairs) == 10
-    assert sum(s.found >= 0.9 for s in pairs) >= 8
+    assert sum(s.found >= 0.9 for s in pairs) >= n_least

@@ -1,5 +1,6 @@
 """Stripes in a whole picture, with no laser known."""
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -219,3 +220,42 @@ def test_a_line_of_another_wavelength(wavelength: float, channels: list[int]) ->
     assert np.sqrt(np.mean(off**2)) < 0.1
     assert len(off) > 0.6 * SIZE[0]
     assert len(find_stripes(image)) == 0
+
+
+def blurred_red(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture of a red line with chroma as coarse as a codec can make it."""
+    luma, *chroma = cv2.split(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb))
+    coarse = [cv2.blur(plane, (17, 17)) for plane in chroma]
+    return np.asarray(cv2.cvtColor(cv2.merge([luma, *coarse]), cv2.COLOR_YCrCb2BGR), np.uint8)
+
+
+def test_a_thin_line_is_known_by_the_colour_beside_it() -> None:
+    """Half of it shows its own colour, the other half what a codec has left of that."""
+    line, half = (0.0, 1.0, 100.3), SIZE[0] // 2
+    image = np.ascontiguousarray(picture(line, width=2.0, green=110.0)[..., [0, 2, 1]])
+    image[:, half:] = blurred_red(image)[:, half:]
+    found = find_stripes(image, WholePictureOptions(wavelength_nm=650.0))
+    assert np.all(np.abs(distances(found, line)) < 1.0)
+    assert np.count_nonzero(found.pixels[:, 0] > half + 8) > 0.95 * (half - 8)
+
+
+def test_what_continues_a_line_faintly_does_not_hide_it() -> None:
+    """A seam without colour, a ninth as bright, goes on where a short line ends."""
+    line, end = (0.0, 1.0, 60.0), 80
+    image = picture((0.0, 1.0, 160.0), line)
+    seam = picture(noise=1.5)
+    seam[59:62] += 12
+    image[30:90, end:] = seam[30:90, end:]
+    found = find_stripes(image)
+    on_line = np.abs(distances(found, line)) < 1.0
+    assert np.count_nonzero(on_line & (found.pixels[:, 0] < end)) > 0.9 * end
+    assert np.count_nonzero(on_line & (found.pixels[:, 0] > end + 10)) < 0.1 * (SIZE[0] - end)
+
+
+def test_a_wide_stretch_of_a_line_is_no_dot() -> None:
+    line = (0.0, 1.0, 100.0)
+    image = picture(line)
+    image[:, 150:220] = picture(line, width=12.0)[:, 150:220]
+    found = find_stripes(image)
+    wide = (found.pixels[:, 0] > 155) & (found.pixels[:, 0] < 215)
+    assert np.count_nonzero(wide & (np.abs(distances(found, line)) < 1.0)) > 50

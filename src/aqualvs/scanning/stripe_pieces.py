@@ -3,12 +3,14 @@
 A piece is a smooth chain of peaks of neighbouring search lines. One peak carries little evidence:
 noise, texture and printed edges make thousands, some of them of the laser's colour. Pooled along a
 piece, the evidence is strong: a laser's line is long for its width, thin, higher than either side,
-and moves the chroma along the wavelength's direction and not across it. The evidence is weighted by
+and moves the chroma along the wavelength's direction and not across it. Where a camera or codec has
+blurred the chroma, a line shows it only beside itself, as a halo. The evidence is weighted by
 logistic regression, twice: first with general statistics of lines, then with those of the picture's
 own lines, which are learned from the pieces that are certain. Where no piece is certain, there is
 no line.
 """
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -36,9 +38,10 @@ from aqualvs.scanning.stripe import WIDTH as PEAK_WIDTH
 
 Rows = NDArray[np.float32]
 
-LENGTH, HEIGHT, WIDTH, TOP, ONE_SIDED, ALONG, ACROSS, FIRST_X, FIRST_Y, LAST_X, LAST_Y = range(11)
+LENGTH, HEIGHT, WIDTH, TOP, ONE_SIDED, ALONG, ACROSS, HALO = range(8)
+FIRST_X, FIRST_Y, LAST_X, LAST_Y = range(8, 12)
 """Rows of a table of pieces: lengths and places in pixels, heights in grey levels."""
-_N_MEASURES = 11
+_N_MEASURES = 12
 
 # Least height of peaks in grey levels, in a picture smoothed along the stripes by this many search
 # lines, so that noise of one pixel does not break a faint line. Number of peaks per search line.
@@ -49,16 +52,28 @@ _REACH_SHARE, _LEAST_REACH = 0.045, 8
 # returns in pixels and as a share of the width. Least number of returns.
 _MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
 _KINK_PX, _KINK_IN_WIDTHS, MIN_RETURNS = 1.0, 0.25, 5
+# Where the median height of MIN_RETURNS changes by this factor, another thing begins: noise and the
+# ringing of a codec continue many a line.
+_HEIGHT_STEP = 3.0
 # Light and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
 _FLANK_PX = 2
+# The halo is summed up to so many pixels beyond them: codecs keep chroma in blocks of 16 pixels.
+_HALO_PX = 6
 # Ratios of chroma to light, and differences in height of the flanks for each level, are clipped to
-# these bounds.
+# these bounds. Every red line of the photographs has at least the expected halo, however coded.
 _MOST_RATIO, _LEAST_RATIO, _MOST_ACROSS, _MOST_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
+_HALO_EXPECTED = 0.3
+# More chroma for each level than this is coloured paint, or the halo of another thing; and the
+# logarithm of that excess is clipped.
+_PAINTED_RATIO, _MOST_EXCESS = 1.5, 3.0
 # Noise of chroma, in levels.
 _CHROMA_NOISE = 2.0
-# Pieces of more than these log odds, by the general statistics of lines, are certain; except those
-# with less chroma for each level than any camera's lines, such as a highlight on steel.
-_CERTAIN = 2.3
+# Pieces of more than these log odds, by the general statistics of lines, and of this share of the
+# picture's width are certain; without laser, long pieces of its colour are rare. Pieces with less
+# chroma for each level than any camera's lines, on themselves or beside them, are not certain: a
+# highlight on steel, for example.
+_CERTAIN, _CERTAIN_SHARE = 2.4, 0.08
+_CERTAIN_IF_LONG, _LONG_SHARE = 1.0, 0.2
 # Spread of the colour of a picture's lines: chroma for each level, and as a share of theirs.
 _ACROSS_SPREAD, _SHARE_SPREAD = 0.08, 0.3
 _MOST_OWN = 9.0
@@ -76,9 +91,9 @@ class Weights(NamedTuple):
 
     Attributes
     ----------
-    general : array, shape (12,)
+    general : array, shape (14,)
         Weights of what `general_evidence` returns.
-    own : array, shape (15,)
+    own : array, shape (17,)
         Weights of what `own_evidence` returns.
     """
 
@@ -87,11 +102,16 @@ class Weights(NamedTuple):
 
 
 WEIGHTS = Weights(
-    np.array([-4.62, -0.196, 0.709, 0.613, -0.316, -1.27, -0.829, 29.9, 1.02, -4.89, -3.89, 0.358]),
     np.concatenate(
         [
-            [-4.1, 0.0586, 0.566, 0.342, -0.48, -0.795, -0.49, 33.4, 0.814, -4.7, -1.59, 0.345],
-            [-0.157, -0.87, 2.77],
+            [-5.75, -0.455, 0.816, 0.1, -0.348, 0.432, -1.11, -0.756],
+            [7.42, -1.46, 0.991, 1.68, -0.409, -2.77],
+        ]
+    ),
+    np.concatenate(
+        [
+            [-5.22, -0.227, 0.704, -0.118, -0.521, 0.405, -0.874, -0.712],
+            [8.74, -1.67, 1.06, 1.57, -0.221, -2.31, 0.00636, -0.47, 2.19],
         ]
     ),
 )
@@ -111,7 +131,7 @@ class Pieces(NamedTuple):
         Indices into the returns, piece by piece, along each piece.
     start : int array, shape (P + 1,)
         Where each piece begins in `order`, and N.
-    table : array, shape (11, P)
+    table : array, shape (12, P)
         Measures of the pieces, rows as named above.
     """
 
@@ -223,7 +243,7 @@ def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
 
 
 def _smooth_chains(returns: Returns, search: StripeSearch) -> tuple[IntArray, IntArray]:
-    """Return chains of returns without gaps and kinks: order, and where each begins."""
+    """Return chains of returns without gaps, kinks and steps: order, and where each begins."""
     segments = link_segments(returns, search)
     order = segments.order
     if len(order) == 0:
@@ -235,10 +255,26 @@ def _smooth_chains(returns: Returns, search: StripeSearch) -> tuple[IntArray, In
     bend = np.abs(position[2:] - 2.0 * position[1:-1] + position[:-2])
     kinks = np.flatnonzero(bend > np.maximum(_KINK_PX, _KINK_IN_WIDTHS * width[1:-1])) + 1
     ends[kinks - 1] = ends[kinks] = True
+    ends[_height_steps(returns.height[order], ends)] = True
     start = np.concatenate([[0], np.flatnonzero(ends) + 1, [len(order)]])
     long = np.diff(start) >= MIN_RETURNS
     order = order[np.repeat(long, np.diff(start))]
     return order, np.concatenate([[0], np.cumsum(np.diff(start)[long])])
+
+
+def _height_steps(height: FloatArray, ends: BoolArray) -> IntArray:
+    """Return after which returns (of N) the height changes for good, but not beside an end."""
+    n, half = len(height), MIN_RETURNS
+    if n < 2 * half:
+        return np.zeros(0, np.int64)
+    median = np.median(np.lib.stride_tricks.sliding_window_view(np.log(height), half), axis=1)
+    change = np.zeros(n - 1)
+    change[half - 1 : n - half] = np.abs(median[half:] - median[:-half])
+    chain = np.concatenate([[0], np.cumsum(ends)])
+    change[half - 1 : n - half][chain[: n - 2 * half + 1] != chain[2 * half - 1 :]] = 0.0
+    # One end for each step: where the medians differ most.
+    largest = np.lib.stride_tricks.sliding_window_view(np.pad(change, half), 2 * half + 1).max(1)
+    return np.flatnonzero((change > math.log(_HEIGHT_STEP)) & (change >= largest))
 
 
 @kernel
@@ -262,7 +298,7 @@ def _measure(
         members = order[start[k] : start[k + 1]]
         n = members.shape[0]
         tops, above, one_sided = np.empty(n), np.empty(n), np.empty(n)
-        total, total_along, total_across = 0.0, 0.0, 0.0
+        total, total_along, total_across, halo = 0.0, 0.0, 0.0, 0.0
         for i in range(n):
             x, peak = line[members[i]], int(position[members[i]] + 0.5)
             reach = int(np.ceil(0.5 * width[members[i]])) + _FLANK_PX
@@ -275,6 +311,8 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
+                low, high = max(low - _HALO_PX, 1), min(high + _HALO_PX, light.shape[1] - 2)
+                halo += _sum_above_flanks(along[x], low, high)
         total = max(total, 1.0)
         first, last = members[0], members[n - 1]
         begin, end = line_px * (line[first] + 0.5) - 0.5, line_px * (line[last] + 0.5) - 0.5
@@ -284,6 +322,7 @@ def _measure(
         table[TOP, k] = np.median(tops)
         table[ONE_SIDED, k] = np.median(one_sided) / max(np.median(above), 1.0)
         table[ALONG, k], table[ACROSS, k] = total_along / total, total_across / total
+        table[HALO, k] = halo / total
         x, y = (FIRST_Y, FIRST_X) if along_x else (FIRST_X, FIRST_Y)
         table[x, k], table[y, k] = begin, position[first]
         x, y = (LAST_Y, LAST_X) if along_x else (LAST_X, LAST_Y)
@@ -306,7 +345,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 
     Parameters
     ----------
-    table : array, shape (11, P)
+    table : array, shape (12, P)
         Measures of pieces.
     width_px : int
         Of the picture: stripes are about as thin for it in every camera.
@@ -315,15 +354,19 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 
     Returns
     -------
-    array, shape (P, 12)
+    array, shape (P, 14)
     """
     length = np.log(32.0 * table[LENGTH] / width_px + 0.1)
     slimness = np.log(table[LENGTH] / table[WIDTH] + 0.5)
     height = np.log(np.maximum(table[HEIGHT], _MIN_CONTRAST) / 20.0)
     width = np.log(200.0 * table[WIDTH] / width_px + 0.1)
     n = table.shape[1]
-    along = _believed_along(table) if has_colour else np.full(n, RATIO_EXPECTED)
-    across = table[ACROSS] if has_colour else np.zeros(n)
+    along, halo = np.full(n, RATIO_EXPECTED), np.full(n, _HALO_EXPECTED)
+    most, across = halo, np.zeros(n)
+    if has_colour:
+        along, halo = _believed(table, ALONG, RATIO_LEAST), _believed(table, HALO, _HALO_EXPECTED)
+        most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
+    levels = np.maximum(np.maximum(along, halo), 0.0) * table[HEIGHT]
     return np.stack(
         [
             np.ones(n),
@@ -331,22 +374,24 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             slimness,
             height,
             height**2,
+            length * height,
             width,
             np.minimum(table[ONE_SIDED], _MOST_ONE_SIDED),
-            np.clip(along, 0.0, RATIO_LEAST),
-            np.log1p(np.maximum(along, 0.0) * table[HEIGHT] / _CHROMA_NOISE),
+            np.clip(halo, 0.0, _HALO_EXPECTED),
+            np.clip(halo, _LEAST_RATIO, 0.0),
             np.clip(along, _LEAST_RATIO, 0.0),
+            np.log1p(levels / _CHROMA_NOISE),
+            np.clip(np.log(np.maximum(most, 1e-3) / _PAINTED_RATIO), 0.0, _MOST_EXCESS),
             np.minimum(np.abs(across), _MOST_ACROSS),
-            length * height,
         ],
         axis=-1,
     )
 
 
-def _believed_along(table: FloatArray) -> FloatArray:
-    """Return chroma along the laser's colour for each level (P,); a white core says nothing."""
-    along = np.minimum(table[ALONG], _MOST_RATIO)
-    believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(along, RATIO_LEAST), along)
+def _believed(table: FloatArray, row: int, in_white: float) -> FloatArray:
+    """Return chroma for each level (P,) of a row; a white core says nothing."""
+    ratio = np.minimum(table[row], _MOST_RATIO)
+    believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(ratio, in_white), ratio)
     return believed
 
 
@@ -359,15 +404,19 @@ class OwnLines(NamedTuple):
     log_height: float
 
 
-def learn_lines(table: FloatArray, log_odds: FloatArray, *, has_colour: bool) -> OwnLines | None:
+def learn_lines(
+    table: FloatArray, log_odds: FloatArray, width_px: int, *, has_colour: bool
+) -> OwnLines | None:
     """Learn the statistics of the picture's lines from the pieces that are certain.
 
     Parameters
     ----------
-    table : array, shape (11, P)
-        Measures of pieces.
+    table : array, shape (12, P)
+        Measures of pieces, lengths together with the pieces that continue them.
     log_odds : array, shape (P,)
         By the general evidence.
+    width_px : int
+        Of the picture.
     has_colour : bool
         Whether the picture has chroma.
 
@@ -376,12 +425,15 @@ def learn_lines(table: FloatArray, log_odds: FloatArray, *, has_colour: bool) ->
     OwnLines or None
         None where no piece is certain.
     """
-    certain = np.flatnonzero(
-        (log_odds > _CERTAIN) & ((table[ALONG] >= RATIO_LEAST) | (not has_colour))
-    )
+    share = table[LENGTH] / width_px
+    is_certain = (log_odds > _CERTAIN) & (share >= _CERTAIN_SHARE)
+    is_certain |= (log_odds > _CERTAIN_IF_LONG) & (share >= _LONG_SHARE)
+    if has_colour:
+        is_certain &= np.minimum(table[ALONG], table[HALO]) >= RATIO_LEAST
+    certain = np.flatnonzero(is_certain)
     if len(certain) == 0:
         return None
-    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _CERTAIN + 0.5, 0.0, 3.0)
+    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _CERTAIN + 0.5, 0.5, 3.0)
 
     def median(values: FloatArray) -> float:
         by_size = np.argsort(values)
@@ -401,7 +453,7 @@ def own_evidence(
 
     Returns
     -------
-    array, shape (P, 15)
+    array, shape (P, 17)
     """
     general = general_evidence(table, width_px, has_colour=has_colour)
     off_across = np.zeros(table.shape[1])
@@ -421,7 +473,7 @@ def line_log_odds(
 
     Parameters
     ----------
-    table : array, shape (11, P)
+    table : array, shape (12, P)
         Measures of all pieces of one picture.
     width_px : int
         Of the picture.
@@ -438,10 +490,10 @@ def line_log_odds(
     log_odds = general_evidence(table, width_px, has_colour=has_colour) @ weights.general
     # Dashes in a row are as long as all of them together.
     likely = np.flatnonzero(log_odds > 0.0)
-    in_a_row = table[:, likely]
-    in_a_row[LENGTH] = _length_in_a_row(in_a_row, width_px)
-    log_odds[likely] = general_evidence(in_a_row, width_px, has_colour=has_colour) @ weights.general
-    lines = learn_lines(table, log_odds, has_colour=has_colour)
+    in_a_row = table.copy()
+    in_a_row[LENGTH, likely] = _length_in_a_row(table[:, likely], width_px)
+    log_odds = general_evidence(in_a_row, width_px, has_colour=has_colour) @ weights.general
+    lines = learn_lines(in_a_row, log_odds, width_px, has_colour=has_colour)
     if lines is None:
         return np.full(table.shape[1], -np.inf)
     found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ weights.own
@@ -466,7 +518,7 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
 
     Parameters
     ----------
-    table : array, shape (11, P)
+    table : array, shape (12, P)
         Measures of all pieces of one picture.
     log_odds : array, shape (P,)
         That each is a line.

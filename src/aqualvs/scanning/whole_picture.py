@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.scanning.laser_bands import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
@@ -28,8 +28,9 @@ _STEEPEST = 1.0
 _SLOPE_REACH = 6
 # A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a mark.
 _MIN_LENGTH_IN_WIDTHS = 2.5
-# Returns wider than this many median widths of their chain are a dot on the stripe.
-_MAX_WIDTH = 1.8
+# Returns wider than this many median widths of their chain are a dot on the stripe, unless they go
+# on for longer than this many of their own widths: then a pale surface saturates the camera.
+_MAX_WIDTH, _LONGEST_DOT = 1.8, 1.5
 # Noise of the centre of a stripe by speckle, as a share of its width; the least noise is that of 8
 # bits and a Bayer pattern.
 _SIGMA_IN_WIDTHS, _LEAST_SIGMA_PX = 0.01, 0.05
@@ -167,7 +168,7 @@ def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePix
     width = returns.width[chain]
     # At just 45 degrees one of the axes must have it.
     steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
-    keep = steep_enough & (width <= _MAX_WIDTH * np.median(width))
+    keep = steep_enough & ~_in_dot(width / search.line_px)
     chain, line, slope = chain[keep], line[keep], slope[keep]
     along_x = axis is SearchAxis.ALONG_X
     cosine = 1.0 / np.hypot(1.0, slope)
@@ -182,6 +183,16 @@ def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePix
         width,
         np.zeros(len(chain)),
     )
+
+
+def _in_dot(width: FloatArray) -> BoolArray:
+    """Mark the returns (N,) of a chain that lie on a dot; widths are in search lines."""
+    wide = width > _MAX_WIDTH * np.median(width)
+    bounds = np.flatnonzero(np.diff(wide, prepend=False, append=False))
+    for first, end in bounds.reshape(-1, 2):
+        if end - first > _LONGEST_DOT * np.median(width[first:end]):
+            wide[first:end] = False
+    return wide
 
 
 def _unsmoothed(width: FloatArray, slope: FloatArray) -> FloatArray:
